@@ -1,0 +1,320 @@
+"""Replay buffer for stacked images that keeps every frame once."""
+
+import itertools
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+try:
+    import psutil
+except ImportError:
+    psutil = None  # type: ignore[assignment]
+
+
+class FrameStackReplayBuffer(ReplayBuffer):
+    """
+    SB3's ``ReplayBuffer`` for stacks of uint8 images, in about a sixth of its memory (three stacked frames).
+
+    Two consecutive observations share all their frames but one, and an observation and its successor do so again.
+    The buffer therefore keeps one ring of frames for all environments, and per transition only the positions of its
+    ``2 * frame_stack`` frames in that ring; stacks are rebuilt when they are sampled. With equal seeds and an equal
+    stream it returns the same batches as ``ReplayBuffer``, bit for bit.
+
+    Nothing is assumed about the stream: where an observation does not continue the stored one (after a reset,
+    another ``learn()``, ``set_env`` or ``load``), its frames are stored anew. The ring has room for 4 % more frames
+    than transitions, enough for episodes of 25 steps and more. Where streams break more often than that, the oldest
+    rows (one row: the transitions of all environments at one time) are given up: they are never sampled and
+    ``size()`` does not count them.
+
+    :param buffer_size: Max number of transitions, over all environments
+    :param observation_space: uint8 ``Box`` of shape (frame_stack * c, height, width), oldest frame first
+    :param action_space: Action space
+    :param device: PyTorch device of the sampled tensors
+    :param n_envs: Number of parallel environments
+    :param optimize_memory_usage: Only ``False``: sharing frames already saves more than SB3's variant does
+    :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
+        as an infinite horizon task
+    :param frame_stack: Number of frames in one observation, which its number of channels cannot tell
+    :raises ValueError: If the observation space is not made of ``frame_stack`` uint8 images, channels first, or if
+        ``optimize_memory_usage`` is set
+    """
+
+    # Room for the one frame that every episode has more than steps; with the index table and the action this stays
+    # below 1.05 frames per transition for images of 84x84.
+    SPARE_FRAMES = 0.04
+    # What `pos` and the frame counter index: only the used part of these is pickled.
+    _ROW_ARRAYS = ("frame_slots", "oldest_frame", "actions", "rewards", "dones", "timeouts")
+
+    frames: npt.NDArray[np.uint8]  # [frame_capacity, c, height, width]
+    frame_slots: npt.NDArray[np.int32]  # [buffer_size, n_envs, 2 (obs, next_obs), frame_stack], positions in `frames`
+    oldest_frame: npt.NDArray[np.int64]  # [buffer_size], running number of the oldest frame that the row needs
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        frame_stack: int,
+    ):
+        _check_arguments(observation_space, frame_stack, optimize_memory_usage)
+        # As SB3's DictReplayBuffer does: ReplayBuffer's constructor would allocate what this class avoids
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        self.frame_stack = frame_stack
+        channels, height, width = self.obs_shape
+        self.frame_shape = (channels // frame_stack, height, width)
+        # The constant part is what one `add` may write (two whole stacks per environment), plus the first stack, so
+        # that not even the smallest buffer overwrites a frame of the row it is writing.
+        self._max_frames_per_add = 2 * frame_stack * n_envs
+        self.frame_capacity = (
+            math.ceil((1 + self.SPARE_FRAMES) * self.buffer_size * n_envs)
+            + self._max_frames_per_add
+            + frame_stack * n_envs
+        )
+
+        # Fresh zeros cost no memory until they are written to
+        rows = (self.buffer_size, n_envs)
+        self.frames = np.zeros((self.frame_capacity, *self.frame_shape), dtype=np.uint8)
+        self.frame_slots = np.zeros((*rows, 2, frame_stack), dtype=np.int32)
+        self.oldest_frame = np.zeros(self.buffer_size, dtype=np.int64)
+        self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
+        self.rewards = np.zeros(rows, dtype=np.float32)
+        self.dones = np.zeros(rows, dtype=np.float32)
+        self.timeouts = np.zeros(rows, dtype=np.float32)
+        self._tails = np.zeros((n_envs, frame_stack), dtype=np.int64)
+        self.reset()
+
+        if psutil is not None and self.nbytes > (mem_available := psutil.virtual_memory().available):
+            warnings.warn(
+                "This system does not have apparently enough memory to store the complete "
+                f"replay buffer {self.nbytes / 1e9:.2f}GB > {mem_available / 1e9:.2f}GB",
+                stacklevel=2,
+            )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays of the full buffer; the system commits them as they fill."""
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        self._n_valid = 0  # rows that can be sampled: the latest ones before `pos`
+        self._n_frames = 0  # frames ever stored; frame number i lies at `frames[i % frame_capacity]`
+        # Per environment, the running numbers of the frames of its last `next_obs`; -frame_capacity: none yet
+        self._tails.fill(-self.frame_capacity)
+
+    def size(self) -> int:
+        """
+        :return: Number of rows that can be sampled. Below SB3's value only where streams broke so often that the
+            frames of the oldest rows had to be overwritten.
+        """
+        return self._n_valid
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment. All inputs are copied.
+
+        :param obs: Observations, uint8 [n_envs, frame_stack * c, height, width]
+        :param next_obs: Successors of the same shape; of an episode's last step the terminal observation
+        :param action: Actions, [n_envs, ...]
+        :param reward: Rewards, [n_envs]
+        :param done: Whether the episode ended, [n_envs]
+        :param infos: One dictionary per environment; ``TimeLimit.truncated`` is used
+        :raises ValueError: If observations have another dtype or shape
+        """
+        stacks, next_stacks = self._split(obs, "obs"), self._split(next_obs, "next_obs")
+        action = np.asarray(action).reshape((self.n_envs, self.action_dim))
+
+        # The row at `pos` is about to be overwritten
+        self._n_valid = min(self._n_valid, self.buffer_size - 1)
+        oldest_frame = self._n_frames
+        for i, (stack, next_stack) in enumerate(zip(stacks, next_stacks, strict=True)):
+            numbers = self._tails[i] if self._continues_tail(i, stack) else self._store_stack(stack)
+            if np.array_equal(next_stack[:-1], stack[1:]):
+                next_numbers = np.append(numbers[1:], self._store_frame(next_stack[-1]))
+            else:
+                next_numbers = self._store_stack(next_stack)
+            self.frame_slots[self.pos, i] = np.stack((numbers, next_numbers)) % self.frame_capacity
+            oldest_frame = min(oldest_frame, int(numbers[0]))
+            self._tails[i] = next_numbers
+        self.oldest_frame[self.pos] = oldest_frame
+
+        self.actions[self.pos] = action
+        self.rewards[self.pos] = reward
+        self.dones[self.pos] = done
+        if self.handle_timeout_termination:
+            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+
+        self._n_valid += 1
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        Sample uniformly, with replacement, from the valid rows and the environments.
+
+        :param batch_size: Number of transitions to sample
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: Batch on ``device``, observations uint8 (unless ``env`` normalizes them)
+        """
+        # As in SB3 a row's offset is its position, unless rows were lost: then it counts from the oldest valid one
+        rows = np.random.randint(0, self._n_valid, size=batch_size)
+        n_stored = self.buffer_size if self.full else self.pos
+        if self._n_valid < n_stored:
+            rows = (rows + self.pos - self._n_valid) % self.buffer_size
+        return self._get_samples(rows, env=env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        Transitions of the given rows, each of a randomly drawn environment.
+
+        :param batch_inds: Row positions in [0, buffer_size), as for ``ReplayBuffer``: the row that ``add`` wrote when
+            ``pos`` had this value, [batch_size]
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: Batch on ``device``
+        :raises IndexError: If a row is empty, or its frames have been overwritten
+        """
+        if np.any((self.pos - 1 - batch_inds) % self.buffer_size >= self._n_valid):
+            raise IndexError(
+                f"Some of the rows asked for hold no transition: of {self.buffer_size} rows only the {self._n_valid} "
+                f"before pos={self.pos} are valid; draw rows with sample()."
+            )
+        inds = batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of numpy
+        slots = th.from_numpy(self.frame_slots[inds].swapaxes(0, 1).ravel())
+        obs, next_obs = th.from_numpy(self.frames).index_select(0, slots).view(2, -1, *self.obs_shape).numpy()
+        data = (
+            self._normalize_obs(obs, env),
+            self.actions[inds],
+            self._normalize_obs(next_obs, env),
+            # Only use dones that are not due to timeouts
+            (self.dones[inds] * (1 - self.timeouts[inds])).reshape(-1, 1),
+            self._normalize_reward(self.rewards[inds].reshape(-1, 1), env),
+        )
+        # All of these are fresh arrays already, so no second copy
+        return ReplayBufferSamples(*(self.to_torch(array, copy=False) for array in data))  # type: ignore[arg-type]
+
+    def _split(self, obs: np.ndarray, name: str) -> npt.NDArray[np.uint8]:
+        """Observations of all environments as single frames: uint8 [n_envs, frame_stack, c, height, width]."""
+        obs = np.ascontiguousarray(obs)
+        if obs.dtype != np.uint8 or obs.shape != (self.n_envs, *self.obs_shape):
+            raise ValueError(
+                f"{name} is {obs.dtype} of shape {obs.shape}, but this buffer expects uint8 of shape "
+                f"{(self.n_envs, *self.obs_shape)}: pass the observations of all {self.n_envs} environments unscaled."
+            )
+        return obs.reshape((self.n_envs, self.frame_stack, *self.frame_shape))
+
+    def _continues_tail(self, i: int, stack: npt.NDArray[np.uint8]) -> bool:
+        """Whether a stack equals the last one of environment ``i``, and that one outlives the current ``add``."""
+        tail = self._tails[i]
+        survives = tail[0] + self.frame_capacity >= self._n_frames + self._max_frames_per_add
+        return bool(survives) and np.array_equal(self.frames[tail % self.frame_capacity], stack)
+
+    def _store_stack(self, stack: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+        """Store a stack that continues nothing, repeated frames (the first after a reset) once; returns numbers."""
+        numbers = [self._store_frame(stack[0])]
+        for previous, frame in itertools.pairwise(stack):
+            numbers.append(numbers[-1] if np.array_equal(previous, frame) else self._store_frame(frame))
+        return np.array(numbers, dtype=np.int64)
+
+    def _store_frame(self, frame: npt.NDArray[np.uint8]) -> int:
+        """Store one frame, at the cost of the rows that need the frame it replaces; returns its running number."""
+        number = self._n_frames
+        # Frame numbers never fall from row to row, so the rows that go are the oldest ones
+        while (
+            self._n_valid
+            and self.oldest_frame[(self.pos - self._n_valid) % self.buffer_size] + self.frame_capacity <= number
+        ):
+            self._n_valid -= 1
+        self.frames[number % self.frame_capacity] = frame
+        self._n_frames += 1
+        return number
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what has not been written to yet: a saved buffer is as large as its contents."""
+        state = self.__dict__.copy()
+        if not self.full:
+            state.update({name: state[name][: self.pos] for name in self._ROW_ARRAYS})
+        state["frames"] = self.frames[: self._n_frames]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the full size of every array."""
+        self.__dict__.update(state)
+        for name in self._ROW_ARRAYS:
+            setattr(self, name, _grown(state[name], self.buffer_size))
+        self.frames = _grown(state["frames"], self.frame_capacity)
+
+
+def _grown(array: np.ndarray, length: int) -> np.ndarray:
+    """The array itself where it has the length, else a copy that is filled up with zeros."""
+    if len(array) == length:
+        return array
+    grown = np.zeros((length, *array.shape[1:]), dtype=array.dtype)
+    grown[: len(array)] = array
+    return grown
+
+
+def _check_arguments(observation_space: spaces.Space, frame_stack: int, optimize_memory_usage: bool) -> None:
+    """
+    Refuse what the buffer cannot store.
+
+    :raises ValueError: One sentence: the value, what is expected, what to do
+    """
+    if not isinstance(observation_space, spaces.Box) or observation_space.dtype != np.uint8:
+        raise ValueError(
+            f"observation_space is {observation_space}, but FrameStackReplayBuffer stores uint8 images in a Box: "
+            "use stable_baselines3's ReplayBuffer or DictReplayBuffer for anything else."
+        )
+    shape = observation_space.shape
+    if len(shape) != 3:
+        raise ValueError(
+            f"observation_space has shape {shape}, but FrameStackReplayBuffer expects (frame_stack * c, height, "
+            "width): concatenate the stacked frames along the channel axis."
+        )
+    # The convention of SB3's `is_image_space_channels_first`
+    if shape[2] < min(shape[:2]):
+        raise ValueError(
+            f"observation_space has shape {shape}, which looks like channels last, but FrameStackReplayBuffer expects "
+            "(frame_stack * c, height, width): wrap the environment in VecTransposeImage."
+        )
+    if not isinstance(frame_stack, int | np.integer) or frame_stack < 1:
+        raise ValueError(
+            f"frame_stack is {frame_stack!r}, but it must be an integer of at least 1: pass the number of frames that "
+            "one observation stacks."
+        )
+    if shape[0] % frame_stack != 0:
+        raise ValueError(
+            f"observation_space has {shape[0]} channels, which frame_stack={frame_stack} does not divide: pass the "
+            "number of frames that one observation stacks."
+        )
+    if optimize_memory_usage:
+        raise ValueError(
+            "optimize_memory_usage is True, but FrameStackReplayBuffer already stores each frame once: leave it False."
+        )

@@ -1,0 +1,884 @@
+"""CuReSAC: SAC from pixels with state representation learning (SRL) and a policy that is curious about it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    MaybeCallback,
+    ReplayBufferSamples,
+    RolloutReturn,
+    Schedule,
+    TrainFreq,
+)
+from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.sac import policies as sb3_policies
+from stable_baselines3.sac.sac import SAC
+from torch.nn import functional as F
+
+from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.metrics import Metrics, reconstruction_strip
+from sb3_cure.mixers import CuriousMixer
+from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor, check_shared_encoder_space
+from sb3_cure.precision import autocast_context, resolve_precision
+from sb3_cure.srl import SRLHead, get_srl_class
+
+SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
+
+#: Updates between two pictures of reconstructions in TensorBoard
+RECONSTRUCTION_INTERVAL = 1000
+
+
+@dataclass
+class Agent:
+    """One actor-critic with its temperature: the task agent, or the curious one.
+
+    :param name: ``"task"`` or ``"curious"``; prefix or suffix of its metrics
+    :param gamma: Discount factor
+    :param trains_encoder: Whether its critics' gradient reaches the shared encoder
+    :param log_ent_coef: Logarithm of the learned temperature, or None if it is fixed
+    :param ent_coef_optimizer: Its optimiser, or None
+    :param ent_coef: Fixed temperature, or None if it is learned
+    """
+
+    name: str
+    actor: TrunkActor
+    critic: LatentCritic
+    critic_target: LatentCritic
+    gamma: float
+    trains_encoder: bool
+    log_ent_coef: th.Tensor | None
+    ent_coef_optimizer: th.optim.Optimizer | None
+    ent_coef: th.Tensor | None
+
+    def temperature(self) -> th.Tensor:
+        """Temperature alpha, detached, shape [1] or []."""
+        return self.ent_coef if self.log_ent_coef is None else self.log_ent_coef.detach().exp()  # type: ignore[return-value]
+
+
+class EncoderPass:
+    """One run of the shared encoder over a batch.
+
+    :param features: Trunk features of the observations, detached, for the actors, [B, trunk_dim]
+    :param latents: Latents of the observations, with their graph, [B, features_dim]
+    :param next_features: Computes the trunk features of the next observations; called at most once
+    """
+
+    def __init__(self, features: th.Tensor, latents: th.Tensor, next_features: Callable[[], th.Tensor]):
+        self.features = features
+        self.latents = latents
+        self._compute_next_features = next_features
+        self._next_features: th.Tensor | None = None
+
+    @property
+    def next_features(self) -> th.Tensor:
+        """Trunk features of the next observations, detached, [B, trunk_dim]."""
+        if self._next_features is None:
+            self._next_features = self._compute_next_features()
+        return self._next_features
+
+
+class CuReSAC(SAC):
+    """Soft actor-critic from pixels, with SRL and a policy that seeks what the SRL does badly.
+
+    Paper: "Seeking Visual Discomfort: Curiosity-driven Representations for Reinforcement Learning" (Aljalbout,
+    Ulmer and Triebel), Algorithm 1. Defaults are its table of hyperparameters. Timesteps are *agent* steps, as
+    everywhere in SB3: environment steps divided by the action repeat.
+
+    With ``srl=None, curiosity=None`` this is SB3's SAC bit for bit: its policies, its choice of replay buffer and its
+    update; ``encoder_tau``, ``update``, ``precision`` and ``actor_update_interval`` then do not apply. For an agent
+    without SRL on the shared encoder add ``policy_kwargs=dict(share_encoder=True)``.
+
+    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
+    :param env: Environment, vectorised environment, or Gymnasium id
+    :param learning_rate: Of everything but the temperatures; a number or a schedule of the remaining progress
+    :param buffer_size: Transitions in the replay buffer
+    :param learning_starts: Agent steps with uniformly random actions before learning
+    :param batch_size: Transitions per update
+    :param tau: Polyak rate of the target critics, once every ``target_update_interval`` updates
+    :param gamma: Discount factor of the task
+    :param train_freq: Agent steps per environment between two calls of ``train``
+    :param gradient_steps: Updates per call; -1: as many as agent steps were made
+    :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), a subclass of
+        ``SRLHead``, or None
+    :param srl_kwargs: Arguments of the head
+    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: ``srl_period`` updates of
+        SRL, then as many of RL, in turn
+    :param srl_period: Updates per phase when alternating
+    :param curiosity: ``"separate"``: a second actor-critic is rewarded with the SRL error; ``"bonus"``: the error is
+        added to the task reward; ``"random"``: the second actor draws uniform actions (control); None: off
+    :param curiosity_prob: p_c, probability with which the second actor acts, per environment and step; a number in
+        [0, 1], or a schedule
+    :param curiosity_beta: beta, factor of the curious reward
+    :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"``
+    :param normalize_curiosity: Standardise the error by running statistics, clipped to +-5; False: the paper's letter
+    :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
+    :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
+    :param task: False: a curious agent alone, which collects, acts and learns without task reward
+    :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000)
+    :param actor_update_interval: Updates between two updates of actors and temperatures
+    :param target_update_interval: Updates between two Polyak steps
+    :param encoder_tau: Polyak rate of the target encoder
+    :param update: ``"sequential"`` (Algorithm 1 to the letter) or ``"joint"`` (one encoder pass for all)
+    :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 where the hardware computes it natively
+    :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number; also the curious agent's
+    :param ent_coef_lr_factor: Learning rate of the temperatures as a multiple of ``learning_rate``
+    :param kwargs: The remaining arguments of ``stable_baselines3.SAC`` (``seed``, ``verbose``, ``policy_kwargs``, ...)
+    :raises ValueError: for arguments that cannot work, in one sentence that says what to do
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": sb3_policies.MultiInputPolicy,
+    }
+    policy: CuRePolicy  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 80_000,
+        learning_starts: int = 1000,
+        batch_size: int = 128,
+        tau: float = 0.01,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = -1,
+        *,
+        srl: str | type[SRLHead] | None = "rae",
+        srl_kwargs: dict[str, Any] | None = None,
+        srl_schedule: str = "simultaneous",
+        srl_period: int = 100,
+        curiosity: str | None = "separate",
+        curiosity_prob: float | Schedule = 0.2,
+        curiosity_beta: float = 1.0,
+        curiosity_gamma: float = 0.99,
+        normalize_curiosity: bool = True,
+        curiosity_target: str = "observation",
+        curiosity_encoder_grad: bool = True,
+        task: bool = True,
+        warmup_updates: int | None = None,
+        actor_update_interval: int = 2,
+        target_update_interval: int = 2,
+        encoder_tau: float = 0.05,
+        update: str = "sequential",
+        precision: str = "auto",
+        ent_coef: str | float = "auto_0.1",
+        ent_coef_lr_factor: float = 0.1,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ):
+        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
+        if env is not None:
+            self._check_action_space(env.action_space)
+        super().__init__(
+            policy,  # type: ignore[arg-type]
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            _init_setup_model=False,
+            **kwargs,
+        )
+        self.srl = srl
+        self.srl_kwargs = srl_kwargs or {}
+        self.srl_schedule = srl_schedule
+        self.srl_period = srl_period
+        self.curiosity = curiosity
+        self.curiosity_prob = curiosity_prob
+        self.curiosity_beta = curiosity_beta
+        self.curiosity_gamma = curiosity_gamma
+        self.normalize_curiosity = normalize_curiosity
+        self.curiosity_target = curiosity_target
+        self.curiosity_encoder_grad = curiosity_encoder_grad
+        self.task = task
+        self.warmup_updates = warmup_updates
+        self.actor_update_interval = actor_update_interval
+        self.encoder_tau = encoder_tau
+        self.update = update
+        self.precision = precision
+        self.ent_coef_lr_factor = ent_coef_lr_factor
+
+        self.curious_log_ent_coef: th.Tensor | None = None
+        self.curious_ent_coef_optimizer: th.optim.Optimizer | None = None
+        self._mixer: CuriousMixer | None = None
+        # Who collects while pretraining ("curious" or "random"); None otherwise.
+        self._collector: str | None = None
+        self._warmed_up = False
+        if _init_setup_model:
+            self._setup_model()
+
+    # ---------------------------------------------------------------- set-up
+
+    @property
+    def _is_plain_sac(self) -> bool:
+        """Whether every extra is off, so that SB3's own SAC does the work."""
+        return self.srl is None and self.curiosity is None and not self.policy_kwargs.get("share_encoder", False)
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        self._metrics = Metrics()
+        if self._is_plain_sac:
+            self.policy_kwargs.pop("share_encoder", None)
+            own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
+            self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
+            super()._setup_model()
+            return
+        check_shared_encoder_space(self.observation_space, self.policy_class)
+        self._choose_replay_buffer()
+        # The policy also needs to know what this algorithm's own arguments ask of it; `policy_kwargs` stays the user's.
+        user_kwargs = self.policy_kwargs
+        self.policy_kwargs = {**user_kwargs, **self._policy_blueprint()}
+        try:
+            super()._setup_model()
+        finally:
+            self.policy_kwargs = user_kwargs
+        if self._mixer is None:
+            self._mixer = CuriousMixer(self.curiosity_prob, self.seed)
+        if not self.task:
+            self.policy.act_with("curious_actor")
+        self._computed_precision = resolve_precision(self.precision, self.device)
+        if self.verbose >= 1:
+            print(f"Networks compute in {self._computed_precision} (precision={self.precision!r})")
+        self._setup_temperatures()
+
+    def _policy_blueprint(self) -> dict[str, Any]:
+        sources = {
+            "srl": self.srl is not None,
+            "task": self.task,
+            "curious": self._has_curious_agent and self.curiosity_encoder_grad,
+        }
+        return dict(
+            srl_class=None if self.srl is None else get_srl_class(self.srl),
+            srl_kwargs=self.srl_kwargs,
+            curious=self._has_curious_agent,
+            curiosity_kwargs=dict(beta=self.curiosity_beta, normalize=self.normalize_curiosity),
+            encoder_sources=tuple(name for name, trains in sources.items() if trains),
+            update=self.update,
+        )
+
+    @property
+    def _has_curious_agent(self) -> bool:
+        return self.curiosity == "separate" or self._collector == "curious"
+
+    def _choose_replay_buffer(self) -> None:
+        """Keep each frame once where the environment says that its observations are stacked frames."""
+        frame_stack = self._env_attribute("frame_stack")
+        if self.replay_buffer_class is None and self.n_steps == 1 and frame_stack is not None:
+            if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
+                self.replay_buffer_class = FrameStackReplayBuffer
+                self.replay_buffer_kwargs = {"frame_stack": frame_stack, **self.replay_buffer_kwargs}
+
+    def _env_attribute(self, name: str) -> Any:
+        """An attribute that the environments tell, or None."""
+        if self.env is not None and self.env.has_attr(name):
+            return self.env.get_attr(name)[0]
+        return None
+
+    def _setup_temperatures(self) -> None:
+        """Two temperatures with the reference's optimiser: a tenth of the learning rate, beta1 = 0.5 (SAC-AE)."""
+        if self.log_ent_coef is not None:
+            self.ent_coef_optimizer = self._make_temperature_optimizer(self.log_ent_coef)
+        if self._has_curious_agent:
+            self._setup_curious_temperature()
+        self._create_agents()
+
+    def _setup_curious_temperature(self) -> None:
+        if self.log_ent_coef is not None:
+            # The same initial value; a fixed temperature serves both agents.
+            initial = float(self.ent_coef.split("_")[1]) if "_" in str(self.ent_coef) else 1.0  # type: ignore[union-attr]
+            log_ent_coef = th.full((1,), initial, device=self.device).log().requires_grad_(True)
+            self.curious_log_ent_coef = log_ent_coef
+            self.curious_ent_coef_optimizer = self._make_temperature_optimizer(log_ent_coef)
+
+    def _make_temperature_optimizer(self, log_ent_coef: th.Tensor) -> th.optim.Adam:
+        return th.optim.Adam([log_ent_coef], lr=self.lr_schedule(1) * self.ent_coef_lr_factor, betas=(0.5, 0.999))
+
+    def _create_agents(self) -> None:
+        policy = self.policy
+        fixed = None if self.log_ent_coef is not None else self.ent_coef_tensor
+        self._task_agent = Agent(
+            "task",
+            policy.actor,
+            policy.critic,
+            policy.critic_target,
+            self.gamma,
+            True,
+            self.log_ent_coef,
+            self.ent_coef_optimizer,
+            fixed,
+        )
+        self._curious_agent: Agent | None = None
+        if self._has_curious_agent:
+            self._curious_agent = Agent(
+                "curious",
+                policy.curious_actor,
+                policy.curious_critic,
+                policy.curious_critic_target,
+                self.curiosity_gamma,
+                self.curiosity_encoder_grad,
+                self.curious_log_ent_coef,
+                self.curious_ent_coef_optimizer,
+                fixed,
+            )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        self._metrics.attach(self.logger)
+        self._action_repeat = self._env_attribute("action_repeat") or 1
+        self._frame_stack = self._env_attribute("frame_stack") or 1
+        return result
+
+    def set_logger(self, logger: Logger) -> None:
+        """
+        :param logger: SB3's logger
+        """
+        super().set_logger(logger)
+        self._metrics.attach(logger)
+
+    # ---------------------------------------------------------------- acting
+
+    def predict_curious(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """What ``predict`` is to the task policy, to the curious one.
+
+        :param observation: One observation or a batch, as for ``predict``
+        :param state: Unused (SB3's signature)
+        :param episode_start: Unused (SB3's signature)
+        :param deterministic: Whether to return the mean action
+        :return: Actions in the action space's bounds, and ``state``
+        :raises ValueError: if there is no curious policy
+        """
+        if self._is_plain_sac or self.policy.curious_actor is None:
+            raise ValueError(
+                f"predict_curious was called with curiosity={self.curiosity!r}, but only curiosity='separate' trains a "
+                "curious policy: use predict, or train with curiosity='separate'."
+            )
+        with self.policy.acting("curious_actor"):
+            return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self._is_plain_sac:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        # Noise is added below, once, whoever acts.
+        _, actions = super()._sample_action(learning_starts, None, n_envs)
+        if self.num_timesteps >= learning_starts:
+            second = self._second_actor_acts(n_envs)
+            if second.any():
+                actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
+        if action_noise is not None:
+            actions = np.clip(actions + action_noise(), -1, 1)
+        return self.policy.unscale_action(actions), actions
+
+    def _second_actor_acts(self, n_envs: int) -> np.ndarray:
+        """Boolean array [n_envs]: where the second (curious or random) actor acts in this step."""
+        if self._collector is not None:
+            return np.ones(n_envs, dtype=bool)
+        if self.curiosity in ("separate", "random") and self.task:
+            return self._mixer.choose(n_envs, self._current_progress_remaining)  # type: ignore[union-attr]
+        return np.zeros(n_envs, dtype=bool)
+
+    def _second_actor_actions(self, observations: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1], [n, action_dim]."""
+        if "random" in (self._collector, self.curiosity) and self._collector != "curious":
+            actions = np.array([self.action_space.sample() for _ in observations])
+        else:
+            actions, _ = self.predict_curious(observations)
+        return self.policy.scale_action(actions)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if not np.isfinite(reward).all():
+            index = int(np.flatnonzero(~np.isfinite(reward))[0])
+            raise ValueError(
+                f"environment {index} returned the reward {reward[index]} at agent step {self.num_timesteps}, but "
+                "rewards must be finite: it was not stored; fix the environment's reward."
+            )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    # -------------------------------------------------------------- learning
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """SB3's loop, with the mixer of Algorithm 1 in ``_sample_action``, and the burst of updates after the warm-up.
+
+        :param env: Training environments
+        :param callback: Called at each step
+        :param train_freq: How much to collect
+        :param replay_buffer: Where to store it
+        :param action_noise: Noise added to the actions
+        :param learning_starts: Agent steps with uniformly random actions
+        :param log_interval: Episodes between two dumps of the logger
+        :return: What was collected
+        """
+        rollout = super().collect_rollouts(
+            env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
+        )
+        if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
+            self._warmed_up = True
+            updates = self.warmup_updates
+            if updates is None:
+                updates = 0 if self.srl is None else get_srl_class(self.srl).warmup_updates
+            if updates > 0:
+                if self.verbose >= 1:
+                    print(f"{updates} updates on the {self.num_timesteps} agent steps of the random warm-up")
+                self.train(gradient_steps=updates, batch_size=self.batch_size)
+        return rollout
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Sample, update, repeat.
+
+        :param gradient_steps: Number of updates
+        :param batch_size: Transitions per update
+        """
+        if self._is_plain_sac:
+            super().train(gradient_steps, batch_size)
+            return
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            self._gradient_step(batch)
+            self._n_updates += 1
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def _gradient_step(self, batch: ReplayBufferSamples) -> None:
+        """One update, in the order of the paper's Algorithm 1: SRL, task agent, curious agent."""
+        observations = self.policy.augment(batch.observations)
+        next_observations = self.policy.augment(batch.next_observations)
+        with th.no_grad(), self._autocast():
+            next_latents = self.policy.encoder_target(next_observations)
+        shared = self._encode(observations, next_observations) if self.update == "joint" else None
+        # Sequential: a fresh pass for each source, because the one before has moved the encoder.
+        encode = lambda: shared or self._encode(observations, next_observations)  # noqa: E731
+
+        curious_reward = None
+        if self.policy.srl is not None:
+            error = self._update_srl(batch, encode())
+            if self.curiosity in ("separate", "bonus") or self._collector == "curious":
+                curious_reward = self._curious_reward(error)
+        if self._in_rl_phase:
+            if self.task and self._collector is None:
+                rewards = batch.rewards + curious_reward if self.curiosity == "bonus" else batch.rewards
+                self._update_actor_critic(self._task_agent, encode(), next_latents, batch, rewards)
+            if self._curious_agent is not None and self._collector != "random":
+                self._update_actor_critic(self._curious_agent, encode(), next_latents, batch, curious_reward)
+        self.policy.encoder_optimizer.step()
+        if self._n_updates % self.target_update_interval == 0:
+            self._update_targets()
+        self._record_metrics(batch)
+
+    def _encode(self, observations: th.Tensor, next_observations: th.Tensor) -> EncoderPass:
+        encoder = self.policy.encoder
+        with self._autocast():
+            features = encoder.trunk(observations)
+            latents = encoder.projection(features)
+
+        def next_features() -> th.Tensor:
+            with th.no_grad(), self._autocast():
+                return encoder.trunk(next_observations)
+
+        return EncoderPass(features.detach(), latents, next_features)
+
+    def _update_srl(self, batch: ReplayBufferSamples, encoded: EncoderPass) -> th.Tensor:
+        """UpdateSRL of Algorithm 1: train head and encoder.
+
+        :return: SRL error of the observations (or next observations) that the curious reward is about, [B]
+        """
+        srl = self.policy.srl
+        trains = self._in_srl_phase
+        # The loss stops at a copy of the latents; the encoder's optimiser takes the gradient from there.
+        latents = encoded.latents.detach().requires_grad_(trains)
+        with th.set_grad_enabled(trains), self._autocast():
+            loss, error = srl.loss(batch, latents)  # type: ignore[union-attr, misc]
+        if trains:
+            if srl.optimizer is not None:  # type: ignore[union-attr]
+                srl.optimizer.zero_grad()  # type: ignore[union-attr]
+            loss.backward()
+            if latents.grad is not None:
+                self.policy.encoder_optimizer.pull("srl", encoded.latents, latents.grad)
+            if srl.optimizer is not None:  # type: ignore[union-attr]
+                srl.optimizer.step()  # type: ignore[union-attr]
+        variance = encoded.latents.detach().var(dim=0).mean()
+        self._log({"train/srl_loss": loss, "train/srl_error": error.mean(), "train/latent_variance": variance})
+        if self.curiosity_target == "next_observation" and self._curious_agent is not None:
+            with th.no_grad(), self._autocast():
+                next_latents = self.policy.encoder.projection(encoded.next_features)
+                error = srl.loss(batch._replace(observations=batch.next_observations), next_latents).error  # type: ignore[union-attr]
+        return error
+
+    def _curious_reward(self, error: th.Tensor) -> th.Tensor:
+        """r_cure of this batch, [B, 1]: computed afresh, never stored, hence never stale."""
+        self.policy.curiosity.update(error)
+        reward = self.policy.curiosity(error)
+        self._log(
+            {
+                "train/curious_reward_raw_mean": error.mean(),
+                "train/curious_reward_raw_max": error.max(),
+                "train/curious_reward_mean": reward.mean(),
+                "train/curious_reward_max": reward.max(),
+            }
+        )
+        return reward
+
+    def _update_actor_critic(
+        self,
+        agent: Agent,
+        encoded: EncoderPass,
+        next_latents: th.Tensor,
+        batch: ReplayBufferSamples,
+        rewards: th.Tensor,
+    ) -> None:
+        """UpdateTaskAC and UpdateCuriousAC of Algorithm 1: soft actor-critic on the latents.
+
+        :param agent: Task or curious agent
+        :param encoded: This agent's pass through the encoder
+        :param next_latents: Latents of the next observations by the target encoder, [B, features_dim]
+        :param batch: Samples of the replay buffer
+        :param rewards: The agent's rewards, [B, 1]
+        """
+        discounts = agent.gamma if batch.discounts is None else batch.discounts
+        with th.no_grad(), self._autocast():
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoded.next_features)
+            next_q = th.cat(agent.critic_target(next_latents, next_actions), dim=1).amin(dim=1, keepdim=True)
+        next_value = next_q - agent.temperature() * next_log_prob.unsqueeze(1)
+        target = rewards + (1 - batch.dones) * discounts * next_value
+
+        latents = encoded.latents.detach().requires_grad_(agent.trains_encoder)
+        with self._autocast():
+            q_values = agent.critic(latents, batch.actions)
+        critic_loss = 0.5 * sum(F.mse_loss(q, target) for q in q_values)
+        agent.critic.optimizer.zero_grad()
+        critic_loss.backward()  # type: ignore[union-attr]
+        if agent.trains_encoder:
+            self.policy.encoder_optimizer.pull(agent.name, encoded.latents, latents.grad)  # type: ignore[arg-type]
+        agent.critic.optimizer.step()
+        prefix = self._prefix(agent)
+        self._log({f"{prefix}critic_loss": critic_loss, f"{prefix}q_value": q_values[0].mean()})  # type: ignore[dict-item]
+        if self._n_updates % self.actor_update_interval == 0:
+            self._update_actor(agent, encoded.features, encoded.latents.detach())
+
+    def _update_actor(self, agent: Agent, features: th.Tensor, latents: th.Tensor) -> None:
+        """SAC's policy improvement and temperature step; neither trains the encoder.
+
+        :param agent: Task or curious agent
+        :param features: Trunk features, detached, [B, trunk_dim]
+        :param latents: Latents, detached, [B, features_dim]
+        """
+        temperature = agent.temperature()
+        with self._autocast():
+            actions, log_prob = agent.actor.action_log_prob(features)
+            q_values = th.cat(agent.critic(latents, actions), dim=1).amin(dim=1)
+        actor_loss = (temperature * log_prob - q_values).mean()
+        agent.actor.optimizer.zero_grad()
+        actor_loss.backward(inputs=list(agent.actor.parameters()))
+        agent.actor.optimizer.step()
+
+        prefix = self._prefix(agent)
+        self._log({f"{prefix}actor_loss": actor_loss, f"{prefix}ent_coef": temperature.squeeze()})
+        if agent.log_ent_coef is not None and agent.ent_coef_optimizer is not None:
+            ent_coef_loss = -(agent.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()  # type: ignore[operator]
+            agent.ent_coef_optimizer.zero_grad()
+            ent_coef_loss.backward()
+            agent.ent_coef_optimizer.step()
+            self._log({f"{prefix}ent_coef_loss": ent_coef_loss})
+
+    def _update_targets(self) -> None:
+        """Polyak step of the target encoder and the target critics."""
+        policy = self.policy
+        _polyak(policy.encoder, policy.encoder_target, self.encoder_tau)
+        for agent in (self._task_agent, self._curious_agent):
+            if agent is not None:
+                _polyak(agent.critic, agent.critic_target, self.tau)
+
+    @property
+    def _in_srl_phase(self) -> bool:
+        return self.srl_schedule == "simultaneous" or self._n_updates // self.srl_period % 2 == 0
+
+    @property
+    def _in_rl_phase(self) -> bool:
+        return self.srl_schedule == "simultaneous" or not self._in_srl_phase
+
+    def _autocast(self) -> th.autocast:
+        return autocast_context(self._computed_precision, self.device)
+
+    def _update_learning_rates(self) -> None:
+        """One schedule for everything; the temperatures follow it at a fixed ratio, so that a zero freezes all."""
+        policy = self.policy
+        learning_rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", learning_rate)
+        policy.encoder_optimizer.set_learning_rate(learning_rate)
+        owners = (policy.srl, policy.actor, policy.critic, policy.curious_actor, policy.curious_critic)
+        for owner in owners:
+            if owner is not None and owner.optimizer is not None:
+                update_learning_rate(owner.optimizer, learning_rate)
+        for optimizer in (self.ent_coef_optimizer, self.curious_ent_coef_optimizer):
+            if optimizer is not None:
+                update_learning_rate(optimizer, learning_rate * self.ent_coef_lr_factor)
+
+    def learn(
+        self: SelfCuReSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CuReSAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCuReSAC:
+        """
+        :param total_timesteps: Agent steps to train for (environment steps / action repeat), all environments together
+        :param callback: SB3 callback(s)
+        :param log_interval: Episodes between two dumps of the logger
+        :param tb_log_name: Name of the run in TensorBoard
+        :param reset_num_timesteps: Whether to start counting anew
+        :param progress_bar: Show a progress bar (needs tqdm and rich)
+        :return: self
+        """
+        # A checkpoint taken while pretraining may have been loaded.
+        self._end_pretraining()
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def pretrain(
+        self: SelfCuReSAC,
+        total_timesteps: int,
+        collector: str = "curious",
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "pretrain",
+        progress_bar: bool = False,
+    ) -> SelfCuReSAC:
+        """Pretrain the representation without task reward (paper, "Effect of Pretraining").
+
+        Trains no task networks. Keeps encoder, target encoder, head and their optimisers (and the curious agent, if
+        curiosity is on), empties the replay buffer and starts counting anew: the ``learn`` that follows is vanilla
+        unless curiosity is on.
+
+        :param total_timesteps: Agent steps
+        :param collector: Who collects: ``"curious"``, a policy trained by the SRL error alone (built for the purpose
+            if curiosity is off), or ``"random"``, uniform actions
+        :param callback: SB3 callback(s)
+        :param log_interval: Episodes between two dumps of the logger
+        :param tb_log_name: Name of the run in TensorBoard
+        :param progress_bar: Show a progress bar (needs tqdm and rich)
+        :return: self
+        :raises ValueError: if there is no SRL head, or the collector is unknown
+        """
+        if self.srl is None:
+            raise ValueError(
+                "pretrain was called with srl=None, but it trains the representation alone: choose srl='rae', "
+                "srl='curl' or a head of your own."
+            )
+        if collector not in ("curious", "random"):
+            raise ValueError(
+                f"pretrain got collector={collector!r}, but data are collected by 'curious' or 'random': choose one."
+            )
+        self._collector = collector
+        if self._has_curious_agent and self.policy.curious_actor is None:
+            self.policy.add_curious_agent()
+            self.policy.to(self.device)
+            if self.curiosity_encoder_grad:
+                self.policy.encoder_optimizer.add_source("curious")
+            self._setup_curious_temperature()
+        self._create_agents()
+        try:
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, True, progress_bar)
+        finally:
+            self._end_pretraining()
+        return self
+
+    def _end_pretraining(self) -> None:
+        if self._collector is None:
+            return
+        self._collector = None
+        if not self._has_curious_agent and self.policy.curious_actor is not None:
+            self.policy.remove_curious_agent()
+            if self.curiosity_encoder_grad:
+                self.policy.encoder_optimizer.remove_source("curious")
+            self.curious_log_ent_coef = self.curious_ent_coef_optimizer = None
+        self._create_agents()
+        self.replay_buffer.reset()  # type: ignore[union-attr]
+        self.num_timesteps = self._n_updates = 0
+        self._warmed_up = False
+        self._last_obs = None
+
+    # --------------------------------------------------------------- logging
+
+    @staticmethod
+    def _prefix(agent: Agent) -> str:
+        """SB3's names for the task agent; the curious one's are marked."""
+        return "train/" if agent.name == "task" else f"train/{agent.name}_"
+
+    def _log(self, values: dict[str, th.Tensor]) -> None:
+        self._metrics.record(self.logger, values)
+
+    def _record_metrics(self, batch: ReplayBufferSamples) -> None:
+        optimizer = self.policy.encoder_optimizer
+        self._log({f"train/latent_grad_norm_{name}": norm for name, norm in optimizer.gradient_norms.items()})
+        self._log({f"train/encoder_share_{name}": share for name, share in optimizer.shares.items()})
+        if self._n_updates % RECONSTRUCTION_INTERVAL == 0:
+            self._log_reconstructions(batch)
+
+    def _log_reconstructions(self, batch: ReplayBufferSamples) -> None:
+        writes_images = any(isinstance(output, TensorBoardOutputFormat) for output in self.logger.output_formats)
+        strip = reconstruction_strip(self.policy, batch, self._frame_stack) if writes_images else None
+        if strip is not None:
+            self.logger.record("srl/reconstructions", Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))
+
+    def dump_logs(self) -> None:
+        """Write the logs: SB3's, and environment steps beside agent steps."""
+        self.logger.record("time/environment_steps", self.num_timesteps * self._action_repeat)
+        if self._mixer is not None and self._mixer.n_steps > 0:
+            self.logger.record("rollout/curious_share", self._mixer.pop_share())
+        super().dump_logs()
+
+    # ---------------------------------------------------------------- saving
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_metrics", "_task_agent", "_curious_agent"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = super()._get_torch_save_params()
+        if self._is_plain_sac:
+            return state_dicts, variables
+        state_dicts = [*state_dicts, "policy.encoder_optimizer"]
+        if self.policy.srl is not None and self.policy.srl.optimizer is not None:
+            state_dicts.append("policy.srl.optimizer")
+        if self.policy.curious_actor is not None:
+            state_dicts += ["policy.curious_actor.optimizer", "policy.curious_critic.optimizer"]
+            if self.curious_ent_coef_optimizer is not None:
+                state_dicts.append("curious_ent_coef_optimizer")
+                variables = [*variables, "curious_log_ent_coef"]
+        return state_dicts, variables
+
+    # -------------------------------------------------------------- checking
+
+    @staticmethod
+    def _check_action_space(action_space: spaces.Space) -> None:
+        if not isinstance(action_space, spaces.Box):
+            raise ValueError(
+                f"the action space is {action_space}, but SAC needs continuous actions (a Box): use another algorithm "
+                "(DQN, PPO), or an environment with continuous actions."
+            )
+        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+            raise ValueError(
+                f"the action space is {action_space}, but SAC needs finite bounds: wrap the environment so that its "
+                "actions lie in, say, [-1, 1] (gymnasium's RescaleAction or ClipAction)."
+            )
+
+    def _check_arguments(self) -> None:
+        """Everything that can be known to be wrong before anything is built."""
+        if self.srl is not None:
+            get_srl_class(self.srl)
+        _check_choice("srl_schedule", self.srl_schedule, ("simultaneous", "alternating"))
+        _check_choice("curiosity", self.curiosity, ("separate", "bonus", "random", None))
+        _check_choice("curiosity_target", self.curiosity_target, ("observation", "next_observation"))
+        _check_choice("update", self.update, ("sequential", "joint"))
+        resolve_precision(self.precision, self.device)
+        CuriousMixer(self.curiosity_prob)
+        for name in ("gamma", "curiosity_gamma", "tau", "encoder_tau"):
+            _check_range(name, getattr(self, name), 0.0, 1.0)
+        for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts", "warmup_updates"):
+            if getattr(self, name) is not None:
+                _check_range(name, getattr(self, name), 0.0, np.inf)
+        for name in ("batch_size", "buffer_size", "srl_period", "actor_update_interval", "target_update_interval"):
+            _check_range(name, getattr(self, name), 1, np.inf)
+        if self.curiosity is not None and self.srl is None:
+            raise ValueError(
+                f"curiosity={self.curiosity!r} was given with srl=None, but the curious reward is the SRL error: "
+                "choose srl='rae', srl='curl' or a head of your own, or set curiosity=None."
+            )
+        if not self.task and self.curiosity != "separate":
+            raise ValueError(
+                f"task=False was given with curiosity={self.curiosity!r}, but an agent without task needs a curious "
+                "policy: set curiosity='separate'."
+            )
+        if self.curiosity == "separate" and self.curiosity_gamma == 0 and self.curiosity_target == "observation":
+            raise ValueError(
+                "curiosity_gamma=0 was given with curiosity_target='observation', but the error of the observation "
+                "itself does not depend on the action, so that there is nothing to learn: set "
+                "curiosity_target='next_observation', or a curiosity_gamma > 0."
+            )
+        if self.use_sde and not self._is_plain_sac:
+            raise ValueError(
+                f"use_sde=True was given with srl={self.srl!r} and curiosity={self.curiosity!r}, but gSDE's noise "
+                "belongs to one actor on its own features: leave use_sde=False, or set srl=None and curiosity=None."
+            )
+        if self.n_steps > 1 and self.curiosity is not None:
+            raise ValueError(
+                f"n_steps={self.n_steps} was given with curiosity={self.curiosity!r}, but the curious reward is known "
+                "for single transitions only: set n_steps=1, or curiosity=None."
+            )
+        if not self._is_plain_sac and not issubclass(self.policy_class, CuRePolicy | sb3_policies.MultiInputPolicy):
+            raise ValueError(
+                f"the policy is {self.policy_class.__name__}, but SRL and curiosity need a subclass of "
+                "sb3_cure.policies.CuRePolicy: use 'CnnPolicy' or 'MlpPolicy'."
+            )
+
+
+def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} is {value!r}, but it must be one of {', '.join(map(repr, choices))}: choose one.")
+
+
+def _check_range(name: str, value: Any, low: float, high: float) -> None:
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (is_number and low <= value <= high):
+        bounds = f"within [{low:g}, {high:g}]" if np.isfinite(high) else f"of at least {low:g}"
+        raise ValueError(f"{name} is {value!r}, but it must be a number {bounds}: change {name}.")
+
+
+@th.no_grad()
+def _polyak(source: th.nn.Module, target: th.nn.Module, tau: float) -> None:
+    """target <- target + tau (source - target), exactly unchanged where they are equal; buffers are copied."""
+    th._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
+    for buffer, target_buffer in zip(source.buffers(), target.buffers(), strict=True):
+        target_buffer.copy_(buffer)

@@ -1,0 +1,156 @@
+"""How the losses that read the latents move the shared encoder.
+
+The SRL loss and the critics' losses all pull at the encoder, with gradients that differ by factors of 1e3 to 1e5.
+A plain sum under one Adam would let the critics drown the autoencoder: Adam divides by the running size of the sum.
+"""
+
+from functools import partial
+from typing import Any
+
+import torch as th
+from torch import nn
+
+#: Every how many updates the sequential mode measures how far each source moved the encoder (it costs a copy)
+SHARE_INTERVAL = 50
+
+
+class EncoderOptimizer:
+    """Turns each source's gradient at the latents into steps of the encoder.
+
+    ``"sequential"`` (the paper's Algorithm 1): every source has its own pass through the encoder, its own Adam state
+    and its own step, taken at once. ``"joint"``: all sources share one pass; the gradient of each is divided by its
+    own running root-mean-square norm, and their sum goes back through the encoder once, for one step.
+
+    :param encoder: The shared encoder
+    :param sources: Names of the losses that train it, e.g. ``("srl", "task", "curious")``
+    :param mode: ``"sequential"`` or ``"joint"``
+    :param optimizer_class: Class of the optimisers
+    :param optimizer_kwargs: Their arguments, the learning rate among them
+    """
+
+    #: Weight of the past in the running mean square of a source's gradient norm (joint)
+    decay = 0.99
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        sources: tuple[str, ...],
+        mode: str,
+        optimizer_class: type[th.optim.Optimizer],
+        **optimizer_kwargs: Any,
+    ):
+        self.parameters = list(encoder.parameters())
+        self.mode = mode
+        self._make_optimizer = partial(optimizer_class, self.parameters, **optimizer_kwargs)
+        self.optimizers: dict[str, th.optim.Optimizer] = {}
+        self.mean_squares: dict[str, th.Tensor] = {}
+        self.weights: dict[str, float] = {}
+        for source in sources:
+            self.add_source(source)
+        self._pulls: dict[str, th.Tensor] = {}
+        self._latents: th.Tensor | None = None
+        self._n_steps = 0
+        #: Norm of each source's gradient at the latents, of the last update (detached scalars)
+        self.gradient_norms: dict[str, th.Tensor] = {}
+        #: Share of each source in the last measured step of the encoder; they add up to 1 (detached scalars)
+        self.shares: dict[str, th.Tensor] = {}
+
+    def add_source(self, source: str) -> None:
+        """
+        :param source: Name of a further loss that trains the encoder
+        """
+        self.optimizers.setdefault(source if self.mode == "sequential" else "joint", self._make_optimizer())
+        self.mean_squares[source] = th.zeros((), device=self.parameters[0].device)
+        self.weights[source] = 0.0
+
+    def remove_source(self, source: str) -> None:
+        """
+        :param source: Name of a loss that no longer trains the encoder
+        """
+        self.optimizers.pop(source, None)
+        del self.mean_squares[source], self.weights[source]
+
+    def pull(self, source: str, latents: th.Tensor, gradient: th.Tensor) -> None:
+        """Take one source's gradient: step at once (sequential), or keep it for ``step`` (joint).
+
+        :param source: Name of the loss
+        :param latents: Output of the encoder, with its graph, [B, features_dim]
+        :param gradient: The loss's gradient with respect to the latents, [B, features_dim]
+        """
+        gradient = gradient.detach()
+        norm = gradient.norm()
+        self.gradient_norms[source] = norm
+        if self.mode == "sequential":
+            optimizer = self.optimizers[source]
+            optimizer.zero_grad()
+            latents.backward(gradient)
+            if self._n_steps % SHARE_INTERVAL == 0:
+                before = [parameter.detach().clone() for parameter in self.parameters]
+                optimizer.step()
+                moved = [now.detach() - then for now, then in zip(self.parameters, before, strict=True)]
+                self._pulls[source] = th.linalg.vector_norm(th.stack(th._foreach_norm(moved)))
+            else:
+                optimizer.step()
+        else:
+            # The policy may have moved to another device since this average was made.
+            mean_square = self.mean_squares[source].to(norm.device)
+            self.mean_squares[source] = mean_square.lerp_(norm.square(), 1 - self.decay)
+            # Undo the bias of an average that starts at zero, as Adam does.
+            self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
+            size = (self.mean_squares[source] / self.weights[source]).sqrt().clamp(min=1e-30)
+            self._pulls[source] = gradient / size
+            self._latents = latents
+
+    def step(self) -> None:
+        """End one update: in joint mode, one backward pass with the scaled gradients and one step."""
+        self._n_steps += 1
+        if self.mode == "joint" and self._latents is not None:
+            optimizer = self.optimizers["joint"]
+            optimizer.zero_grad()
+            self._latents.backward(th.stack(list(self._pulls.values())).sum(dim=0))
+            optimizer.step()
+            self._latents = None
+        if self._pulls:
+            sizes = {source: pull.norm() for source, pull in self._pulls.items()}
+            total = th.stack(list(sizes.values())).sum().clamp(min=1e-30)
+            self.shares = {source: size / total for source, size in sizes.items()}
+            self._pulls = {}
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """
+        :param learning_rate: New learning rate of all optimisers
+        """
+        for optimizer in self.optimizers.values():
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: States of the optimisers and the running sizes of the gradients
+        """
+        return {
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
+            "weights": dict(self.weights),
+            "n_steps": self._n_steps,
+        }
+
+    def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
+        """
+        :param state: Result of ``state_dict``
+        :param strict: Whether a state of other sources or of the other mode is an error (else it is skipped)
+        :raises ValueError: if ``strict`` and the state belongs to another mode or other sources
+        """
+        if state["optimizers"].keys() != self.optimizers.keys() or state["weights"].keys() != self.weights.keys():
+            if strict:
+                raise ValueError(
+                    f"the saved encoder was trained by {sorted(state['weights'])} with optimisers "
+                    f"{sorted(state['optimizers'])}, but this model has {sorted(self.weights)} with "
+                    f"{sorted(self.optimizers)}: load with the update=, srl= and curiosity= it was trained with."
+                )
+            return
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
+        self.weights = dict(state["weights"])
+        self._n_steps = state["n_steps"]

@@ -1,0 +1,128 @@
+"""The shared encoder: a trunk that every part of the agent reads, and a projection to the latent state.
+
+Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), which the CuRe paper uses (appendix A).
+"""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_cure.layers import Projection, conv_sizes, init_weights
+
+
+class Encoder(BaseFeaturesExtractor):
+    """What all encoders share: ``latents = projection(trunk(observation))``.
+
+    Actors read the trunk's features *detached* and own a projection of their own; the critics and the
+    state-representation head read the latents and train both parts.
+
+    :param observation_space: Space of one observation
+    :param features_dim: Size of the latent state
+    :param trunk_dim: Size of the (flat) trunk features
+    """
+
+    trunk: nn.Module
+    projection: nn.Module
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int, trunk_dim: int):
+        super().__init__(observation_space, features_dim)
+        self.trunk_dim = trunk_dim
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: Preprocessed observations, [B, *shape]; images in [0, 1]
+        :return: Latents, [B, features_dim]
+        """
+        return self.projection(self.trunk(observations))
+
+
+class PixelEncoder(Encoder):
+    """3x3 convolutions, the first with stride 2, then a projection (SAC-AE's encoder).
+
+    :param observation_space: Image space, channels first, [C, H, W]
+    :param features_dim: Size of the latent state
+    :param n_filters: Channels of each convolution
+    :param n_layers: Number of convolutions
+    :param tanh: Whether latents end in a tanh
+    :raises ValueError: if the space is no image or smaller than the convolutions need
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int = 50,
+        n_filters: int = 32,
+        n_layers: int = 4,
+        tanh: bool = True,
+    ):
+        shape = observation_space.shape
+        if len(shape) != 3:
+            raise ValueError(
+                f"PixelEncoder got observations of shape {shape}, but needs images (channels, height, width): "
+                "use 'MlpPolicy' for vectors."
+            )
+        if min(features_dim, n_filters, n_layers) < 1:
+            raise ValueError(
+                f"PixelEncoder got features_dim={features_dim}, n_filters={n_filters}, n_layers={n_layers}, "
+                "but each must be at least 1: change features_extractor_kwargs."
+            )
+        height, width = conv_sizes(shape[1], shape[2], n_layers)[-1]
+        super().__init__(observation_space, features_dim, trunk_dim=n_filters * height * width)
+        self.n_filters = n_filters
+        self.n_layers = n_layers
+        layers: list[nn.Module] = []
+        for layer in range(n_layers):
+            channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
+            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU()]
+        self.trunk = nn.Sequential(*layers, nn.Flatten())
+        self.projection = Projection(self.trunk_dim, features_dim, tanh)
+        init_weights(self)
+        # NHWC kernels are the fast ones for convolutions on CPU and GPU; the values are the same.
+        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+
+
+class VectorEncoder(Encoder):
+    """The same split for vectors: one hidden layer as the trunk, then a projection.
+
+    :param observation_space: Any space that SB3 can flatten (Box of rank 1, Discrete, ...)
+    :param features_dim: Size of the latent state
+    :param hidden_dim: Width of the hidden layer
+    :param tanh: Whether latents end in a tanh
+    """
+
+    def __init__(
+        self, observation_space: spaces.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True
+    ):
+        super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
+        inputs = get_flattened_obs_dim(observation_space)
+        self.trunk = nn.Sequential(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
+        self.projection = Projection(hidden_dim, features_dim, tanh)
+        init_weights(self)
+
+
+class ExtractorEncoder(Encoder):
+    """Any SB3 features extractor as the shared encoder: it is the trunk, and its features are the latents.
+
+    :param extractor: The features extractor
+    """
+
+    def __init__(self, extractor: BaseFeaturesExtractor):
+        super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
+        self.trunk = extractor
+        self.projection = nn.Identity()
+
+
+def make_encoder(
+    extractor_class: type[BaseFeaturesExtractor], observation_space: spaces.Space, **kwargs: object
+) -> Encoder:
+    """Build the shared encoder from SB3's ``features_extractor_class`` and ``features_extractor_kwargs``.
+
+    :param extractor_class: One of ours, or any ``BaseFeaturesExtractor``
+    :param observation_space: Space of what the encoder sees (after the head's crop, if it has one)
+    :param kwargs: Passed on to the class
+    :return: The encoder
+    """
+    extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
+    return extractor if isinstance(extractor, Encoder) else ExtractorEncoder(extractor)

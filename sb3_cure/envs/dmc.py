@@ -1,0 +1,170 @@
+"""DeepMind Control tasks as Gymnasium environments that are seen through pixels."""
+
+import difflib
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
+from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
+
+# PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
+ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}
+# Camera 0 of the quadruped does not follow it; 0 for all other domains.
+CAMERAS = {"quadruped": 2}
+# All other tasks end by themselves after 1000 steps of physics.
+STEP_LIMITS = {"lqr": 1000}
+RENDER_FLAGS: dict[str, dict[str, bool]] = {"dmc": {}, "fast": {"shadow": False, "reflection": False}}
+VIDEO_SIZE = 256
+
+
+class DMCPixels(PixelObservation):
+    """
+    Observes a dm_control environment through one of its cameras.
+
+    ``render()`` is left to the environment, so that videos can have another size than the observations.
+
+    :param env: An environment of shimmy that has not rendered yet
+    :param image_size: Height and width of the observation in pixels
+    :param grayscale: One channel of luminance instead of three of RGB
+    :param camera_id: Index of a camera of the model, -1 for its free camera
+    :param renderer: ``"dmc"`` or ``"fast"``, see :func:`make_dmc_env`
+    :raises ValueError: If the model has no such camera
+    """
+
+    def __init__(
+        self, env: gym.Env, image_size: int = 84, grayscale: bool = False, camera_id: int = 0, renderer: str = "dmc"
+    ) -> None:
+        gym.utils.RecordConstructorArgs.__init__(
+            self, image_size=image_size, grayscale=grayscale, camera_id=camera_id, renderer=renderer
+        )
+        super().__init__(env, image_size, grayscale)
+        self.renderer = renderer
+        self.camera_id = camera_id
+        self._physics = env.get_wrapper_attr("physics")
+        self._camera: Any = None
+        model = self._physics.model
+        if isinstance(camera_id, bool) or not isinstance(camera_id, int) or not -1 <= camera_id < model.ncam:
+            raise ValueError(
+                f"camera_id={camera_id!r} is not one of this model's cameras; use 0 to {model.ncam - 1}, or -1 for the "
+                "free camera."
+            )
+        # These take effect because the rendering context is made with the first frame.
+        buffer = model.vis.global_
+        buffer.offwidth = max(buffer.offwidth, self.image_size)
+        buffer.offheight = max(buffer.offheight, self.image_size)
+        if renderer == "fast":
+            model.vis.quality.offsamples = 0
+
+    def frame(self) -> np.ndarray:
+        if self._camera is None:
+            from dm_control.mujoco import Camera
+
+            # The same pixels as `physics.render`, which builds such a camera, and frees it, for every frame.
+            self._camera = Camera(self._physics, self.image_size, self.image_size, self.camera_id)
+        return self._camera.render(render_flag_overrides=RENDER_FLAGS[self.renderer])
+
+    def close(self) -> None:
+        self._camera = None
+        super().close()
+
+
+def make_dmc_env(
+    domain: str,
+    task: str,
+    *,
+    image_size: int = 84,
+    frame_stack: int = 3,
+    action_repeat: int | None = None,
+    camera_id: int | None = None,
+    renderer: str = "dmc",
+    render_mode: str | None = None,
+    seed: int | None = None,
+    grayscale: bool = False,
+) -> gym.Env:
+    """
+    Make a task of the DeepMind Control suite that is seen through pixels.
+
+    Observations are uint8 of shape (3 x frame_stack, image_size, image_size), oldest frame first; the first frame is
+    repeated at reset, and one frame is rendered per agent step. Actions are float32 in [-1, 1]. Episodes last 1000
+    environment steps and end by truncation. ``unwrapped`` is shimmy's ``DmControlCompatibilityV0``.
+
+    :param domain: Domain of the suite, such as ``"cartpole"``
+    :param task: Task of that domain, such as ``"swingup"``
+    :param image_size: Height and width of the observation in pixels
+    :param frame_stack: Number of frames in an observation
+    :param action_repeat: Environment steps per agent step, whose rewards are summed; by default PlaNet's: 8 for
+        cartpole, 2 for finger and walker, 4 for the others
+    :param camera_id: Index of a camera of the model, -1 for its free camera; by default 0, and 2 for quadruped
+    :param renderer: ``"dmc"`` gives the pixels of ``physics.render``; ``"fast"`` leaves out shadows, reflections and
+        multisampling, which is several times faster without a GPU and shows other pixels: another environment
+    :param render_mode: ``"rgb_array"`` lets ``render()`` give RGB frames of 256 x 256 for videos; it does not change
+        the observations
+    :param seed: Seed of the first ``reset`` that is given none; later ones go on with its random stream
+    :param grayscale: One channel of luminance per frame instead of three of RGB
+    :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack``, ``action_repeat`` and
+        ``renderer``
+    :raises ValueError: If there is no such task or an argument is out of range
+    :raises GLUnavailableError: If OpenGL is missing
+    """
+    if task not in DMC_TASKS.get(domain, ()):
+        known = [f"{domain}-{task}" for domain, tasks in DMC_TASKS.items() for task in tasks]
+        close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
+        raise ValueError(
+            f"'{domain}-{task}' is not a task of the DeepMind Control suite; the closest are {close} "
+            "(sb3_cure.envs.DMC_TASKS has all)."
+        )
+    if renderer not in RENDER_FLAGS:
+        raise ValueError(f"renderer={renderer!r} is unknown; use 'dmc', or 'fast' for no shadows and reflections.")
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode={render_mode!r} is not supported; use 'rgb_array', or None for no videos.")
+    action_repeat = ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat
+    camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id
+
+    from sb3_cure.envs.rendering import load_gl
+
+    load_gl()
+    import shimmy  # noqa: F401  (registers dm_control/... and imports dm_control, hence not before load_gl)
+
+    env = gym.make(
+        f"dm_control/{domain}-{task}-v0",
+        max_episode_steps=STEP_LIMITS.get(domain),
+        disable_env_checker=True,
+        # lqr draws the stiffness of its springs when it is built: an id must mean the same physics every time.
+        task_kwargs={"random": 0},
+        render_mode=render_mode,
+        render_kwargs={
+            "height": VIDEO_SIZE,
+            "width": VIDEO_SIZE,
+            "camera_id": camera_id,
+            "render_flag_overrides": RENDER_FLAGS[renderer],
+        },
+    )
+    base: Any = env.unwrapped
+    base.np_random = np.random.RandomState(seed)
+    # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.
+    base.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / base.control_timestep()}
+    # As gymnasium.make would set it, so that loggers and copies see this environment and not the one underneath.
+    base.spec = EnvSpec(
+        dmc_env_id(domain, task),
+        entry_point=ENTRY_POINT,
+        order_enforce=False,
+        disable_env_checker=True,
+        kwargs={
+            "domain": domain,
+            "task": task,
+            "image_size": image_size,
+            "frame_stack": frame_stack,
+            "action_repeat": action_repeat,
+            "camera_id": camera_id,
+            "renderer": renderer,
+            "render_mode": render_mode,
+            "seed": seed,
+            "grayscale": grayscale,
+        },
+    )
+    env = ActionRepeat(NormalizeActions(env), action_repeat)
+    env = DMCPixels(env, image_size, grayscale, camera_id, renderer)
+    return StackFrames(env, frame_stack)

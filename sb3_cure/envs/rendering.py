@@ -1,0 +1,77 @@
+"""The OpenGL that dm_control renders with: which backend is used, and whether it works."""
+
+import importlib
+import os
+import sys
+
+
+class GLUnavailableError(RuntimeError):
+    """OpenGL cannot be loaded or cannot render; the message says what to do."""
+
+
+def _missing(cause: object) -> GLUnavailableError:
+    backend = os.environ.get("MUJOCO_GL", "unset")
+    first_line = str(cause).partition("\n")[0].rstrip(".")
+    return GLUnavailableError(
+        f"OpenGL cannot render here (MUJOCO_GL={backend}: {first_line}): install the libraries with "
+        "`apt-get install libegl1 libopengl0 libgl1-mesa-dri` (Debian, Ubuntu) and leave MUJOCO_GL unset, "
+        "or set it to a backend that works here (egl, glfw or osmesa)."
+    )
+
+
+def load_gl() -> None:
+    """
+    Load the OpenGL backend of dm_control: EGL if there is no display and ``MUJOCO_GL`` is not set.
+
+    No rendering context is made, so a process that has only called this can still be forked.
+
+    :raises GLUnavailableError: If the libraries or their drivers are missing
+    """
+    headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if headless:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    importlib.import_module("dm_control")  # outside of the try: its absence is no matter of OpenGL
+    try:
+        backend = importlib.import_module("dm_control._render").BACKEND
+    # PyOpenGL fails in many ways when a library is missing, most often with an AttributeError of None.
+    except Exception as error:
+        raise _missing(error) from error
+    if backend in (None, "off"):
+        raise _missing("no rendering backend")
+    # dm_control prefers GLFW when it is imported without MUJOCO_GL, even here, where that aborts the process.
+    if backend == "glfw" and headless:
+        raise GLUnavailableError(
+            "dm_control was imported with its GLFW backend, which needs a display, and there is none; set "
+            "MUJOCO_GL=egl before starting Python."
+        )
+
+
+def check_gl() -> str:
+    """
+    Render an empty scene.
+
+    :return: The name that OpenGL gives its renderer, such as ``"llvmpipe (LLVM 15.0.6, 256 bits)"``
+    :raises GLUnavailableError: If that fails
+    """
+    load_gl()
+    from dm_control import mujoco
+
+    try:
+        from OpenGL import GL
+
+        physics = mujoco.Physics.from_xml_string("<mujoco><worldbody/></mujoco>")
+        try:
+            physics.render(height=16, width=16)
+            with physics.contexts.gl.make_current() as context:
+                return context.call(GL.glGetString, GL.GL_RENDERER).decode()
+        finally:
+            physics.free()
+    except Exception as error:
+        raise _missing(error) from error
+
+
+if __name__ == "__main__":
+    try:
+        print(check_gl())
+    except GLUnavailableError as unavailable:
+        sys.exit(str(unavailable))

@@ -1,0 +1,185 @@
+"""From an environment that can render itself to one that an agent sees through pixels."""
+
+from collections import deque
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import RepeatAction
+from PIL import Image
+
+# MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
+UNBOUNDED = 1e10
+
+
+def check_at_least_one(name: str, value: Any, usual: int) -> int:
+    """
+    :param name: What the value is, for the message
+    :param value: The value to check
+    :param usual: A good value to suggest
+    :return: The value as a plain integer
+    :raises ValueError: If it is not an integer of at least 1
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name}={value!r} is not an integer of at least 1; use {name}={usual}, for example.")
+    return int(value)
+
+
+class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
+    """
+    Takes float32 actions in [-1, 1], clips them to that range and scales them to the bounds of the environment.
+
+    Actions without bounds are clipped and not scaled. Unlike :class:`gymnasium.wrappers.RescaleAction`, this accepts
+    them, does not keep the float64 of the environment's space, and clips.
+
+    :param env: An environment whose actions are floats in a ``Box``
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+        bounds = env.action_space
+        if not isinstance(bounds, spaces.Box) or not np.issubdtype(bounds.dtype, np.floating):
+            raise ValueError(
+                f"The actions {bounds} cannot be scaled: expected floats in a Box; leave out NormalizeActions."
+            )
+        low, high = bounds.low.astype(np.float64), bounds.high.astype(np.float64)
+        bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
+        low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        # As centre and half width, symmetric bounds of 1 leave each action bit-equal.
+        self._center, self._half_width = (high + low) / 2, (high - low) / 2
+        self.action_space = spaces.Box(-1.0, 1.0, bounds.shape, np.float32)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        return self._center + self._half_width * np.clip(action, -1.0, 1.0)
+
+
+class ActionRepeat(RepeatAction):
+    """
+    Repeats each action, sums the rewards, and stops early where the episode ends.
+
+    Unlike the wrapper it is made from, it tells its ``action_repeat`` and that videos have fewer frames per second.
+
+    :param env: The environment
+    :param num_repeats: Environment steps per agent step
+    :raises ValueError: If ``num_repeats`` is not an integer of at least 1
+    """
+
+    def __init__(self, env: gym.Env, num_repeats: int) -> None:
+        self.action_repeat = check_at_least_one("action_repeat", num_repeats, usual=4)
+        super().__init__(env, self.action_repeat)
+        if "render_fps" in env.metadata:
+            self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / self.action_repeat}
+
+
+class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConstructorArgs):
+    """
+    Replaces observations by rendered frames: uint8 of shape (channels, image_size, image_size), one render per step.
+
+    :param env: An environment made with ``render_mode="rgb_array"``
+    :param image_size: Height and width of the observation in pixels; frames of another size are area-averaged to it
+    :param grayscale: One channel of luminance instead of three of RGB
+    :raises ValueError: If ``image_size`` is not an integer of at least 1, or, when first reset, if ``env`` does not
+        render uint8 RGB frames
+    """
+
+    def __init__(self, env: gym.Env, image_size: int = 84, grayscale: bool = False) -> None:
+        RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale)
+        super().__init__(env)
+        self.image_size = check_at_least_one("image_size", image_size, usual=84)
+        self.grayscale = grayscale
+        shape = (1 if grayscale else 3, self.image_size, self.image_size)
+        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
+
+    def frame(self) -> Any:
+        """
+        :return: The frame to observe, uint8 of shape (height, width, 3)
+        """
+        return self.env.render()
+
+    def observation(self, observation: Any) -> np.ndarray:
+        frame = self.frame()
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[-1] != 3:
+            raise ValueError(
+                f"Rendering with render_mode={self.env.render_mode!r} gave no uint8 frame of shape (height, width, 3); "
+                "make the environment with render_mode='rgb_array'."
+            )
+        if self.grayscale or frame.shape[:2] != (self.image_size, self.image_size):
+            image = Image.fromarray(frame)
+            if self.grayscale:
+                image = image.convert("L")
+            frame = np.asarray(image.resize((self.image_size, self.image_size), Image.Resampling.BOX))
+        # Always a copy, because a renderer may draw its next frame into the same memory.
+        return np.array(np.moveaxis(np.atleast_3d(frame), -1, 0), order="C")
+
+
+class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+    """
+    Joins the last observations along their first axis, oldest first; the first one of an episode is repeated.
+
+    :param env: An environment whose observations are arrays, such as channels-first images
+    :param frame_stack: Number of observations in a stack
+    :raises ValueError: If ``frame_stack`` is not an integer of at least 1
+    """
+
+    def __init__(self, env: gym.Env, frame_stack: int = 3) -> None:
+        RecordConstructorArgs.__init__(self, frame_stack=frame_stack)
+        super().__init__(env)
+        self.frame_stack = check_at_least_one("frame_stack", frame_stack, usual=3)
+        box = env.observation_space
+        if not isinstance(box, spaces.Box):
+            raise ValueError(
+                f"Observations of {box} cannot be stacked: expected a Box; wrap in PixelObservation first."
+            )
+        low, high = (np.concatenate([bound] * self.frame_stack) for bound in (box.low, box.high))
+        self.observation_space = spaces.Box(low, high, dtype=box.dtype.type)
+        self._frames: deque[np.ndarray] = deque(maxlen=self.frame_stack)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        frame, info = self.env.reset(seed=seed, options=options)
+        self._frames.extend([frame] * self.frame_stack)
+        return np.concatenate(self._frames), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        frame, reward, terminated, truncated, info = self.env.step(action)
+        self._frames.append(frame)
+        return np.concatenate(self._frames), reward, terminated, truncated, info
+
+
+def make_pixel_env(
+    env: str | gym.Env,
+    *,
+    image_size: int = 84,
+    frame_stack: int = 3,
+    action_repeat: int = 1,
+    grayscale: bool = False,
+) -> gym.Env:
+    """
+    Make any Gymnasium environment that can render itself one that is seen through pixels.
+
+    Observations are uint8 of shape (channels x frame_stack, image_size, image_size), oldest frame first; the first
+    frame is repeated at reset, and one frame is rendered per agent step. Float actions in a ``Box`` become float32 in
+    [-1, 1]. What ``env`` observed is dropped.
+
+    :param env: Gymnasium id, or an environment made with ``render_mode="rgb_array"``
+    :param image_size: Height and width of the observation in pixels
+    :param frame_stack: Number of frames in an observation
+    :param action_repeat: Environment steps per agent step; their rewards are summed
+    :param grayscale: One channel of luminance per frame instead of three of RGB
+    :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack`` and ``action_repeat``
+    :raises ValueError: If an argument is out of range or ``env`` cannot render RGB frames
+    """
+    if isinstance(env, str):
+        env = gym.make(env, render_mode="rgb_array")
+    if env.render_mode is None:
+        raise ValueError(
+            f"{env} was made with render_mode=None; make it with render_mode='rgb_array' to see its pixels."
+        )
+    if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):
+        env = NormalizeActions(env)
+    env = PixelObservation(ActionRepeat(env, action_repeat), image_size, grayscale)
+    return StackFrames(env, frame_stack)

@@ -1,0 +1,80 @@
+"""Building blocks of the encoder, the decoder, the actors and the critics."""
+
+from typing import TypeVar
+
+import torch as th
+from torch import nn
+
+ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+
+def init_weights(module: ModuleT) -> ModuleT:
+    """Initialise in place as SAC-AE does: orthogonal linear maps, delta-orthogonal convolutions of gain sqrt(2).
+
+    Delta-orthogonal (Xiao et al., 2018): all taps of a kernel are zero but the central one, which is orthogonal.
+
+    :param module: Any module; its linear and convolution layers are initialised, biases become 0
+    :return: The same module
+    """
+
+    def init(layer: nn.Module) -> None:
+        if isinstance(layer, nn.Linear):
+            nn.init.orthogonal_(layer.weight)
+        elif isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
+            nn.init.zeros_(layer.weight)
+            middle = layer.weight.shape[-1] // 2
+            nn.init.orthogonal_(layer.weight.data[:, :, middle, middle], nn.init.calculate_gain("relu"))
+        else:
+            return
+        if layer.bias is not None:
+            nn.init.zeros_(layer.bias)
+
+    return module.apply(init)
+
+
+def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
+    """Sizes along a stack of 3x3 convolutions without padding, the first of stride 2.
+
+    :param height: Height of the image, pixels
+    :param width: Width of the image, pixels
+    :param n_layers: Number of convolutions
+    :return: (height, width) of the image and of each layer's output: ``n_layers + 1`` pairs
+    :raises ValueError: if the image is too small
+    """
+    smallest = 4 * n_layers - 1
+    if min(height, width) < smallest:
+        raise ValueError(
+            f"observations of {height}x{width} pixels are too small for {n_layers} convolutions of 3x3 (the first "
+            f"with stride 2), which need at least {smallest}x{smallest}: use a larger image_size, or fewer layers "
+            "through policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=...))."
+        )
+    sizes = [(height, width), ((height - 3) // 2 + 1, (width - 3) // 2 + 1)]
+    for _ in range(n_layers - 1):
+        sizes.append((sizes[-1][0] - 2, sizes[-1][1] - 2))
+    return sizes
+
+
+def full_precision(tensor: th.Tensor) -> th.autocast:
+    """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
+    return th.autocast(tensor.device.type, enabled=False)
+
+
+class Projection(nn.Module):
+    """Linear map, LayerNorm and (by default) tanh: trunk features [B, in_dim] to latents [B, out_dim].
+
+    :param in_dim: Size of the trunk's features
+    :param out_dim: Size of the latent state
+    :param tanh: Whether latents are squashed into (-1, 1) (SAC-AE, DrQ); CURL's code leaves it out
+    """
+
+    def __init__(self, in_dim: int, out_dim: int, tanh: bool = True):
+        super().__init__()
+        self.linear = nn.Linear(in_dim, out_dim)
+        self.norm = nn.LayerNorm(out_dim)
+        self.tanh = tanh
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        projected = self.linear(features)
+        with full_precision(projected):
+            latents = self.norm(projected.float())
+            return th.tanh(latents) if self.tanh else latents

@@ -1,0 +1,76 @@
+"""Training metrics: tensors while training, Python floats once, when the logger writes them."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_cure.policies import CuRePolicy
+
+
+class Metrics(KVWriter):
+    """Averages detached tensors between two dumps of SB3's logger.
+
+    Reading a tensor's value waits for the device, so it is done only when there is something to write. The object is
+    the logger's first output format: SB3 hands every format the same dictionary, in which it turns tensors to floats.
+    """
+
+    def __init__(self) -> None:
+        self._sums: dict[str, th.Tensor] = {}
+        self._counts: dict[str, int] = {}
+
+    def attach(self, logger: Logger) -> None:
+        """
+        :param logger: SB3's logger; attaching twice changes nothing
+        """
+        if self not in logger.output_formats:
+            logger.output_formats.insert(0, self)
+
+    def record(self, logger: Logger, values: dict[str, th.Tensor]) -> None:
+        """
+        :param logger: SB3's logger
+        :param values: Scalars by key, detached
+        """
+        for key, value in values.items():
+            value = value.detach()
+            self._sums[key] = self._sums[key] + value if key in self._sums else value
+            self._counts[key] = self._counts.get(key, 0) + 1
+            logger.record(key, value)
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Called by the logger before the formats that write."""
+        for key, value in key_values.items():
+            if key in self._sums:
+                key_values[key] = float(self._sums.pop(key)) / self._counts.pop(key)
+            elif isinstance(value, th.Tensor) and value.numel() == 1:
+                key_values[key] = float(value)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@th.no_grad()
+def reconstruction_strip(
+    policy: CuRePolicy, batch: ReplayBufferSamples, frame_stack: int, columns: int = 8
+) -> np.ndarray | None:
+    """Newest frames of a few observations above their reconstructions.
+
+    :param policy: The policy, whose encoder and SRL head are used
+    :param batch: Samples of image observations
+    :param frame_stack: Frames per observation
+    :param columns: How many observations
+    :return: uint8 image (C, 2 * H, columns * W) with C = 1 or 3, or None if the head draws no images
+    """
+    observations = batch.observations[:columns]
+    if policy.srl is None or observations.dim() != 4:
+        return None
+    drawn = policy.srl.reconstruct(policy.encode(observations))
+    if drawn is None:
+        return None
+    channels = observations.shape[1] // frame_stack
+    if channels not in (1, 3):
+        channels = 1
+    rows = [list(images[:, -channels:].cpu().numpy()) for images in (observations, drawn)]
+    return np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)

@@ -1,0 +1,344 @@
+"""Encoder, task actor-critic, curious actor-critic, SRL head and their optimisers, as one SB3 policy."""
+
+import contextlib
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+from sb3_cure.curiosity import CuriousReward
+from sb3_cure.encoder_optimizer import EncoderOptimizer
+from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
+from sb3_cure.layers import Projection, full_precision, init_weights
+from sb3_cure.srl import SRLHead
+
+# Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
+LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+
+
+class TrunkActor(Actor):
+    """SAC's actor on the (detached) trunk features of the shared encoder, behind a projection of its own."""
+
+    def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
+        """
+        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :return: Mean and log standard deviation before squashing, [B, action_dim] each
+        """
+        latent = self.latent_pi(self.features_extractor(obs))
+        with full_precision(latent):
+            latent = latent.float()
+            # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
+            log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
+            log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
+            return self.mu(latent), log_std, {}
+
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B]
+        """
+        mean, log_std, kwargs = self.get_action_dist_params(obs)
+        with full_precision(mean):
+            return self.action_dist.log_prob_from_params(mean, log_std, **kwargs)
+
+
+class LatentCritic(ContinuousCritic):
+    """SAC's critics on the latents of the shared encoder, which they do not own."""
+
+    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        :param obs: Latents, [B, features_dim]
+        :param actions: [B, action_dim], in [-1, 1]
+        :return: Q values of each critic, [B, 1]
+        """
+        inputs = th.cat([obs, actions], dim=1)
+        return tuple(self._q_value(q_net, inputs) for q_net in self.q_networks)
+
+    @staticmethod
+    def _q_value(q_net: nn.Sequential, inputs: th.Tensor) -> th.Tensor:
+        for layer in list(q_net)[:-1]:
+            inputs = layer(inputs)
+        with full_precision(inputs):
+            return q_net[-1](inputs.float())
+
+
+class CuRePolicy(SACPolicy):
+    """All networks of CuReSAC and their optimisers.
+
+    ``encoder`` is trained by the SRL head and by the critics; actors see its trunk's features detached. With
+    ``curious=True`` there is a second actor-critic. Names: ``encoder``, ``encoder_target``, ``srl``, ``actor``,
+    ``critic``, ``critic_target``, ``curious_actor``, ``curious_critic``, ``curious_critic_target``, ``curiosity``
+    (scale and running statistics of the curious reward), ``encoder_optimizer``.
+
+    :param observation_space: Observation space (channels-first images, or vectors)
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule
+    :param net_arch: Hidden layers of actors and critics (paper: 1024; two of them in SAC-AE)
+    :param activation_fn: Activation function
+    :param use_sde: Accepted because SB3 passes it; must be False
+    :param features_extractor_class: ``PixelEncoder``, ``VectorEncoder`` or any SB3 ``BaseFeaturesExtractor``
+    :param features_extractor_kwargs: Its arguments
+    :param normalize_images: Must be True: heads and encoder read images in 0-255
+    :param optimizer_class: Optimiser of everything, ``th.optim.Adam`` by default
+    :param optimizer_kwargs: Its arguments but for the learning rate
+    :param n_critics: Number of critics of each agent
+    :param share_encoder: Must be True; it asks for this policy where neither SRL nor curiosity does
+    :param srl_class: Class of the SRL head, or None
+    :param srl_kwargs: Its arguments
+    :param curious: Whether there is a second, curious actor-critic
+    :param curiosity_kwargs: Arguments of ``CuriousReward``
+    :param encoder_sources: Which losses train the encoder
+    :param update: ``"sequential"`` or ``"joint"``, see ``EncoderOptimizer``
+    """
+
+    encoder: Encoder
+    encoder_target: Encoder
+    srl: SRLHead | None
+    actor: TrunkActor
+    critic: LatentCritic
+    critic_target: LatentCritic
+    curious_actor: TrunkActor
+    curious_critic: LatentCritic
+    curious_critic_target: LatentCritic
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        use_sde: bool = False,
+        features_extractor_class: type[BaseFeaturesExtractor] = PixelEncoder,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        share_encoder: bool = True,
+        srl_class: type[SRLHead] | None = None,
+        srl_kwargs: dict[str, Any] | None = None,
+        curious: bool = False,
+        curiosity_kwargs: dict[str, Any] | None = None,
+        encoder_sources: tuple[str, ...] = ("task",),
+        update: str = "sequential",
+    ):
+        if not (normalize_images and share_encoder) or use_sde:
+            raise ValueError(
+                f"policy_kwargs got normalize_images={normalize_images}, share_encoder={share_encoder}, "
+                f"use_sde={use_sde}, but the shared encoder reads images in 0-255 and has no gSDE: leave them out, or "
+                "use srl=None and curiosity=None, which is SB3's own SAC."
+            )
+        # SACPolicy builds within its constructor: what _build needs comes first.
+        self._blueprint: dict[str, Any] = dict(
+            srl_class=srl_class,
+            srl_kwargs=srl_kwargs or {},
+            curious=curious,
+            curiosity_kwargs=curiosity_kwargs or {},
+            encoder_sources=encoder_sources,
+            update=update,
+        )
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            [1024, 1024] if net_arch is None else net_arch,
+            activation_fn,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            n_critics=n_critics,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        blueprint = self._blueprint
+        self.learning_rate = lr_schedule(1)
+        self._build_encoder(blueprint["srl_class"], blueprint["srl_kwargs"])
+        self.actor, self.critic, self.critic_target = self._make_actor_critic()
+        # Always there, as the same buffers then travel with every archive; it costs three numbers.
+        self.curiosity = CuriousReward(**blueprint["curiosity_kwargs"])
+        self._acting = "actor"
+        self.remove_curious_agent()
+        if blueprint["curious"]:
+            self.add_curious_agent()
+        self.encoder_optimizer = EncoderOptimizer(
+            self.encoder,
+            blueprint["encoder_sources"],
+            blueprint["update"],
+            self.optimizer_class,
+            lr=self.learning_rate,
+            **self.optimizer_kwargs,
+        )
+
+    def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
+        space, defaults = self.observation_space, {}
+        if srl_class is not None:
+            space, defaults = srl_class.configure_encoder(self.observation_space, **srl_kwargs)
+        if not issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
+            defaults = {}
+        self.encoder_space = space
+        kwargs = {**defaults, **self.features_extractor_kwargs}
+        self.encoder = make_encoder(self.features_extractor_class, space, **kwargs)
+        self.encoder_target = copy.deepcopy(self.encoder).requires_grad_(False)
+        self.srl = None
+        if srl_class is not None:
+            self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
+            self.srl.bind_target_encoder(self.encoder_target)
+            parameters = list(self.srl.parameters())
+            # A head without parameters (say, one that scores latents) has nothing to optimise.
+            self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None  # type: ignore[assignment]
+
+    def _make_actor_critic(self) -> tuple[TrunkActor, LatentCritic, LatentCritic]:
+        encoder = self.encoder
+        tanh = getattr(encoder.projection, "tanh", True)
+        actor = TrunkActor(
+            **self.actor_kwargs,
+            features_extractor=Projection(encoder.trunk_dim, encoder.features_dim, tanh),
+            features_dim=encoder.features_dim,
+        )
+        critic = LatentCritic(
+            **self.critic_kwargs,
+            features_extractor=nn.Identity(),  # type: ignore[arg-type]
+            features_dim=encoder.features_dim,
+        )
+        init_weights(actor).to(self.device)
+        init_weights(critic).to(self.device)
+        target = copy.deepcopy(critic).requires_grad_(False)
+        target.set_training_mode(False)
+        actor.optimizer = self._make_optimizer(actor.parameters())
+        critic.optimizer = self._make_optimizer(critic.parameters())
+        return actor, critic, target
+
+    def _make_optimizer(self, parameters: Any, **kwargs: Any) -> th.optim.Optimizer:
+        return self.optimizer_class(parameters, lr=self.learning_rate, **{**self.optimizer_kwargs, **kwargs})  # type: ignore[call-arg]
+
+    def add_curious_agent(self) -> None:
+        """Build the second actor-critic (with fresh weights)."""
+        self.curious_actor, self.curious_critic, self.curious_critic_target = self._make_actor_critic()
+
+    def remove_curious_agent(self) -> None:
+        """Drop the second actor-critic."""
+        self.curious_actor = self.curious_critic = self.curious_critic_target = None  # type: ignore[assignment]
+
+    def preprocess(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: What the encoder is to see (after ``srl.augment`` or ``srl.center``), images in 0-255
+        :return: The encoder's input: images in [0, 1], in the memory order that its convolutions like
+        """
+        inputs = preprocess_obs(observations, self.encoder_space)
+        return inputs.contiguous(memory_format=th.channels_last) if inputs.dim() == 4 else inputs  # type: ignore[union-attr]
+
+    def augment(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: Randomly augmented encoder inputs, as in training
+        """
+        return self.preprocess(observations if self.srl is None else self.srl.augment(observations))
+
+    def center(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: Encoder inputs without randomness, as when acting
+        """
+        return self.preprocess(observations if self.srl is None else self.srl.center(observations))
+
+    def encode(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: Latents as the acting agent sees them, [B, features_dim]
+        """
+        return self.encoder(self.center(observations))
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        actor = getattr(self, self._acting)
+        return actor(self.encoder.trunk(self.center(observation)), deterministic)  # type: ignore[arg-type]
+
+    def act_with(self, actor: str) -> None:
+        """
+        :param actor: Who acts from now on: ``"actor"`` or ``"curious_actor"``
+        """
+        self._acting = actor
+
+    @contextlib.contextmanager
+    def acting(self, actor: str) -> Iterator[None]:
+        """Within this context ``predict`` asks the given actor.
+
+        :param actor: ``"actor"`` or ``"curious_actor"``
+        """
+        previous, self._acting = self._acting, actor
+        try:
+            yield
+        finally:
+            self._acting = previous
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: Whether layers that differ between training and evaluation behave as in training
+        """
+        self.train(mode)
+        for target in (self.encoder_target, self.critic_target, self.curious_critic_target):
+            if target is not None:
+                target.train(False)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for key in ("log_std_init", "use_expln", "clip_mean"):
+            del data[key]
+        data.update(self._blueprint, curious=self.curious_actor is not None)
+        return data
+
+
+class CnnPolicy(CuRePolicy):
+    """``CuRePolicy`` for images."""
+
+
+class MlpPolicy(CuRePolicy):
+    """``CuRePolicy`` for vectors: the same but for the encoder's default class."""
+
+    def __init__(self, *args: Any, features_extractor_class: type = VectorEncoder, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+def check_shared_encoder_space(observation_space: spaces.Space, policy_class: type) -> None:
+    """Whether the shared encoder can read these observations.
+
+    :param observation_space: Observation space of the environment
+    :param policy_class: The policy that is to read it
+    :raises ValueError: if it cannot
+    """
+    if isinstance(observation_space, spaces.Dict | spaces.Tuple):
+        raise ValueError(
+            f"observations are {observation_space}, but the shared encoder reads one image or one vector: pick one "
+            "entry with a wrapper (gymnasium's FilterObservation and FlattenObservation), or use srl=None and "
+            "curiosity=None, which is SB3's own SAC."
+        )
+    image_like = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 3
+    if image_like and (
+        observation_space.dtype != np.uint8
+        or np.any(observation_space.low != 0)  # type: ignore[attr-defined]
+        or np.any(observation_space.high != 255)  # type: ignore[attr-defined]
+    ):
+        raise ValueError(
+            f"images arrive as {observation_space.dtype} in [{observation_space.low.min()}, "  # type: ignore[attr-defined]
+            f"{observation_space.high.max()}], but the encoder and the replay buffer take uint8 in [0, 255]: give "  # type: ignore[attr-defined]
+            "the environment's images as they are rendered, and VecNormalize with norm_obs=False."
+        )
+    if issubclass(policy_class, MlpPolicy) and image_like:
+        raise ValueError(
+            f"'MlpPolicy' got images of shape {observation_space.shape}, but it reads vectors: use 'CnnPolicy'."
+        )
+    if issubclass(policy_class, CnnPolicy) and not image_like:
+        raise ValueError(
+            f"'CnnPolicy' got observations of shape {observation_space.shape}, but it reads images (channels, height, "
+            "width): use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels."
+        )

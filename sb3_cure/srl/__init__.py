@@ -1,0 +1,31 @@
+"""State-representation-learning heads, by name.
+
+``SRLHead`` is the contract; ``"rae"`` and ``"curl"`` are built in; any subclass can be passed as ``srl=``.
+"""
+
+import inspect
+
+from sb3_cure.srl.autoencoder import RAE
+from sb3_cure.srl.base import SRLHead, SRLOutput
+from sb3_cure.srl.contrastive import CURL
+
+SRL_HEADS: dict[str, type[SRLHead]] = {"rae": RAE, "curl": CURL}
+
+
+def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
+    """
+    :param srl: Name of a built-in head, or a subclass of ``SRLHead``
+    :return: The class
+    :raises ValueError: if it is neither
+    """
+    if isinstance(srl, str) and srl in SRL_HEADS:
+        return SRL_HEADS[srl]
+    if inspect.isclass(srl) and issubclass(srl, SRLHead):
+        return srl
+    raise ValueError(
+        f"srl is {srl!r}, but it must be one of {', '.join(map(repr, SRL_HEADS))}, None, or a subclass of "
+        "sb3_cure.srl.SRLHead (the class itself, not an instance)."
+    )
+
+
+__all__ = ["CURL", "RAE", "SRL_HEADS", "SRLHead", "SRLOutput", "get_srl_class"]

@@ -1,0 +1,146 @@
+"""Regularised autoencoder (RAE): eq. 2 of the paper, as SAC-AE (Yarats et al., 2019) implements it."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import nn
+
+from sb3_cure.encoders import Encoder
+from sb3_cure.layers import conv_sizes, full_precision, init_weights
+from sb3_cure.srl.base import SRLHead, SRLOutput
+
+
+class PixelDecoder(nn.Module):
+    """The mirror image of ``PixelEncoder``: a linear map, transposed 3x3 convolutions, the last one with stride 2.
+
+    :param latent_dim: Size of the latent state
+    :param shape: Shape of the observation to draw, (C, H, W)
+    :param n_filters: Channels of the hidden layers
+    :param n_layers: Number of transposed convolutions
+    """
+
+    def __init__(self, latent_dim: int, shape: tuple[int, ...], n_filters: int = 32, n_layers: int = 4):
+        super().__init__()
+        sizes = conv_sizes(shape[1], shape[2], n_layers)
+        self.first_shape = (n_filters, *sizes[-1])
+        self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
+        hidden: list[nn.Module] = []
+        for _ in range(n_layers - 1):
+            hidden += [nn.ConvTranspose2d(n_filters, n_filters, 3), nn.ReLU()]
+        self.hidden = nn.Sequential(*hidden)
+        # The strided convolution may drop the last row or column; output padding gives it back.
+        padding = tuple(size - (2 * (half - 1) + 3) for size, half in zip(sizes[0], sizes[1], strict=True))
+        self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2, output_padding=padding)
+        init_weights(self)
+        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, latents: th.Tensor) -> th.Tensor:
+        """
+        :param latents: [B, latent_dim]
+        :return: Images in the target's scale, about [-0.5, 0.5], [B, C, H, W]
+        """
+        hidden = th.relu(self.linear(latents)).view(-1, *self.first_shape)
+        hidden = self.hidden(hidden.contiguous(memory_format=th.channels_last))
+        with full_precision(hidden):
+            return self.output(hidden.float())
+
+
+class VectorDecoder(nn.Sequential):
+    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]."""
+
+    def __init__(self, latent_dim: int, out_dim: int, hidden_dim: int = 256):
+        super().__init__(nn.Linear(latent_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, out_dim))
+        init_weights(self)
+
+
+class RAE(SRLHead):
+    """Regularised autoencoder: squared reconstruction error + latent penalty + weight decay of the decoder.
+
+    The paper's eq. 2 gives the log-likelihood a plus sign; what is meant, and done here, is to *minimise*
+    the squared error. Images are reduced to 5 bits and dithered with uniform noise, as in SAC-AE (after Glow).
+
+    :param encoder: The shared encoder
+    :param observation_space: Space of the stored observations: images, or anything that SB3 can flatten
+    :param latent_penalty: lambda_z, on half the squared norm of the latents
+    :param decoder_weight_decay: lambda_theta, applied by the decoder's optimiser
+    :param bits: Bits that are left of each pixel's 8
+    """
+
+    warmup_updates = 1000
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        observation_space: spaces.Space,
+        latent_penalty: float = 1e-6,
+        decoder_weight_decay: float = 1e-7,
+        bits: int = 5,
+    ):
+        super().__init__(encoder, observation_space)
+        if not 1 <= bits <= 8:
+            raise ValueError(f"srl_kwargs got bits={bits}, but a pixel has 8: give a number from 1 to 8.")
+        if latent_penalty < 0 or decoder_weight_decay < 0:
+            raise ValueError(
+                f"srl_kwargs got latent_penalty={latent_penalty} and decoder_weight_decay={decoder_weight_decay}, "
+                "but both are penalties: give numbers >= 0."
+            )
+        self.latent_penalty = latent_penalty
+        self.optimizer_kwargs = {"weight_decay": decoder_weight_decay}
+        self.levels = 2**bits
+        self.pixels = is_image_space(observation_space)
+        self.decoder: nn.Module
+        if self.pixels:
+            self.decoder = PixelDecoder(
+                encoder.features_dim,
+                observation_space.shape,  # type: ignore[arg-type]
+                # Not every features extractor has these; SAC-AE's own sizes otherwise.
+                getattr(encoder, "n_filters", 32),
+                getattr(encoder, "n_layers", 4),
+            )
+        else:
+            self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(observation_space))
+
+    def target(self, observations: th.Tensor, dither: bool) -> th.Tensor:
+        """What the decoder is to draw.
+
+        :param observations: [B, *shape], images in 0-255
+        :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
+        :return: Images in [-0.5, 0.5], [B, C, H, W]; flat vectors as they are, [B, out_dim]
+        """
+        if not self.pixels:
+            return self.preprocess(observations).flatten(1)
+        steps = th.div(observations, 256 // self.levels, rounding_mode="floor").float()
+        offset = th.rand_like(steps) if dither else 0.5
+        return (steps + offset) / self.levels - 0.5
+
+    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+        """Eq. 2 of the paper; the weight decay of the decoder is applied by its optimiser.
+
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :return: Loss, and the mean squared error of each observation, [B]
+        """
+        error = self._squared_error(self.target(batch.observations, dither=True), latents)
+        penalty = 0.5 * latents.square().sum(dim=1).mean()
+        return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
+
+    def error(self, batch: ReplayBufferSamples, latents: th.Tensor) -> th.Tensor:
+        """Mean squared error per observation against the target without noise.
+
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :return: [B]
+        """
+        return self._squared_error(self.target(batch.observations, dither=False), latents).detach()
+
+    def reconstruct(self, latents: th.Tensor) -> th.Tensor:
+        """
+        :param latents: [B, features_dim]
+        :return: Images in 0-255 (uint8), [B, C, H, W]; vectors as decoded, [B, out_dim]
+        """
+        drawn = self.decoder(latents).float()
+        return ((drawn + 0.5) * 256).clamp(0, 255).to(th.uint8) if self.pixels else drawn
+
+    def _squared_error(self, target: th.Tensor, latents: th.Tensor) -> th.Tensor:
+        return (self.decoder(latents).float() - target).square().flatten(1).mean(dim=1)
