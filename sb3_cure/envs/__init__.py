@@ -1,14 +1,12 @@
 """Environments that are observed through pixels: DeepMind Control tasks, and any other that can render itself.
 
-Importing this package registers the ``dmc_pixels/...`` ids. It needs neither OpenGL nor dm_control, which are loaded
-when the first DeepMind Control environment is made; what checks OpenGL is in :mod:`sb3_cure.envs.rendering`.
+Importing this package and registering its ids needs neither OpenGL nor dm_control, which are loaded when the first
+DeepMind Control environment is made; what checks OpenGL is in :mod:`sb3_cure.envs.rendering`.
 """
 
 from sb3_cure.envs.dmc import make_dmc_env
 from sb3_cure.envs.registration import DMC_TASKS, register_dmc_envs
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames, make_pixel_env
-
-register_dmc_envs()
 
 __all__ = [
     "DMC_TASKS",

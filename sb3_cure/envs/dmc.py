@@ -110,7 +110,7 @@ def make_dmc_env(
     :raises GLUnavailableError: If OpenGL is missing
     """
     if task not in DMC_TASKS.get(domain, ()):
-        known = [f"{domain}-{task}" for domain, tasks in DMC_TASKS.items() for task in tasks]
+        known = [f"{known_domain}-{known_task}" for known_domain in DMC_TASKS for known_task in DMC_TASKS[known_domain]]
         close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
         raise ValueError(
             f"'{domain}-{task}' is not a task of the DeepMind Control suite; the closest are {close} "

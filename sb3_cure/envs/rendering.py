@@ -57,13 +57,12 @@ def check_gl() -> str:
     from dm_control import mujoco
 
     try:
-        from OpenGL import GL
-
+        gl = importlib.import_module("OpenGL.GL")
         physics = mujoco.Physics.from_xml_string("<mujoco><worldbody/></mujoco>")
         try:
             physics.render(height=16, width=16)
             with physics.contexts.gl.make_current() as context:
-                return context.call(GL.glGetString, GL.GL_RENDERER).decode()
+                return context.call(gl.glGetString, gl.GL_RENDERER).decode()
         finally:
             physics.free()
     except Exception as error:

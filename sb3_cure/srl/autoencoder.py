@@ -6,6 +6,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
+from sb3_cure.augmentations import random_shift
 from sb3_cure.encoders import Encoder
 from sb3_cure.layers import conv_sizes, full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
@@ -65,6 +66,9 @@ class RAE(SRLHead):
     :param latent_penalty: lambda_z, on half the squared norm of the latents
     :param decoder_weight_decay: lambda_theta, applied by the decoder's optimiser
     :param bits: Bits that are left of each pixel's 8
+    :param augmentation: ``"none"`` as in SAC-AE and the CuRe paper; ``"shift"``: the encoder sees randomly shifted
+        images, as in DrQ, and the decoder draws the unshifted ones. Learns from far fewer steps
+    :param pad: Largest shift, pixels
     """
 
     warmup_updates = 1000
@@ -76,6 +80,8 @@ class RAE(SRLHead):
         latent_penalty: float = 1e-6,
         decoder_weight_decay: float = 1e-7,
         bits: int = 5,
+        augmentation: str = "none",
+        pad: int = 4,
     ):
         super().__init__(encoder, observation_space)
         if not 1 <= bits <= 8:
@@ -85,10 +91,19 @@ class RAE(SRLHead):
                 f"srl_kwargs got latent_penalty={latent_penalty} and decoder_weight_decay={decoder_weight_decay}, "
                 "but both are penalties: give numbers >= 0."
             )
+        self.pixels = is_image_space(observation_space)
+        if augmentation not in ("none", "shift") or (augmentation == "shift" and not self.pixels):
+            raise ValueError(
+                f"srl_kwargs got augmentation={augmentation!r} for observations of shape {observation_space.shape}, but "
+                "srl='rae' knows 'none', and for images 'shift': choose one of them."
+            )
+        if pad < 1:
+            raise ValueError(f"srl_kwargs got pad={pad}, but a shift needs at least 1 pixel: change pad.")
+        self.shifts = augmentation == "shift"
+        self.pad = pad
         self.latent_penalty = latent_penalty
         self.optimizer_kwargs = {"weight_decay": decoder_weight_decay}
         self.levels = 2**bits
-        self.pixels = is_image_space(observation_space)
         self.decoder: nn.Module
         if self.pixels:
             self.decoder = PixelDecoder(
@@ -100,6 +115,13 @@ class RAE(SRLHead):
             )
         else:
             self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(observation_space))
+
+    def augment(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: The same, with ``augmentation="shift"`` randomly shifted
+        """
+        return random_shift(observations, self.pad) if self.shifts else observations
 
     def target(self, observations: th.Tensor, dither: bool) -> th.Tensor:
         """What the decoder is to draw.

@@ -1,0 +1,478 @@
+"""The environments: what the agent sees, gets and may do, compared with dm_control itself."""
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, ClassVar
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils import env_checker as gym_checker
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from sb3_cure.envs import (
+    DMC_TASKS,
+    ActionRepeat,
+    NormalizeActions,
+    PixelObservation,
+    StackFrames,
+    make_dmc_env,
+    make_pixel_env,
+    register_dmc_envs,
+)
+from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
+
+load_gl()  # before any test imports dm_control
+
+ALL_IDS = [f"dmc_pixels/{domain}-{task}-v0" for domain, tasks in DMC_TASKS.items() for task in tasks]
+
+
+@pytest.fixture
+def make() -> Iterator[Callable[..., gym.Env]]:
+    """Makes small environments quickly and closes them after the test."""
+    envs = []
+
+    def make_and_remember(domain: str = "cartpole", task: str = "swingup", **kwargs: Any) -> gym.Env:
+        envs.append(make_dmc_env(domain, task, **{"image_size": 36, "renderer": "fast", **kwargs}))
+        return envs[-1]
+
+    yield make_and_remember
+    for env in envs:
+        env.close()
+
+
+class Painting(gym.Env):
+    """Renders its step count as a grey level, white on its right half; an episode has 10 steps, each with reward 1."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "ansi"], "render_fps": 30}
+    observation_space = spaces.Box(-1, 1, (2,))
+
+    def __init__(self, render_mode: str | None = "rgb_array", action_space: spaces.Space | None = None) -> None:
+        self.render_mode = render_mode
+        self.action_space = action_space or spaces.Discrete(2)
+        self.canvas = np.zeros((80, 120, 3), np.uint8)
+        self.renders = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.action = action
+        self.count += 1
+        return np.zeros(2, np.float32), 1.0, self.count == 10, False, {}
+
+    def render(self) -> Any:
+        self.renders += 1
+        if self.render_mode != "rgb_array":
+            return f"step {self.count}"
+        self.canvas[:] = self.count  # the same memory each time, as renderers may do
+        self.canvas[:, 60:] = 255
+        return self.canvas
+
+
+# ---------------------------------------------------------------------------------- against dm_control itself
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "action_repeat", "camera_id"),
+    [("cartpole", "swingup", 8, 0), ("walker", "walk", 2, 0), ("quadruped", "escape", 4, 2)],
+)
+def test_frames_and_rewards_are_those_of_dm_control(make, domain, task, action_repeat, camera_id):
+    from dm_control import suite
+
+    env = make(domain, task, image_size=84, renderer="dmc", seed=5)
+    assert env.get_wrapper_attr("action_repeat") == action_repeat
+    reference = suite.load(domain, task, task_kwargs={"random": 5})
+    reference.reset()
+
+    def reference_frame() -> np.ndarray:
+        return reference.physics.render(height=84, width=84, camera_id=camera_id).transpose(2, 0, 1)
+
+    obs, _ = env.reset()
+    assert obs.dtype == np.uint8
+    frames = [reference_frame()] * 3
+    np.testing.assert_array_equal(obs, np.concatenate(frames))  # the first frame, three times
+    bounds = reference.action_spec()
+    env.action_space.seed(0)
+    for _ in range(5):
+        action = env.action_space.sample()
+        scaled = bounds.minimum + (action.astype(np.float64) + 1) / 2 * (bounds.maximum - bounds.minimum)
+        expected_reward = sum(reference.step(scaled).reward for _ in range(action_repeat))
+        obs, reward, terminated, truncated, _ = env.step(action)
+        frames.append(reference_frame())
+        np.testing.assert_array_equal(obs, np.concatenate(frames[-3:]))  # oldest first
+        assert reward == pytest.approx(expected_reward, rel=1e-9)
+        assert not terminated and not truncated
+    assert len({frame.tobytes() for frame in frames}) == 6, "the scene did not move, so this test saw nothing"
+    reference.physics.free()
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "action_repeat", "agent_steps"),
+    [("cartpole", "swingup", None, 125), ("reacher", "easy", 3, 334), ("lqr", "lqr_2_1", None, 250)],
+)
+def test_time_limit_truncates_after_1000_environment_steps(make, domain, task, action_repeat, agent_steps):
+    env = make(domain, task, action_repeat=action_repeat)
+    env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(agent_steps)]
+    assert not any(terminated for terminated, _ in ends)
+    assert [truncated for _, truncated in ends] == [False] * (agent_steps - 1) + [True]
+
+
+def test_one_frame_is_rendered_per_agent_step(make):
+    from dm_control.mujoco import Camera
+
+    env = make(action_repeat=4, frame_stack=2)
+    with mock.patch.object(Camera, "render", autospec=True, side_effect=Camera.render) as render:
+        env.reset()
+        assert render.call_count == 1
+        for _ in range(3):
+            env.step(env.action_space.sample())
+        assert render.call_count == 4
+
+
+def test_lqr_actions_are_clipped_to_the_unit_box(make):
+    env = make("lqr", "lqr_6_2")
+    assert env.action_space == spaces.Box(-1, 1, (2,), np.float32)
+    env.reset()
+    env.step(np.array([0.25, 7.0], np.float32))
+    np.testing.assert_array_equal(env.unwrapped.physics.control(), [0.25, 1.0])
+
+
+# ---------------------------------------------------------------------------------------------------- seeding
+
+
+def test_seed_of_the_constructor_and_of_reset_start_the_same_stream(make):
+    constructed, reseeded = make("reacher", "easy", seed=7), make("reacher", "easy", seed=0)
+    first = constructed.reset()[0]
+    np.testing.assert_array_equal(first, reseeded.reset(seed=7)[0])
+    action = np.array([0.5, -0.5], np.float32)
+    np.testing.assert_array_equal(constructed.step(action)[0], reseeded.step(action)[0])
+    second = constructed.reset()[0]
+    np.testing.assert_array_equal(second, reseeded.reset()[0])
+    assert (first != second).any()
+    np.testing.assert_array_equal(first, constructed.reset(seed=7)[0])
+
+
+def test_without_seed_episodes_differ_but_lqr_physics_is_the_same(make):
+    first, second = make("lqr", "lqr_2_1"), make("lqr", "lqr_2_1")
+    first.reset()
+    second.reset()
+    assert (first.unwrapped.physics.position() != second.unwrapped.physics.position()).any()
+    np.testing.assert_array_equal(
+        first.unwrapped.physics.model.jnt_stiffness, second.unwrapped.physics.model.jnt_stiffness
+    )
+
+
+# ---------------------------------------------------------------------------------- renderers, videos, closing
+
+
+def test_fast_renderer_is_recorded_and_differs_only_in_pixels(make):
+    envs = {renderer: make("cheetah", "run", renderer=renderer, seed=1) for renderer in ("dmc", "fast")}
+    obs = {renderer: env.reset()[0] for renderer, env in envs.items()}
+    assert [env.get_wrapper_attr("renderer") for env in envs.values()] == ["dmc", "fast"]
+    assert obs["dmc"].shape == obs["fast"].shape
+    assert (obs["dmc"] != obs["fast"]).any()
+    physics = envs["fast"].unwrapped.physics
+    flat = physics.render(36, 36, camera_id=0, render_flag_overrides={"shadow": False, "reflection": False})
+    assert (flat != physics.render(36, 36, camera_id=0)).any()
+    np.testing.assert_array_equal(obs["fast"][:3], flat.transpose(2, 0, 1))
+    assert physics.model.vis.quality.offsamples == 0
+    np.testing.assert_array_equal(envs["dmc"].unwrapped.physics.get_state(), envs["fast"].unwrapped.physics.get_state())
+
+
+def test_rendering_for_videos_does_not_change_observations(make):
+    filmed, plain = make(render_mode="rgb_array", seed=3), make(seed=3)
+    np.testing.assert_array_equal(filmed.reset()[0], plain.reset()[0])
+    for action in np.linspace(-1, 1, 4, dtype=np.float32):
+        video = filmed.render()
+        assert video.shape == (256, 256, 3) and video.dtype == np.uint8 and video.std() > 0
+        np.testing.assert_array_equal(filmed.step(action[None])[0], plain.step(action[None])[0])
+    assert filmed.render_mode == "rgb_array" and filmed.metadata["render_modes"] == ["rgb_array"]
+    assert filmed.metadata["render_fps"] == pytest.approx(12.5)  # 0.01 s of physics, 8 times per agent step
+    assert plain.render_mode is None and plain.render() is None
+
+
+def test_several_sizes_and_cameras_live_in_one_process(make):
+    large = make(image_size=700, frame_stack=1, camera_id=1)  # larger than MuJoCo's default frame buffer
+    grey = make(grayscale=True, frame_stack=2)
+    large_obs, grey_obs = large.reset(seed=0)[0], grey.reset(seed=0)[0]
+    assert large_obs.shape == (3, 700, 700) and large_obs.std() > 0
+    assert grey_obs.shape == (2, 36, 36)
+    rgb = make(frame_stack=1).reset(seed=0)[0]
+    np.testing.assert_allclose(grey_obs[0], np.tensordot([0.299, 0.587, 0.114], rgb, 1), atol=1)
+    np.testing.assert_array_equal(large_obs, large.reset(seed=0)[0])
+
+
+def test_closing_frees_the_renderer(make):
+    env = make()
+    env.reset()
+    physics = env.unwrapped.physics
+    assert physics._contexts is not None
+    env.close()
+    assert physics._contexts is None
+    env.close()
+
+
+# ------------------------------------------------------------------------------- Gymnasium, Stable-Baselines3
+
+
+def test_every_task_of_the_suite_is_registered():
+    from dm_control import suite
+
+    expected = {f"dmc_pixels/{domain}-{task}-v0" for domain, task in suite.ALL_TASKS}
+    assert {env_id for env_id in gym.registry if env_id.startswith("dmc_pixels/")} == expected
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register_dmc_envs()
+
+
+@pytest.mark.parametrize("env_id", ALL_IDS)
+def test_every_id_makes_an_environment_that_steps_and_repeats(env_id):
+    env = gym.make(env_id, image_size=36)
+    obs, _ = env.reset(seed=0)
+    next_obs, reward, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert next_obs in env.observation_space and np.isfinite(reward) and not terminated and not truncated
+    np.testing.assert_array_equal(env.reset(seed=0)[0], obs)
+    assert type(env.unwrapped).__name__ == "DmControlCompatibilityV0"
+    env.close()
+
+
+def test_gymnasium_make_passes_every_argument_on():
+    kwargs = {
+        "image_size": 40,
+        "frame_stack": 2,
+        "action_repeat": 3,
+        "camera_id": 1,
+        "renderer": "fast",
+        "render_mode": "rgb_array",
+        "seed": 4,
+    }
+    env = gym.make("dmc_pixels/fish-swim-v0", **kwargs)
+    direct = make_dmc_env("fish", "swim", **kwargs)
+    assert env.observation_space.shape == (6, 40, 40)
+    np.testing.assert_array_equal(env.reset()[0], direct.reset()[0])
+    for name in set(kwargs) - {"seed"}:
+        assert env.get_wrapper_attr(name) == direct.get_wrapper_attr(name) == kwargs[name]
+    env.close()
+    direct.close()
+
+
+@pytest.mark.parametrize("through_gymnasium", [False, True])
+def test_checkers_of_gymnasium_and_sb3_find_nothing(through_gymnasium):
+    kwargs = {"image_size": 36, "renderer": "fast", "render_mode": "rgb_array"}
+    env = (
+        gym.make("dmc_pixels/finger-spin-v0", **kwargs)
+        if through_gymnasium
+        else make_dmc_env("finger", "spin", **kwargs)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*is different from the unwrapped version.*")
+        gym_checker.check_env(env)
+        sb3_check_env(env)
+    env.close()
+
+
+def test_spec_makes_a_copy(make):
+    env = make("ball_in_cup", "catch", seed=2, action_repeat=5)
+    copy = env.spec.make()
+    assert env.spec.id == "dmc_pixels/ball_in_cup-catch-v0"
+    assert copy.get_wrapper_attr("action_repeat") == 5
+    np.testing.assert_array_equal(copy.reset()[0], env.reset()[0])
+    copy.close()
+
+
+@pytest.mark.parametrize("start_method", ["forkserver", "spawn"])
+def test_vectorised_environments_give_the_same_stream(start_method):
+    factories = [
+        partial(make_dmc_env, "point_mass", "easy", image_size=36, renderer="fast", seed=seed) for seed in (1, 2)
+    ]
+    local, remote = DummyVecEnv(factories), SubprocVecEnv(factories, start_method=start_method)
+    try:
+        first = local.reset()
+        assert (first[0] != first[1]).any()
+        np.testing.assert_array_equal(first, remote.reset())
+        for _ in range(3):
+            actions = np.stack([local.action_space.sample() for _ in factories])
+            (obs, rewards, dones, _), (remote_obs, remote_rewards, remote_dones, _) = (
+                vec_env.step(actions) for vec_env in (local, remote)
+            )
+            np.testing.assert_array_equal(obs, remote_obs)
+            np.testing.assert_array_equal(rewards, remote_rewards.astype(np.float32))  # only DummyVecEnv rounds them
+            np.testing.assert_array_equal(dones, remote_dones)
+        for vec_env in (local, remote):
+            vec_env.seed(9)
+        np.testing.assert_array_equal(local.reset(), remote.reset())
+        names = ("frame_stack", "action_repeat", "renderer", "image_size")
+        assert [remote.get_attr(name) for name in names] == [[3, 3], [4, 4], ["fast", "fast"], [36, 36]]
+    finally:
+        local.close()
+        remote.close()
+
+
+# --------------------------------------------------------------------------------- any Gymnasium environment
+
+
+def test_any_environment_that_renders_can_be_seen_through_pixels():
+    painting = Painting(action_space=spaces.Box(np.float32([0, -2]), np.float32([10, 2])))
+    env = make_pixel_env(painting, image_size=40, frame_stack=3, action_repeat=4)
+    assert env.observation_space == spaces.Box(0, 255, (9, 40, 40), np.uint8)
+    assert [env.get_wrapper_attr(name) for name in ("image_size", "frame_stack", "action_repeat")] == [40, 3, 4]
+    obs, _ = env.reset()
+    assert (obs[:, :, :20] == 0).all() and (obs[:, :, 20:] == 255).all()
+    steps = [env.step(np.array([1, -1], np.float32)) for _ in range(3)]
+    np.testing.assert_array_equal(painting.action, [10, -2])
+    assert [step[1] for step in steps] == [4, 4, 2]  # the repeat stops with the episode
+    assert [step[2] for step in steps] == [False, False, True]
+    assert steps[1][0][::3, 0, 0].tolist() == [0, 4, 8] and steps[2][0][::3, 0, 0].tolist() == [4, 8, 10]
+    assert painting.renders == 4
+    assert env.metadata["render_fps"] == 7.5
+    assert env.reset()[0].max(axis=(1, 2)).tolist() == [255] * 9 and env.reset()[0][:, 0, 0].tolist() == [0] * 9
+    sb3_check_env(env)
+
+
+def test_frames_of_another_size_are_area_averaged():
+    env = make_pixel_env(Painting(), image_size=10, frame_stack=1, grayscale=True)
+    assert env.action_space == spaces.Discrete(2)
+    assert env.reset()[0].shape == (1, 10, 10)
+    # 120 pixels become 3, so the middle one is half black and half white.
+    assert PixelObservation(Painting(), 3).reset()[0][:, 0].tolist() == [[0, 128, 255]] * 3
+
+
+def test_pixel_environment_from_an_id():
+    gym.register("test/Painting-v0", entry_point=Painting)
+    try:
+        assert make_pixel_env("test/Painting-v0", image_size=36).reset()[0].shape == (9, 36, 36)
+    finally:
+        del gym.registry["test/Painting-v0"]
+
+
+# -------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "named"),
+    [
+        ({"domain": "cartpol"}, ["'cartpol-swingup'", "cartpole-swingup"]),
+        ({"domain": "walker", "task": "wlak"}, ["'walker-wlak'", "walker-walk"]),
+        ({"image_size": 0}, ["image_size=0", "at least 1", "84"]),
+        ({"image_size": 84.0}, ["image_size=84.0", "integer", "84"]),
+        ({"frame_stack": 0}, ["frame_stack=0", "at least 1", "3"]),
+        ({"frame_stack": True}, ["frame_stack=True", "integer"]),
+        ({"action_repeat": 0}, ["action_repeat=0", "at least 1", "4"]),
+        ({"action_repeat": 2.5}, ["action_repeat=2.5", "integer"]),
+        ({"camera_id": 2}, ["camera_id=2", "0 to 1", "-1"]),
+        ({"camera_id": -2}, ["camera_id=-2", "0 to 1"]),
+        ({"camera_id": "lookat"}, ["camera_id='lookat'", "0 to 1"]),
+        ({"renderer": "slow"}, ["renderer='slow'", "'dmc'", "'fast'"]),
+        ({"render_mode": "human"}, ["render_mode='human'", "'rgb_array'"]),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)
+def test_bad_input_is_answered_in_one_sentence(kwargs, named):
+    with pytest.raises(ValueError) as error:
+        make_dmc_env(**{"domain": "cartpole", "task": "swingup", **kwargs})
+    message = str(error.value)
+    assert all(part in message for part in named), message
+    assert "\n" not in message and message.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("build", "match"),
+    [
+        (lambda: make_pixel_env(Painting(render_mode=None)), "render_mode=None.*render_mode='rgb_array'"),
+        (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*render_mode='rgb_array'"),
+        (lambda: make_pixel_env(Painting(), action_repeat=-1), "action_repeat=-1"),
+        (lambda: ActionRepeat(Painting(), 0), "action_repeat=0"),
+        (lambda: NormalizeActions(Painting()), "Discrete"),
+        (lambda: StackFrames(gym.wrappers.FlattenObservation(Painting()), 0), "frame_stack=0"),
+    ],
+)
+def test_bad_input_of_the_wrappers(build, match):
+    with pytest.raises(ValueError, match=match):
+        build()
+
+
+# ----------------------------------------------------------------------------------------------------- OpenGL
+
+
+def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")
+    env = {name: value for name, value in os.environ.items() if name not in hidden} | environment
+    env["PYTHONPATH"] = os.pathsep.join(sys.path)
+    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
+
+
+def test_importing_needs_neither_gl_nor_dm_control():
+    result = run_python(
+        "import sys, sb3_cure.envs, gymnasium\n"
+        "assert 'dmc_pixels/cartpole-swingup-v0' in gymnasium.registry\n"
+        "print([name for name in ('dm_control', 'mujoco', 'OpenGL', 'shimmy') if name in sys.modules])"
+    )
+    assert result.stdout.strip() == "[]", result.stderr
+
+
+@pytest.mark.parametrize("missing", ["libEGL", "lib(OpenGL|GL|GLESv2|GLESv1_CM)[.]"])
+def test_missing_gl_is_answered_in_one_sentence(missing):
+    result = run_python(
+        f"""
+import ctypes, re, runpy
+load = ctypes.CDLL.__init__
+
+def refuse(self, name, *args, **kwargs):
+    if name and re.search({missing!r}, str(name)):
+        raise OSError(f"{{name}}: cannot open shared object file: No such file or directory")
+    load(self, name, *args, **kwargs)
+
+ctypes.CDLL.__init__ = refuse
+from sb3_cure.envs import make_dmc_env
+try:
+    make_dmc_env("cartpole", "swingup")
+except Exception as error:
+    print(type(error).__name__, error)
+del __import__("sys").modules["sb3_cure.envs.rendering"]
+runpy.run_module("sb3_cure.envs.rendering", run_name="__main__")
+"""
+    )
+    assert result.returncode == 1
+    for said in (result.stdout, result.stderr):
+        assert "apt-get install libegl1 libopengl0 libgl1-mesa-dri" in said
+        assert said.count("\n") == 1, said
+    assert result.stdout.startswith("GLUnavailableError OpenGL cannot render here (MUJOCO_GL=egl: ")
+
+
+def test_working_gl_names_its_renderer():
+    result = run_python("import runpy; runpy.run_module('sb3_cure.envs.rendering', run_name='__main__')")
+    assert result.returncode == 0 and result.stdout.strip() == check_gl(), result.stderr
+    assert len(check_gl()) > 3
+
+
+@pytest.mark.parametrize(
+    ("environment", "chosen"),
+    [({}, "egl"), ({"DISPLAY": ":0"}, None), ({"WAYLAND_DISPLAY": "wayland-0"}, None), ({"MUJOCO_GL": "glfw"}, "glfw")],
+)
+def test_egl_is_chosen_only_without_a_display_and_a_choice(environment, chosen):
+    with mock.patch.dict(os.environ, environment, clear=True), mock.patch.object(sys, "platform", "linux"):
+        load_gl()
+        assert os.environ.get("MUJOCO_GL") == chosen
+
+
+@pytest.mark.parametrize(("backend", "fix"), [("off", "apt-get install"), (None, "apt-get"), ("glfw", "MUJOCO_GL=egl")])
+def test_backend_that_cannot_render_is_answered_in_one_sentence(backend, fix):
+    with (
+        mock.patch.dict(os.environ, clear=True),
+        mock.patch.object(sys, "platform", "linux"),
+        mock.patch("dm_control._render.BACKEND", backend),
+        pytest.raises(GLUnavailableError, match=fix),
+    ):
+        load_gl()
