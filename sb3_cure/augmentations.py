@@ -24,23 +24,33 @@ def random_crop(images: th.Tensor, size: int, generator: th.Generator | None = N
     :param generator: Source of the offsets (default: torch's global one)
     :return: [B, C, size, size]
     """
-    batch = len(images)
+    batch, _, height, width = images.shape
     # Drawn on the CPU: a CUDA draw would not repeat a CPU run, and two short vectors cost nothing to send.
-    top = th.randint(images.shape[2] - size + 1, (batch,), generator=generator).to(images.device)
-    left = th.randint(images.shape[3] - size + 1, (batch,), generator=generator).to(images.device)
-    windows = images.unfold(2, size, 1).unfold(3, size, 1)
-    return windows[th.arange(batch, device=images.device), :, top, left]
+    top = th.randint(height - size + 1, (batch, 1), generator=generator)
+    left = th.randint(width - size + 1, (batch, 1), generator=generator)
+    return _windows(images, top + th.arange(size), left + th.arange(size))
 
 
 def random_shift(images: th.Tensor, pad: int = 4, generator: th.Generator | None = None) -> th.Tensor:
     """Shift each image by up to ``pad`` pixels, the border pixels repeated (DrQ, section 4.1).
 
-    :param images: [B, C, H, W], H = W
+    :param images: [B, C, H, W]
     :param pad: Largest shift, pixels
     :param generator: Source of the shifts (default: torch's global one)
     :return: [B, C, H, W]
     """
-    size = images.shape[2]
-    # Replicate-padding by index, because torch's own has no uint8 kernel.
-    clamped = th.arange(-pad, size + pad, device=images.device).clamp(0, size - 1)
-    return random_crop(images[:, :, clamped][:, :, :, clamped], size, generator)
+    batch, _, height, width = images.shape
+    down = th.randint(-pad, pad + 1, (batch, 1), generator=generator)
+    right = th.randint(-pad, pad + 1, (batch, 1), generator=generator)
+    # Rows and columns outside of the image are those of its border.
+    rows = (th.arange(height) + down).clamp(0, height - 1)
+    columns = (th.arange(width) + right).clamp(0, width - 1)
+    return _windows(images, rows, columns)
+
+
+def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:
+    """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, as one gather (the quickest way on uint8)."""
+    batch, channels, _, width = images.shape
+    index = (rows[:, :, None] * width + columns[:, None, :]).view(batch, 1, -1).to(images.device)
+    windows = images.flatten(2).gather(2, index.expand(-1, channels, -1))
+    return windows.view(batch, channels, rows.shape[1], columns.shape[1])

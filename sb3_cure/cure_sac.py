@@ -238,6 +238,7 @@ class CuReSAC(SAC):
     def _setup_model(self) -> None:
         self._check_arguments()
         self._metrics = Metrics()
+        self._read_env_attributes()
         if self._is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
@@ -255,8 +256,8 @@ class CuReSAC(SAC):
             self.policy_kwargs = user_kwargs
         if self._mixer is None:
             self._mixer = CuriousMixer(self.curiosity_prob, self.seed)
-        if not self.task:
-            self.policy.act_with("curious_actor")
+        # A loaded mixer goes on with its random stream, but `load` may have been given another probability.
+        self._mixer.probability = self.curiosity_prob
         self._computed_precision = resolve_precision(self.precision, self.device)
         if self.verbose >= 1:
             print(f"Networks compute in {self._computed_precision} (precision={self.precision!r})")
@@ -275,11 +276,16 @@ class CuReSAC(SAC):
             curiosity_kwargs=dict(beta=self.curiosity_beta, normalize=self.normalize_curiosity),
             encoder_sources=tuple(name for name, trains in sources.items() if trains),
             update=self.update,
+            acting="actor" if self.task else "curious_actor",
         )
 
     @property
     def _has_curious_agent(self) -> bool:
         return self.curiosity == "separate" or self._collector == "curious"
+
+    @property
+    def _uses_curious_reward(self) -> bool:
+        return self.curiosity == "bonus" or self._has_curious_agent
 
     def _choose_replay_buffer(self) -> None:
         """Keep each frame once where the environment says that its observations are stacked frames."""
@@ -288,6 +294,11 @@ class CuReSAC(SAC):
             if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
                 self.replay_buffer_class = FrameStackReplayBuffer
                 self.replay_buffer_kwargs = {"frame_stack": frame_stack, **self.replay_buffer_kwargs}
+
+    def _read_env_attributes(self) -> None:
+        """What logging needs to know; again before each ``learn``, as ``set_env`` may have changed it."""
+        self._action_repeat = self._env_attribute("action_repeat") or 1
+        self._frame_stack = self._env_attribute("frame_stack") or 1
 
     def _env_attribute(self, name: str) -> Any:
         """An attribute that the environments tell, or None."""
@@ -352,8 +363,7 @@ class CuReSAC(SAC):
     ) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         self._metrics.attach(self.logger)
-        self._action_repeat = self._env_attribute("action_repeat") or 1
-        self._frame_stack = self._env_attribute("frame_stack") or 1
+        self._read_env_attributes()
         return result
 
     def set_logger(self, logger: Logger) -> None:
@@ -493,9 +503,9 @@ class CuReSAC(SAC):
 
     def _gradient_step(self, batch: ReplayBufferSamples) -> None:
         """One update, in the order of the paper's Algorithm 1: SRL, task agent, curious agent."""
-        observations = self.policy.augment(batch.observations)
-        next_observations = self.policy.augment(batch.next_observations)
         with th.no_grad(), self._autocast():
+            observations = self.policy.augment(batch.observations)
+            next_observations = self.policy.augment(batch.next_observations)
             next_latents = self.policy.encoder_target(next_observations)
         shared = self._encode(observations, next_observations) if self.update == "joint" else None
         # Sequential: a fresh pass for each source, because the one before has moved the encoder.
@@ -504,7 +514,7 @@ class CuReSAC(SAC):
         curious_reward = None
         if self.policy.srl is not None:
             error = self._update_srl(batch, encode())
-            if self.curiosity in ("separate", "bonus") or self._collector == "curious":
+            if self._uses_curious_reward:
                 curious_reward = self._curious_reward(error)
         if self._in_rl_phase:
             if self.task and self._collector is None:
@@ -550,7 +560,7 @@ class CuReSAC(SAC):
                 srl.optimizer.step()  # type: ignore[union-attr]
         variance = encoded.latents.detach().var(dim=0).mean()
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean(), "train/latent_variance": variance})
-        if self.curiosity_target == "next_observation" and self._curious_agent is not None:
+        if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features)
                 error = srl.loss(batch._replace(observations=batch.next_observations), next_latents).error  # type: ignore[union-attr]

@@ -52,6 +52,8 @@ class CuriousReward(nn.Module):
         if self.normalize:
             weight = self.weight.clamp(min=1e-8)
             mean = self.mean / weight
-            std = (self.mean_square / weight - mean.square()).clamp(min=0.0).sqrt()
+            mean_square = self.mean_square / weight
+            # A spread below a thousandth of the errors' size is rounding: errors that are all alike earn nothing.
+            std = th.maximum(mean_square - mean.square(), 1e-6 * mean_square).sqrt()
             error = ((error - mean) / (std + 1e-8)).clamp(-self.clip, self.clip)
         return self.beta * error.unsqueeze(1)

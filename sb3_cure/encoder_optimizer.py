@@ -48,6 +48,7 @@ class EncoderOptimizer:
         for source in sources:
             self.add_source(source)
         self._pulls: dict[str, th.Tensor] = {}
+        self._norms: dict[str, th.Tensor] = {}
         self._latents: th.Tensor | None = None
         self._n_steps = 0
         #: Norm of each source's gradient at the latents, of the last update (detached scalars)
@@ -69,6 +70,7 @@ class EncoderOptimizer:
         """
         self.optimizers.pop(source, None)
         del self.mean_squares[source], self.weights[source]
+        self.gradient_norms, self.shares = {}, {}
 
     def pull(self, source: str, latents: th.Tensor, gradient: th.Tensor) -> None:
         """Take one source's gradient: step at once (sequential), or keep it for ``step`` (joint).
@@ -79,7 +81,7 @@ class EncoderOptimizer:
         """
         gradient = gradient.detach()
         norm = gradient.norm()
-        self.gradient_norms[source] = norm
+        self._norms[source] = norm
         if self.mode == "sequential":
             optimizer = self.optimizers[source]
             optimizer.zero_grad()
@@ -104,6 +106,7 @@ class EncoderOptimizer:
     def step(self) -> None:
         """End one update: in joint mode, one backward pass with the scaled gradients and one step."""
         self._n_steps += 1
+        self.gradient_norms, self._norms = self._norms, {}
         if self.mode == "joint" and self._latents is not None:
             optimizer = self.optimizers["joint"]
             optimizer.zero_grad()
@@ -139,11 +142,12 @@ class EncoderOptimizer:
         """
         :param state: Result of ``state_dict``
         :param strict: Whether a state of other sources or of the other mode is an error (else it is skipped)
-        :raises ValueError: if ``strict`` and the state belongs to another mode or other sources
+        :raises RuntimeError: if ``strict`` and the state belongs to another mode or other sources
         """
         if state["optimizers"].keys() != self.optimizers.keys() or state["weights"].keys() != self.weights.keys():
             if strict:
-                raise ValueError(
+                # As torch's own load_state_dict; SB3's `load` takes a ValueError for an archive of an old DQN.
+                raise RuntimeError(
                     f"the saved encoder was trained by {sorted(state['weights'])} with optimisers "
                     f"{sorted(state['optimizers'])}, but this model has {sorted(self.weights)} with "
                     f"{sorted(self.optimizers)}: load with the update=, srl= and curiosity= it was trained with."

@@ -9,7 +9,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import Projection, conv_sizes, init_weights
+from sb3_cure.layers import FlattenImage, Projection, conv_sizes, init_weights
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -76,7 +76,7 @@ class PixelEncoder(Encoder):
         for layer in range(n_layers):
             channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
             layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU()]
-        self.trunk = nn.Sequential(*layers, nn.Flatten())
+        self.trunk = nn.Sequential(*layers, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)
         # NHWC kernels are the fast ones for convolutions on CPU and GPU; the values are the same.

@@ -3,6 +3,8 @@
 from typing import TypeVar
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
@@ -54,9 +56,31 @@ def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
     return sizes
 
 
+def preprocess(observations: th.Tensor, observation_space: spaces.Space) -> th.Tensor:
+    """SB3's preprocessing (images divided by 255, discrete values one-hot), images in the cheapest way.
+
+    :param observations: Observations as stored, [B, *shape]
+    :param observation_space: Their space (only its kind matters, so crops are welcome)
+    :return: Input of the encoder; images in [0, 1], in NHWC memory order and, within autocast, in its number format
+    """
+    if not is_image_space(observation_space):
+        return preprocess_obs(observations, observation_space)  # type: ignore[return-value]
+    device = observations.device.type
+    dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else th.float32
+    # Reordered while still one byte per value; all of 0-255 is exact in bfloat16.
+    return observations.contiguous(memory_format=th.channels_last).to(dtype).div_(255)
+
+
 def full_precision(tensor: th.Tensor) -> th.autocast:
     """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
     return th.autocast(tensor.device.type, enabled=False)
+
+
+class FlattenImage(nn.Module):
+    """[B, C, H, W] to [B, H * W * C]: the order in memory of NHWC kernels, so that nothing is copied."""
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        return images.permute(0, 2, 3, 1).flatten(1)
 
 
 class Projection(nn.Module):

@@ -23,10 +23,12 @@ class Metrics(KVWriter):
 
     def attach(self, logger: Logger) -> None:
         """
-        :param logger: SB3's logger; attaching twice changes nothing
+        :param logger: SB3's logger; a new one starts with empty averages, attaching twice changes nothing
         """
         if self not in logger.output_formats:
             logger.output_formats.insert(0, self)
+            self._sums.clear()
+            self._counts.clear()
 
     def record(self, logger: Logger, values: dict[str, th.Tensor]) -> None:
         """

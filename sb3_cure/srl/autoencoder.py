@@ -24,7 +24,7 @@ class PixelDecoder(nn.Module):
     def __init__(self, latent_dim: int, shape: tuple[int, ...], n_filters: int = 32, n_layers: int = 4):
         super().__init__()
         sizes = conv_sizes(shape[1], shape[2], n_layers)
-        self.first_shape = (n_filters, *sizes[-1])
+        self.first_shape = (*sizes[-1], n_filters)
         self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
         hidden: list[nn.Module] = []
         for _ in range(n_layers - 1):
@@ -42,9 +42,20 @@ class PixelDecoder(nn.Module):
         :return: Images in the target's scale, about [-0.5, 0.5], [B, C, H, W]
         """
         hidden = th.relu(self.linear(latents)).view(-1, *self.first_shape)
-        hidden = self.hidden(hidden.contiguous(memory_format=th.channels_last))
+        # The linear map writes NHWC, which the convolutions read without a copy.
+        hidden = self.hidden(hidden.permute(0, 3, 1, 2))
         with full_precision(hidden):
             return self.output(hidden.float())
+
+
+def _uniform_like(tensor: th.Tensor) -> th.Tensor:
+    """Uniform noise in (0, 1) in 256 even levels, of mean 1/2: eight values per draw of the generator.
+
+    ``th.rand`` on a CPU costs as much as the encoder's forward pass; dither needs no finer noise.
+    """
+    draws = th.empty(-(-tensor.numel() // 8), dtype=th.int64, device=tensor.device).random_(-(2**63), None)
+    levels = draws.view(th.uint8)[: tensor.numel()].view(tensor.shape)
+    return levels.float().add_(0.5).div_(256)
 
 
 class VectorDecoder(nn.Sequential):
@@ -103,7 +114,7 @@ class RAE(SRLHead):
         self.pad = pad
         self.latent_penalty = latent_penalty
         self.optimizer_kwargs = {"weight_decay": decoder_weight_decay}
-        self.levels = 2**bits
+        self.bits = bits
         self.decoder: nn.Module
         if self.pixels:
             self.decoder = PixelDecoder(
@@ -132,9 +143,9 @@ class RAE(SRLHead):
         """
         if not self.pixels:
             return self.preprocess(observations).flatten(1)
-        steps = th.div(observations, 256 // self.levels, rounding_mode="floor").float()
-        offset = th.rand_like(steps) if dither else 0.5
-        return (steps + offset) / self.levels - 0.5
+        steps = th.bitwise_right_shift(observations, 8 - self.bits).float()
+        offset = _uniform_like(steps) if dither else 0.5
+        return steps.add_(offset).div_(2**self.bits).sub_(0.5)
 
     def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
         """Eq. 2 of the paper; the weight decay of the decoder is applied by its optimiser.

@@ -4,11 +4,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_cure.encoders import Encoder
+from sb3_cure.layers import preprocess
 
 
 class SRLOutput(NamedTuple):
@@ -77,9 +77,9 @@ class SRLHead(nn.Module):
     def preprocess(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: Observations after ``augment`` or ``center``, [B, *shape], images in 0-255
-        :return: The encoder's input: images divided by 255
+        :return: The encoder's input: images in [0, 1]
         """
-        return preprocess_obs(observations, self.observation_space)  # type: ignore[return-value]
+        return preprocess(observations, self.observation_space)
 
     def augment(self, observations: th.Tensor) -> th.Tensor:
         """What the encoder sees in training; the identity unless a head augments.

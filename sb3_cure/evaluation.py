@@ -1,0 +1,123 @@
+"""Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_cure.cure_sac import CuReSAC
+
+ACTORS = ("task", "curious", "random")
+
+
+@dataclass
+class Episode:
+    """What one episode showed.
+
+    :param rewards: Reward of each agent step, [T]
+    :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
+    :param observations: The observations before each step, [T, *shape]
+    :param frames: ``env.render()`` after each step, if asked for
+    """
+
+    rewards: np.ndarray
+    srl_errors: np.ndarray
+    observations: np.ndarray
+    frames: list[np.ndarray]
+
+    @property
+    def total_reward(self) -> float:
+        """Return of the episode, undiscounted."""
+        return float(self.rewards.sum())
+
+
+def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> np.ndarray:
+    """SRL error of transitions without training noise, as the acting agent sees them (no augmentation).
+
+    :param model: A model with an SRL head
+    :param batch: Transitions, observations as stored (images in 0-255)
+    :param chunk: How many at a time
+    :return: Error per sample, [n]
+    """
+    policy = model.policy
+    policy.set_training_mode(False)
+    errors = []
+    with th.no_grad():
+        for start in range(0, len(batch.observations), chunk):
+            part = ReplayBufferSamples(*[None if field is None else field[start : start + chunk] for field in batch])
+            errors.append(policy.srl.error(part, policy.encode(part.observations)).cpu().numpy())  # type: ignore[union-attr]
+    return np.concatenate(errors)
+
+
+def _actor(model: CuReSAC, env: gym.Env, actor: str, deterministic: bool) -> Callable[[np.ndarray], np.ndarray]:
+    if actor not in ACTORS:
+        raise ValueError(f"actor is {actor!r}, but it must be one of {', '.join(map(repr, ACTORS))}: choose one.")
+    if actor == "random":
+        return lambda observation: env.action_space.sample()
+    predict = model.predict_curious if actor == "curious" else model.predict
+    return lambda observation: predict(observation, deterministic=deterministic)[0]
+
+
+def run_episodes(
+    model: CuReSAC,
+    env: gym.Env,
+    n_episodes: int,
+    actor: str = "task",
+    *,
+    deterministic: bool = True,
+    seed: int | None = None,
+    render: bool = False,
+) -> Iterator[Episode]:
+    """Roll out one policy alone, episode by episode (one is in memory at a time).
+
+    :param model: A trained model
+    :param env: One (not vectorised) environment
+    :param n_episodes: How many episodes
+    :param actor: Whose actions: ``"task"``, ``"curious"`` or ``"random"`` (uniform)
+    :param deterministic: Whether policies act by their mean
+    :param seed: Seed of the first reset and of random actions
+    :param render: Whether to keep ``env.render()`` of each step
+    :return: The episodes
+    :raises ValueError: if the actor is unknown, or the model has no curious policy
+    """
+    choose = _actor(model, env, actor, deterministic)
+    if seed is not None:
+        env.action_space.seed(seed)
+    for index in range(n_episodes):
+        observation, _ = env.reset(seed=seed if index == 0 else None)
+        observations, actions, rewards, dones, frames = [observation], [], [], [], []
+        done = False
+        while not done:
+            action = choose(observation)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            done = terminated or truncated
+            observations.append(observation)
+            actions.append(action)
+            rewards.append(float(reward))
+            dones.append(terminated)
+            if render:
+                frames.append(env.render())
+        seen = np.stack(observations)
+        errors = np.zeros(0, np.float32)
+        if getattr(model.policy, "srl", None) is not None:
+            errors = srl_errors(model, _as_batch(model, seen, actions, rewards, dones))
+        yield Episode(np.array(rewards), errors, seen[:-1], frames)
+
+
+def _as_batch(
+    model: CuReSAC, observations: np.ndarray, actions: list[np.ndarray], rewards: list[float], dones: list[bool]
+) -> ReplayBufferSamples:
+    """An episode in the form in which heads read the replay buffer (actions scaled to [-1, 1])."""
+    device = model.device
+    stacked = th.as_tensor(observations, device=device)
+    column = {"dtype": th.float32, "device": device}
+    return ReplayBufferSamples(
+        observations=stacked[:-1],
+        actions=th.as_tensor(model.policy.scale_action(np.stack(actions)), **column),  # type: ignore[arg-type]
+        next_observations=stacked[1:],
+        dones=th.as_tensor(dones, **column).unsqueeze(1),  # type: ignore[arg-type]
+        rewards=th.as_tensor(rewards, **column).unsqueeze(1),  # type: ignore[arg-type]
+    )
