@@ -720,7 +720,7 @@ class CuReSAC(SAC):
         :param tb_log_name: Name of the run in TensorBoard
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
-        :raises ValueError: if there is no SRL head, or the collector is unknown
+        :raises ValueError: if there is no SRL head, or the collector is unknown or has nothing to learn from
         """
         if self.srl is None:
             raise ValueError(
@@ -731,6 +731,8 @@ class CuReSAC(SAC):
             raise ValueError(
                 f"pretrain got collector={collector!r}, but data are collected by 'curious' or 'random': choose one."
             )
+        if collector == "curious":
+            self._check_curious_agent()
         self._collector = collector
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
@@ -851,12 +853,8 @@ class CuReSAC(SAC):
                 f"task=False was given with curiosity={self.curiosity!r}, but an agent without task needs a curious "
                 "policy: set curiosity='separate'."
             )
-        if self.curiosity == "separate" and self.curiosity_gamma == 0 and self.curiosity_target == "observation":
-            raise ValueError(
-                "curiosity_gamma=0 was given with curiosity_target='observation', but the error of the observation "
-                "itself does not depend on the action, so that there is nothing to learn: set "
-                "curiosity_target='next_observation', or a curiosity_gamma > 0."
-            )
+        if self.curiosity == "separate":
+            self._check_curious_agent()
         if self.use_sde and not self._is_plain_sac:
             raise ValueError(
                 f"use_sde=True was given with srl={self.srl!r} and curiosity={self.curiosity!r}, but gSDE's noise "
@@ -867,10 +865,27 @@ class CuReSAC(SAC):
                 f"n_steps={self.n_steps} was given with curiosity={self.curiosity!r}, but the curious reward is known "
                 "for single transitions only: set n_steps=1, or curiosity=None."
             )
-        if not self._is_plain_sac and not issubclass(self.policy_class, CuRePolicy | sb3_policies.MultiInputPolicy):
+        # Dictionaries, for which SB3 asks for 'MultiInputPolicy', are refused for themselves.
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        if not (self._is_plain_sac or is_dict or issubclass(self.policy_class, CuRePolicy)):
+            policy = f"{self.policy_class.__module__}.{self.policy_class.__name__}"
             raise ValueError(
-                f"the policy is {self.policy_class.__name__}, but SRL and curiosity need a subclass of "
-                "sb3_cure.policies.CuRePolicy: use 'CnnPolicy' or 'MlpPolicy'."
+                f"the policy is {policy}, but SRL and curiosity need a subclass of sb3_cure.policies.CuRePolicy: use "
+                "'CnnPolicy' or 'MlpPolicy'."
+            )
+
+    def _check_curious_agent(self) -> None:
+        """What a second actor-critic cannot learn from."""
+        if self.curiosity_gamma == 0 and self.curiosity_target == "observation":
+            raise ValueError(
+                "curiosity_gamma=0 was given with curiosity_target='observation', but the error of the observation "
+                "itself does not depend on the action, so that there is nothing to learn: set "
+                "curiosity_target='next_observation', or a curiosity_gamma > 0."
+            )
+        if self.n_steps > 1:
+            raise ValueError(
+                f"n_steps={self.n_steps} was given with a curious policy to train, but the curious reward is known "
+                "for single transitions only: set n_steps=1."
             )
 
 
@@ -881,7 +896,7 @@ def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None
 
 def _check_range(name: str, value: Any, low: float, high: float) -> None:
     is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (is_number and low <= value <= high):
+    if not (is_number and low <= value <= high and np.isfinite(value)):
         bounds = f"within [{low:g}, {high:g}]" if np.isfinite(high) else f"of at least {low:g}"
         raise ValueError(f"{name} is {value!r}, but it must be a number {bounds}: change {name}.")
 

@@ -1,5 +1,7 @@
 """Which actor acts: at every step of every environment the curious one with probability p_c (Algorithm 1)."""
 
+from numbers import Real
+
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -26,13 +28,13 @@ class CuriousMixer:
         :raises ValueError: if a schedule leaves [0, 1]
         """
         schedule = self.probability
-        probability = float(schedule(progress_remaining) if callable(schedule) else schedule)
-        if not 0.0 <= probability <= 1.0:
+        probability = schedule(progress_remaining) if callable(schedule) else schedule
+        if not (isinstance(probability, Real) and 0 <= probability <= 1):
             raise ValueError(
-                f"curiosity_prob is {probability} (progress remaining {progress_remaining:.2f}), but it is the "
+                f"curiosity_prob is {probability!r} (progress remaining {progress_remaining:.2f}), but it is the "
                 "probability p_c with which the curious actor acts: give a number, or a schedule, within [0, 1]."
             )
-        return probability
+        return float(probability)
 
     def choose(self, n_envs: int, progress_remaining: float) -> np.ndarray:
         """

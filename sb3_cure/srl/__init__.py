@@ -5,7 +5,7 @@
 
 import inspect
 
-from sb3_cure.srl.autoencoder import RAE
+from sb3_cure.srl.autoencoder import RAE, PixelDecoder
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
 
@@ -22,10 +22,12 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
         return SRL_HEADS[srl]
     if inspect.isclass(srl) and issubclass(srl, SRLHead):
         return srl
+    # A module's own description takes many lines.
+    given = f"an instance of {type(srl).__name__}" if isinstance(srl, SRLHead) else repr(srl)
     raise ValueError(
-        f"srl is {srl!r}, but it must be one of {', '.join(map(repr, SRL_HEADS))}, None, or a subclass of "
+        f"srl is {given}, but it must be one of {', '.join(map(repr, SRL_HEADS))}, None, or a subclass of "
         "sb3_cure.srl.SRLHead (the class itself, not an instance)."
     )
 
 
-__all__ = ["CURL", "RAE", "SRL_HEADS", "SRLHead", "SRLOutput", "get_srl_class"]
+__all__ = ["CURL", "RAE", "SRL_HEADS", "PixelDecoder", "SRLHead", "SRLOutput", "get_srl_class"]

@@ -105,8 +105,8 @@ class RAE(SRLHead):
         self.pixels = is_image_space(observation_space)
         if augmentation not in ("none", "shift") or (augmentation == "shift" and not self.pixels):
             raise ValueError(
-                f"srl_kwargs got augmentation={augmentation!r} for observations of shape {observation_space.shape}, but "
-                "srl='rae' knows 'none', and for images 'shift': choose one of them."
+                f"srl_kwargs got augmentation={augmentation!r} for observations of shape {observation_space.shape}, "
+                "but srl='rae' knows 'none', and for images 'shift': choose one of them."
             )
         if pad < 1:
             raise ValueError(f"srl_kwargs got pad={pad}, but a shift needs at least 1 pixel: change pad.")

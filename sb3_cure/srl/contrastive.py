@@ -81,8 +81,8 @@ class CURL(SRLHead):
         if augmentation == "crop" and not 1 <= crop_size < size:
             raise ValueError(
                 f"srl_kwargs got augmentation='crop' with crop_size={crop_size} for observations of {size} pixels, but "
-                "crops must be smaller than the observation: render larger (CURL: image_size=100), set a smaller "
-                "crop_size, or use augmentation='shift'."
+                "crops must have at least 1 pixel and be smaller than the observation: render larger (CURL: "
+                "image_size=100), set another crop_size, or use augmentation='shift'."
             )
         return augmentation
 

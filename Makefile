@@ -1,0 +1,85 @@
+# Bare `make` installs the package, with all that the other targets need, into .venv; `make help` lists them.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DEFAULT_GOAL := .venv
+.PHONY: .venv gl demo test check notebooks clean help
+
+# The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
+# on the PATH for every version it has, and those that are not active only print an error.
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))
+PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
+	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
+
+export MUJOCO_GL ?= egl
+RUN := .venv/bin/python -m
+PYTEST_ARGS ?=
+
+# $(call apt_install,PACKAGES) installs them as root on Debian and Ubuntu and stops elsewhere: the sentence
+# printed before it has named them. On a machine that has just booted, apt is often busy updating it: wait.
+define apt_install
+	if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then exit 1; fi
+	echo "Installing $(1)"
+	export DEBIAN_FRONTEND=noninteractive
+	apt-get update -qq || true
+	apt-get install -y -qq --no-install-recommends -o DPkg::Lock::Timeout=300 $(1) >/dev/null
+endef
+
+.venv: .venv/.installed  ## install into .venv (the default; another interpreter: make PYTHON=python3.12)
+
+# pip, killed half-way, can leave packages that look complete. So .venv carries the mark `.unfinished` from before
+# its creation until the end, where it becomes the stamp; a .venv found with the mark is made anew.
+.venv/.installed: setup.cfg pyproject.toml constraints.txt
+	@exec 9<>constraints.txt  # only to lock it: a second make at the same time waits here
+	flock 9
+	if [ -z "$$(find $^ -newer $@ 2>&1)" ]; then exit; fi  # and finds that the first has done the work
+	if [ -e .venv/.unfinished ] || ! .venv/bin/python -c 'import pip; $(SUPPORTED)' 2>/dev/null; then
+		rm -rf .venv
+		python="$(PYTHON)"
+		if ! "$$python" -c '$(SUPPORTED)' 2>/dev/null; then
+			echo "sb3_cure needs a Python 3.11 or 3.12 that runs; name one: make PYTHON=/path/to/python3.12" >&2
+			exit 1
+		fi
+		if ! "$$python" -c 'import ensurepip' 2>/dev/null; then
+			package=$$("$$python" -c 'import sys; print("python{}.{}-venv".format(*sys.version_info))')
+			echo "$$python cannot make virtual environments; on Debian and Ubuntu this needs: apt-get install $$package" >&2
+			$(call apt_install,$$package)
+		fi
+		mkdir .venv
+		touch .venv/.unfinished
+		"$$python" -m venv .venv
+	fi
+	rm -f $@
+	touch .venv/.unfinished
+	echo "Installing sb3_cure into .venv (some minutes the first time) ..."
+	$(RUN) pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	mv .venv/.unfinished $@
+
+# Prints the OpenGL renderer in use, or one sentence about what is missing.
+gl: .venv/.installed
+	@if ! $(RUN) sb3_cure.envs.rendering; then
+		$(call apt_install,libegl1 libopengl0 libgl1-mesa-dri)
+		$(RUN) sb3_cure.envs.rendering
+	fi
+
+demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten minutes on two cores)
+	$(RUN) sb3_cure.experiments.demo --out demo
+
+test: gl  ## run the tests (options for pytest: make test PYTEST_ARGS="-x -k buffer")
+	$(RUN) pytest $(PYTEST_ARGS)
+
+check: .venv/.installed  ## lint, formatting and types
+	$(RUN) ruff check
+	$(RUN) ruff format --check
+	$(RUN) mypy
+
+notebooks: gl  ## execute the notebooks in place
+	$(RUN) nbconvert --to notebook --execute --inplace notebooks/*.ipynb
+
+clean:  ## remove .venv, caches and build products
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +
+
+help:  ## list the targets
+	@sed -nE 's/^([a-z.]+):[^#]*##/\1:/p' Makefile

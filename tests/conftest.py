@@ -1,0 +1,11 @@
+"""Settings of the whole test run."""
+
+import os
+
+# Without a display MuJoCo needs to be told to render off-screen, before it is imported.
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+import torch as th
+
+# The networks of the tests are so small that more threads only cost time; and some sums depend on their number.
+th.set_num_threads(1)

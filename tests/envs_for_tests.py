@@ -1,0 +1,147 @@
+"""What the tests share: tiny environments (a dot moved about a square), tiny models, and how to compare two of them."""
+
+import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+
+from sb3_cure import CuReSAC
+
+
+class VectorBox(gym.Env):
+    """A dot in [-1, 1]^2 starts at a random place and is moved by the action; the closer to the origin, the better.
+
+    Dynamics are deterministic: ``position += 0.3 * action`` (rescaled to [-1, 1]), kept within the square. The reward
+    of a step is ``1 - max|position|``, in [0, 1]. Episodes are truncated after ``episode_length`` steps and never
+    terminate. All randomness is the start, drawn from the environment's seeded generator.
+
+    :param episode_length: Steps until truncation
+    :param low: Lower bound of the actions
+    :param high: Upper bound of the actions
+    """
+
+    def __init__(self, episode_length: int = 20, low: float = -1.0, high: float = 1.0):
+        self.episode_length = episode_length
+        self.action_space = spaces.Box(low, high, (2,), np.float32)
+        self.observation_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.position = np.zeros(2)
+        self.n_steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.position = self.np_random.uniform(-1, 1, 2)
+        self.n_steps = 0
+        return self.observe(first=True), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        assert self.action_space.contains(np.asarray(action, np.float32)), action
+        low, high = self.action_space.low, self.action_space.high
+        self.position = np.clip(self.position + 0.3 * (2 * (action - low) / (high - low) - 1), -1, 1)
+        self.n_steps += 1
+        reward = 1 - float(np.abs(self.position).max())
+        return self.observe(), reward, False, self.n_steps >= self.episode_length, {}
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        """
+        :param first: Whether this is the first observation of an episode
+        :return: The position, [2]
+        """
+        return self.position.astype(np.float32)
+
+
+class PixelBox(VectorBox):
+    """``VectorBox`` seen as the newest ``frame_stack`` frames: uint8 (3 * frame_stack, size, size), oldest first.
+
+    The dot is a white square on a coloured gradient; the first frame is repeated at reset. As the package's own
+    environments do, it tells ``frame_stack`` (unless ``tells_frame_stack=False``) and ``action_repeat``.
+
+    :param frame_stack: Frames per observation
+    :param size: Height and width, pixels
+    :param action_repeat: What to tell (it changes nothing else)
+    :param channels_last: Whether observations are (size, size, 3 * frame_stack) instead
+    :param tells_frame_stack: Whether there is an attribute ``frame_stack``
+    :param kwargs: Arguments of ``VectorBox``
+    """
+
+    def __init__(
+        self,
+        frame_stack: int = 2,
+        size: int = 36,
+        action_repeat: int = 4,
+        channels_last: bool = False,
+        tells_frame_stack: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(**kwargs)
+        self.size = size
+        self.action_repeat = action_repeat
+        self.channels_last = channels_last
+        if tells_frame_stack:
+            self.frame_stack = frame_stack
+        shape = (size, size, 3 * frame_stack) if channels_last else (3 * frame_stack, size, size)
+        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
+        ramp = np.linspace(0, 120, size).astype(np.uint8)
+        self.background = np.stack(np.broadcast_arrays(ramp[:, None], ramp[None, :], ramp[::-1, None]))
+        self.frames = [self.background] * frame_stack
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        side = self.size // 6
+        row, column = np.rint((self.position + 1) / 2 * (self.size - side)).astype(int)
+        frame = self.background.copy()
+        frame[:, row : row + side, column : column + side] = 255
+        self.frames = [frame] * len(self.frames) if first else [*self.frames[1:], frame]
+        stacked = np.concatenate(self.frames)
+        return stacked.transpose(1, 2, 0) if self.channels_last else stacked
+
+
+def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
+    """The smallest CuReSAC that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
+
+    Networks are tiny unless ``policy_kwargs`` says otherwise. What SB3's SAC takes under its name has its meaning.
+    """
+    shared = kwargs.get("srl", "rae") is not None or kwargs.get("policy_kwargs", {}).get("share_encoder", False)
+    policy_kwargs: dict[str, Any] = {"net_arch": [16]}
+    if policy == "MlpPolicy" and shared:
+        policy_kwargs["features_extractor_kwargs"] = {"features_dim": 8, "hidden_dim": 16}
+    elif policy == "CnnPolicy":
+        policy_kwargs["features_extractor_kwargs"] = {"n_filters": 4, "n_layers": 2} if shared else {"features_dim": 8}
+    defaults: dict[str, Any] = dict(
+        learning_starts=10, batch_size=8, buffer_size=500, warmup_updates=0, precision="fp32", seed=0, device="cpu"
+    )
+    defaults.update(kwargs)
+    defaults["policy_kwargs"] = {**policy_kwargs, **kwargs.get("policy_kwargs", {})}
+    return CuReSAC(policy, env, **defaults)
+
+
+def state_of(model: SAC) -> dict[str, Any]:
+    """A copy of all that learning changes: networks, optimisers, temperatures."""
+    _, variables = model._get_torch_save_params()
+    return copy.deepcopy({**model.get_parameters(), **{name: getattr(model, name) for name in variables}})
+
+
+def differences(first: Any, second: Any, path: str = "") -> list[str]:
+    """Where two nested states are not equal bit for bit (NaNs differ, as nothing here may be NaN).
+
+    :param first: Nested dictionaries and sequences of tensors, arrays and plain values
+    :param second: Another one
+    :param path: Prefix of the names
+    :return: Names of the leaves that differ
+    """
+    if isinstance(first, dict) and isinstance(second, dict):
+        different = [f"{path}.{key} (only in one)" for key in first.keys() ^ second.keys()]
+        return different + [
+            d for key in first.keys() & second.keys() for d in differences(first[key], second[key], f"{path}.{key}")
+        ]
+    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        if len(first) != len(second):
+            return [f"{path} (length)"]
+        return [d for i, pair in enumerate(zip(first, second, strict=True)) for d in differences(*pair, f"{path}[{i}]")]
+    if isinstance(first, th.Tensor) and isinstance(second, th.Tensor):
+        return [] if first.dtype == second.dtype and th.equal(first, second) else [path]
+    if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        return [] if first.dtype == second.dtype and np.array_equal(first, second) else [path]
+    return [] if first == second else [path]

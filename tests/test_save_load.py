@@ -1,0 +1,356 @@
+"""What is saved and loaded acts alike and learns on alike, whatever is switched on."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import DummyVecEnv
+from torch import nn
+
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.encoders import Encoder
+from sb3_cure.policies import CnnPolicy, CuRePolicy
+from sb3_cure.srl import SRLHead, SRLOutput
+
+
+class Denoising(SRLHead):
+    """A user's head: draw the clean image from the latents of a noisy one."""
+
+    def __init__(self, encoder: Encoder, observation_space: spaces.Box, noise: float = 30.0):
+        super().__init__(encoder, observation_space)
+        self.noise = noise
+        self.decoder = nn.Linear(encoder.features_dim, int(np.prod(observation_space.shape)))
+
+    def augment(self, observations: th.Tensor) -> th.Tensor:
+        noisy = observations + self.noise * th.randn(observations.shape, device=observations.device)
+        return noisy.clamp(0, 255)
+
+    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+        clean = self.preprocess(batch.observations).flatten(1)
+        error = (self.decoder(latents) - clean).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+    def reconstruct(self, latents: th.Tensor) -> th.Tensor:
+        drawn = self.decoder(latents).view(-1, *self.observation_space.shape)
+        return (255 * drawn).clamp(0, 255).to(th.uint8)
+
+
+IMAGES = np.random.default_rng(0).integers(0, 256, (5, 6, 36, 36), dtype=np.uint8)
+
+
+def predictions(model: CuReSAC, observations: np.ndarray = IMAGES) -> list[np.ndarray]:
+    """Deterministic actions of the task policy and, if there is one, of the curious one."""
+    actions = [model.predict(observations, deterministic=True)[0]]
+    if model.policy.curious_actor is not None:
+        actions.append(model.predict_curious(observations, deterministic=True)[0])
+    return actions
+
+
+def srl_errors(model: CuReSAC) -> th.Tensor | None:
+    """The head's noise-free error of the test images, as used for measuring."""
+    policy = model.policy
+    if policy.srl is None:
+        return None
+    batch = ReplayBufferSamples(th.as_tensor(IMAGES), *[None] * 4)  # type: ignore[arg-type]
+    with th.no_grad():
+        return policy.srl.error(batch, policy.encode(batch.observations))
+
+
+def learn_on(model: CuReSAC, env: gym.Env, total_timesteps: int) -> dict[str, Any]:
+    """State and stored actions after learning on, from a given seed of the global generators and the environment."""
+    model.set_env(env)
+    model.set_random_seed(11)
+    model.learn(total_timesteps, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    stored = {"actions": buffer.actions[: buffer.pos].copy(), "rewards": buffer.rewards[: buffer.pos].copy()}
+    return {**state_of(model), **stored}
+
+
+def check_save_load(
+    model: CuReSAC, make_env: Callable[[], gym.Env], path: Path, observations: np.ndarray = IMAGES
+) -> CuReSAC:
+    """Saved and loaded: the same state, the same actions; and after learning on the same state and actions again."""
+    model.save(path / "model")
+    model.save_replay_buffer(path / "buffer")
+    loaded = CuReSAC.load(path / "model", env=make_env(), device="cpu")
+    loaded.load_replay_buffer(path / "buffer")
+    assert differences(state_of(model), state_of(loaded)) == []
+    expected = predictions(model, observations)
+    assert differences(expected, predictions(loaded, observations)) == []
+    if observations is IMAGES:
+        assert differences(srl_errors(model), srl_errors(loaded)) == []
+    assert differences(learn_on(model, make_env(), 8), learn_on(loaded, make_env(), 8)) == []
+    # Something was learned meanwhile, or the comparison would be idle.
+    assert differences(expected, predictions(loaded, observations))
+    return loaded
+
+
+# --------------------------------------------------- same actions, same update
+
+
+@pytest.mark.parametrize("update", ["sequential", "joint"])
+@pytest.mark.parametrize("curiosity", ["separate", "bonus", "random", None])
+@pytest.mark.parametrize("srl", ["rae", "curl", Denoising], ids=["rae", "curl", "user's"])
+def test_save_load(srl: str | type[SRLHead], curiosity: str | None, update: str, tmp_path: Path) -> None:
+    """Every head, kind of curiosity and update: identical actions of both policies, identical learning afterwards.
+
+    Saved after an odd number of updates, so that the clock of actors and targets matters, with a mixing probability
+    of a half, so that the mixer's random stream matters.
+    """
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity, update=update, curiosity_prob=0.5)
+    model.learn(21)
+    assert model._n_updates == 11
+    if curiosity in ("separate", "bonus"):
+        assert model.policy.curiosity.weight > 0 and model.policy.curiosity.mean > 0
+    if srl == "curl":
+        assert model.policy.srl.bank_filled == 64 and model.policy.srl.bank.any()
+    check_save_load(model, PixelBox, tmp_path)
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "no task": dict(task=False),
+    "no SRL on the shared encoder": dict(srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True)),
+    "fixed temperature": dict(ent_coef=0.05),
+    "alternating": dict(srl_schedule="alternating", srl_period=4),
+    "scheduled mixing": dict(curiosity_prob=lambda progress: 0.5 * progress),
+    "curious about the next observation": dict(curiosity_gamma=0.0, curiosity_target="next_observation"),
+    "curious critics do not train the encoder": dict(curiosity_encoder_grad=False, update="joint"),
+    "bare curious reward": dict(normalize_curiosity=False, curiosity_beta=3.0),
+    "crops": dict(srl="curl", srl_kwargs=dict(crop_size=30, bank_size=9)),
+    "head's arguments": dict(srl=Denoising, srl_kwargs=dict(noise=3.0)),
+    "three environments": dict(n_envs=3),
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_save_load_of_variants(name: str, tmp_path: Path) -> None:
+    """The same for the other arguments."""
+    variant = dict(VARIANTS[name])
+    n_envs = variant.pop("n_envs", 1)
+
+    def make_env() -> DummyVecEnv:
+        return DummyVecEnv([PixelBox] * n_envs)
+
+    model = tiny_model("CnnPolicy", make_env(), **variant).learn(21)
+    loaded = check_save_load(model, make_env, tmp_path)
+    variant.pop("policy_kwargs", None)
+    assert {key: getattr(loaded, key) for key in variant if not callable(variant[key])} == {
+        key: value for key, value in variant.items() if not callable(value)
+    }
+
+
+@pytest.mark.parametrize("update", ["sequential", "joint"])
+def test_save_load_of_vectors(update: str, tmp_path: Path) -> None:
+    """The same for MlpPolicy."""
+    model = tiny_model("MlpPolicy", VectorBox(), update=update).learn(21)
+    check_save_load(model, VectorBox, tmp_path, observations=np.eye(2, dtype=np.float32))
+
+
+def test_saved_again(tmp_path: Path) -> None:
+    """A loaded model can be saved and loaded again."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(15)
+    model.save(tmp_path / "first")
+    CuReSAC.load(tmp_path / "first").save(tmp_path / "second")
+    assert differences(state_of(model), state_of(CuReSAC.load(tmp_path / "second"))) == []
+
+
+def test_parameters_of_a_younger_model() -> None:
+    """CURL's bank of negatives goes on filling from where the parameters that were set had it."""
+    young, old = (tiny_model("CnnPolicy", PixelBox(), srl="curl").learn(steps) for steps in (11, 21))
+    assert (young.policy.srl.bank_filled, old.policy.srl.bank_filled) == (8, 64)
+    old.set_parameters(young.get_parameters())
+    assert differences(srl_errors(young), srl_errors(old)) == []
+    old.train(1, batch_size=8)
+    assert old.policy.srl.bank_filled == 16
+
+
+# ------------------------------------------------------- other circumstances
+
+
+@pytest.mark.parametrize("saved_with, loaded_with", [(1, 3), (3, 1)])
+def test_load_with_other_number_of_environments(saved_with: int, loaded_with: int, tmp_path: Path) -> None:
+    """The number of environments is not part of the model."""
+    model = tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * saved_with)).learn(21)
+    model.save(tmp_path / "model")
+    loaded = CuReSAC.load(tmp_path / "model", env=DummyVecEnv([PixelBox] * loaded_with))
+    assert differences(predictions(model), predictions(loaded)) == []
+    assert loaded.replay_buffer.n_envs == loaded.n_envs == loaded_with
+    steps, updates = model.num_timesteps, model._n_updates
+    loaded.learn(12, reset_num_timesteps=False)
+    assert (loaded.num_timesteps, loaded._n_updates) == (steps + 12, updates + 12)
+    assert loaded.replay_buffer.pos == 12 // loaded_with
+
+
+def test_load_without_environment(tmp_path: Path) -> None:
+    """An archive is enough to predict, and to learn on once there is an environment."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(15)
+    model.save(tmp_path / "model")
+    loaded = CuReSAC.load(tmp_path / "model")
+    assert loaded.env is None
+    assert differences(predictions(model), predictions(loaded)) == []
+    loaded.set_env(PixelBox())
+    loaded.learn(5, reset_num_timesteps=False)
+    assert (loaded.num_timesteps, loaded._n_updates) == (20, 10)
+
+
+def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
+    """``load(..., name=value)`` replaces arguments, also the one that the mixer keeps."""
+    tiny_model("CnnPolicy", PixelBox(), curiosity_prob=0.0).learn(15).save(tmp_path / "model")
+    loaded = CuReSAC.load(tmp_path / "model", env=PixelBox(), curiosity_prob=1.0, learning_rate=0.0)
+    before = {name: value.clone() for name, value in loaded.policy.named_parameters()}
+    asked = []
+    loaded.policy.curious_actor.register_forward_hook(lambda *_: asked.append(1))
+    loaded.learn(6, reset_num_timesteps=False)
+    assert len(asked) == 6
+    # A learning rate of zero moves nothing but the targets, towards the networks.
+    moved = differences(before, dict(loaded.policy.named_parameters()))
+    assert moved and all("target" in name for name in moved)
+
+
+@pytest.mark.parametrize("change", [dict(update="joint"), dict(curiosity_encoder_grad=False)], ids=str)
+def test_loading_into_another_algorithm_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
+    """The encoder's optimiser states belong to the sources and the mode that they were made with."""
+    tiny_model("CnnPolicy", PixelBox()).learn(12).save(tmp_path / "model")
+    with pytest.raises(RuntimeError, match="the saved encoder was trained by"):
+        CuReSAC.load(tmp_path / "model", **change)
+
+
+# ------------------------------------------------------------ a user's own head
+
+
+def test_users_head_trains() -> None:
+    """A head of 20 lines: its parameters and the encoder move, and its loss falls."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Denoising, curiosity=None, learning_starts=60, learning_rate=3e-3)
+    model.learn(61)
+    before = state_of(model)["policy"]
+    first = srl_loss(model)
+    model.train(60, batch_size=16)
+    assert srl_loss(model) < 0.5 * first
+    moved = differences(before, state_of(model)["policy"])
+    assert {".srl.decoder.weight", ".srl.decoder.bias", ".encoder.trunk.0.weight"} <= set(moved)
+
+
+def srl_loss(model: CuReSAC) -> float:
+    policy = model.policy
+    np.random.seed(0)
+    batch = model.replay_buffer.sample(64)
+    with th.no_grad():
+        return policy.srl.error(batch, policy.encode(batch.observations)).mean().item()
+
+
+def test_custom_objects_supply_a_head(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the archive's own class cannot be found any more, ``custom_objects={"srl": ...}`` supplies it."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Denoising).learn(15)
+    model.save(tmp_path / "model")
+    head = Denoising
+    monkeypatch.delitem(globals(), "Denoising")
+    loaded = CuReSAC.load(tmp_path / "model", custom_objects={"srl": head})
+    assert type(loaded.policy.srl) is head
+    assert differences(predictions(model), predictions(loaded)) == []
+    assert differences(state_of(model), state_of(loaded)) == []
+
+
+# -------------------------------------------------- replay buffer, checkpoints
+
+
+def test_frame_stack_buffer_survives(tmp_path: Path) -> None:
+    """A saved and loaded FrameStackReplayBuffer gives the same batches, and more can be added to it."""
+    model = tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * 2)).learn(50)
+    assert type(model.replay_buffer) is FrameStackReplayBuffer
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * 2), seed=4)
+    other.load_replay_buffer(tmp_path / "buffer")
+    batches = []
+    for owner in (model, other):
+        np.random.seed(0)
+        batches.append(owner.replay_buffer.sample(100)._asdict())
+    assert differences(*batches) == []
+    assert batches[0]["observations"].shape == (100, 6, 36, 36)
+    other.learn(20)
+    assert other.replay_buffer.size() == 35
+
+
+def test_resume_from_checkpoint(tmp_path: Path) -> None:
+    """CheckpointCallback's archive and buffer continue the run: counters go on, no second warm-up, no second burst."""
+    model = tiny_model("CnnPolicy", PixelBox(), warmup_updates=7)
+    model.learn(20, callback=CheckpointCallback(15, str(tmp_path), name_prefix="run", save_replay_buffer=True))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"run_15_steps.zip", "run_replay_buffer_15_steps.pkl"}
+    resumed = CuReSAC.load(tmp_path / "run_15_steps", env=PixelBox())
+    resumed.load_replay_buffer(tmp_path / "run_replay_buffer_15_steps.pkl")
+    # The callback is called before the 15th transition is stored and learned from.
+    assert (resumed.num_timesteps, resumed._n_updates, resumed.replay_buffer.size()) == (15, 7 + 4, 14)
+    samples = []
+    resumed.action_space.sample = lambda: samples.append(1)  # type: ignore[method-assign]
+    resumed.learn(10, reset_num_timesteps=False)
+    assert (resumed.num_timesteps, resumed._n_updates, resumed.replay_buffer.size()) == (25, 7 + 4 + 10, 24)
+    assert samples == []
+
+
+@pytest.mark.parametrize("collector", ["curious", "random"])
+@pytest.mark.parametrize("curiosity", ["separate", None])
+@pytest.mark.parametrize("update", ["sequential", "joint"])
+def test_checkpoint_while_pretraining(collector: str, curiosity: str | None, update: str, tmp_path: Path) -> None:
+    """A checkpoint taken while pretraining loads; ``learn`` then ends the pretraining as it would have."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, update=update)
+    states = []
+    model.pretrain(20, collector, callback=lambda locals_, _: states.append(state_of(locals_["self"])) or True)
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, update=update)
+    model.pretrain(20, collector, callback=CheckpointCallback(16, str(tmp_path), save_replay_buffer=True))
+    loaded = CuReSAC.load(tmp_path / "rl_model_16_steps", env=PixelBox())
+    loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_16_steps.pkl")
+    assert differences(states[15], state_of(loaded)) == []
+    assert (loaded.policy.curious_actor is not None) == ("curious" in (collector, "curious" if curiosity else ""))
+    loaded.learn(14)
+    assert (loaded.num_timesteps, loaded._n_updates, loaded.replay_buffer.size()) == (14, 4, 14)
+    assert (loaded.policy.curious_actor is not None) == (curiosity == "separate")
+    # Encoder and head are the pretrained ones, trained on: their optimisers have seen all updates.
+    assert state_of(loaded)["policy.srl.optimizer"]["state"][0]["step"] == 5 + 4
+
+
+def test_pretrained_model_survives(tmp_path: Path) -> None:
+    """A model that was pretrained, with a curious agent of its own for it, is saved and loaded as what it is now."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None).pretrain(15)
+    model.learn(13)
+    check_save_load(model, PixelBox, tmp_path)
+
+
+# ------------------------------------------------------------ the policy alone
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl", Denoising, None], ids=["rae", "curl", "user's", "none"])
+@pytest.mark.parametrize("curiosity", ["separate", None])
+def test_policy_save_load(srl: str | type[SRLHead] | None, curiosity: str | None, tmp_path: Path) -> None:
+    """``policy.save`` and ``CuRePolicy.load``: a policy without the algorithm, with all its networks."""
+    if srl is None:
+        curiosity = None
+    policy_kwargs = dict(share_encoder=True, activation_fn=nn.Tanh, n_critics=3)
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity, policy_kwargs=policy_kwargs).learn(15)
+    policy = model.policy
+    policy.save(tmp_path / "policy.pt")
+    for cls in (CnnPolicy, CuRePolicy):
+        loaded = cls.load(tmp_path / "policy.pt")
+        assert differences(dict(policy.state_dict()), dict(loaded.state_dict())) == []
+        for actor in ["actor"] + ["curious_actor"] * (curiosity is not None):
+            with policy.acting(actor), loaded.acting(actor):
+                np.testing.assert_array_equal(
+                    policy.predict(IMAGES, deterministic=True)[0], loaded.predict(IMAGES, deterministic=True)[0]
+                )
+
+
+def test_policy_without_task_acts_curiously_when_loaded(tmp_path: Path) -> None:
+    """With ``task=False`` the curious actor is the one that acts, in a loaded policy, too."""
+    model = tiny_model("CnnPolicy", PixelBox(), task=False).learn(15)
+    model.policy.save(tmp_path / "policy.pt")
+    loaded = CnnPolicy.load(tmp_path / "policy.pt")
+    expected = model.predict_curious(IMAGES, deterministic=True)[0]
+    np.testing.assert_array_equal(loaded.predict(IMAGES, deterministic=True)[0], expected)

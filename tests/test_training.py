@@ -1,0 +1,652 @@
+"""A training run as a user sees it: who acts, what is stored, what is updated when, and what is logged."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.logger import KVWriter, Logger, configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.metrics import Metrics
+from sb3_cure.policies import CnnPolicy, TrunkActor
+from sb3_cure.srl import SRLHead, SRLOutput
+
+both_updates = pytest.mark.parametrize("update", ["sequential", "joint"])
+
+
+class RecordingBox(PixelBox):
+    """``PixelBox`` that keeps what was done and what was paid."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.actions: list[np.ndarray] = []
+        self.rewards: list[float] = []
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        observation, reward, *rest = super().step(action)
+        self.actions.append(action.copy())
+        self.rewards.append(reward)
+        return observation, reward, *rest
+
+
+class Brightness(SRLHead):
+    """No parameters; the error of an observation is its mean brightness."""
+
+    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+        return SRLOutput(latents.square().mean(), brightness(batch.observations))
+
+
+def brightness(observations: th.Tensor) -> th.Tensor:
+    return observations.float().mean(dim=(1, 2, 3))
+
+
+class Dumps(KVWriter):
+    """Keeps what the logger writes."""
+
+    def __init__(self) -> None:
+        self.dumps: list[dict[str, Any]] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        self.dumps.append(dict(key_values))
+
+    def close(self) -> None:
+        pass
+
+
+def make_vec_env(n_envs: int, make: Callable[[], gym.Env] = PixelBox, kind: type[VecEnv] = DummyVecEnv) -> VecEnv:
+    return kind([lambda: Monitor(make())] * n_envs)
+
+
+def fix_action(actor: TrunkActor, action: float) -> None:
+    """From now on the actor returns (very nearly) this action in every observation, -1 or 1."""
+    for layer, bias in ((actor.mu, 10 * action), (actor.log_std, -10.0)):
+        th.nn.init.zeros_(layer.weight)
+        th.nn.init.constant_(layer.bias, bias)
+
+
+def moved(model: CuReSAC, step: Callable[[], Any]) -> set[str]:
+    """Which networks and temperatures a step changes."""
+    before = state_of(model)
+    step()
+    after = state_of(model)
+    names = {name.split(".")[1] for name in differences(before["policy"], after["policy"])}
+    temperatures = ("log_ent_coef", "curious_log_ent_coef")
+    return names | {key for key in temperatures if differences(before.get(key), after.get(key))}
+
+
+TASK = {"actor", "critic", "critic_target", "log_ent_coef"}
+CURIOUS = {"curious_actor", "curious_critic", "curious_critic_target", "curious_log_ent_coef"}
+#: Running statistics of the curious reward
+STATISTICS = {"curiosity"}
+
+
+# ------------------------------------------------------- how much is updated
+
+
+@pytest.mark.parametrize("kind, n_envs", [(DummyVecEnv, 1), (DummyVecEnv, 3), (SubprocVecEnv, 1), (SubprocVecEnv, 3)])
+def test_one_update_per_agent_step(kind: type[VecEnv], n_envs: int) -> None:
+    """For any number of environments: an update per agent step after the warm-up, and one burst at its end."""
+    env = make_vec_env(n_envs, kind=kind)
+    model = tiny_model("CnnPolicy", env, warmup_updates=7)
+    assert model.gradient_steps == -1
+    assert type(model.replay_buffer) is FrameStackReplayBuffer and model.replay_buffer.frame_stack == 2
+    model.learn(30)
+    # The first multiple of n_envs after `learning_starts` is the first step that is learned from.
+    warmup = 10 if n_envs == 1 else 9
+    assert (model.num_timesteps, model._n_updates) == (30, 7 + 30 - warmup)
+    assert model.replay_buffer.size() == 30 // n_envs
+    model.learn(12, reset_num_timesteps=False)
+    assert (model.num_timesteps, model._n_updates) == (42, 7 + 42 - warmup)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    "srl, warmup_updates, burst",
+    [("rae", None, 1000), ("curl", None, 0), (Brightness, None, 0), ("rae", 0, 0), ("curl", 5, 5), (None, None, 0)],
+)
+def test_burst_after_warmup(
+    srl: str | type[SRLHead] | None, warmup_updates: int | None, burst: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The head says how many updates follow the warm-up, unless ``warmup_updates`` does; they come once."""
+    calls: list[int] = []
+    monkeypatch.setattr(CuReSAC, "train", lambda self, gradient_steps, batch_size: calls.append(gradient_steps))
+    curiosity = None if srl is None else "separate"
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity, warmup_updates=warmup_updates)
+    model.learn(14)
+    model.learn(14)
+    assert calls == [burst] * (burst > 0) + [1] * 8
+
+
+@pytest.mark.parametrize("extras", [{}, dict(srl=None, curiosity=None)], ids=["on", "off"])
+def test_train_counts_its_updates(extras: dict[str, Any]) -> None:
+    """``train(n)`` adds exactly n to ``_n_updates``."""
+    model = tiny_model("CnnPolicy", PixelBox(), **extras).learn(11)
+    model.train(3, batch_size=4)
+    assert model._n_updates == 4
+    model.train(gradient_steps=1)
+    assert model._n_updates == 5
+
+
+@both_updates
+def test_actors_and_targets_keep_to_the_clock_of_updates(update: str) -> None:
+    """Actors every 2nd and targets every 3rd update, also when ``train`` makes one update per call."""
+    model = tiny_model("CnnPolicy", PixelBox(), update=update, actor_update_interval=2, target_update_interval=3)
+    model.learn(10)
+    for n_updates in range(7):
+        assert model._n_updates == n_updates
+        names = moved(model, lambda: model.train(1, batch_size=8))
+        expected = {"encoder", "srl", "critic", "curious_critic", *STATISTICS}
+        if n_updates % 2 == 0:
+            expected |= {"actor", "curious_actor", "log_ent_coef", "curious_log_ent_coef"}
+        if n_updates % 3 == 0:
+            expected |= {"encoder_target", "critic_target", "curious_critic_target"}
+        assert names == expected
+
+
+@both_updates
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_zero_learning_rate_freezes_everything(srl: str, update: str) -> None:
+    """A schedule that is zero moves no parameter, no target and no temperature."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, update=update, learning_rate=lambda _: 0.0)
+    names = moved(model, lambda: model.learn(16))
+    # CURL's bank of negatives is stored data.
+    assert names - STATISTICS == ({"srl"} if srl == "curl" else set())
+    before = dict(tiny_model("CnnPolicy", PixelBox(), srl=srl, update=update).policy.named_parameters())
+    assert differences(before, dict(model.policy.named_parameters())) == []
+
+
+@both_updates
+def test_alternating_schedule(update: str) -> None:
+    """``srl_period`` updates of the head, then as many of the agents, in turn; the encoder learns from both."""
+    model = tiny_model(
+        "CnnPolicy", PixelBox(), update=update, srl_schedule="alternating", srl_period=3, actor_update_interval=1,
+        target_update_interval=100,
+    ).learn(10)  # fmt: skip
+    model.train(1, batch_size=8)  # the one that updates the targets
+    for n_updates in range(1, 13):
+        names = moved(model, lambda: model.train(1, batch_size=8))
+        if n_updates // 3 % 2 == 0:
+            assert names == {"encoder", "srl", *STATISTICS}
+        else:
+            agents = (TASK | CURIOUS) - {"critic_target", "curious_critic_target"}
+            assert names == {"encoder", *agents, *STATISTICS}
+
+
+# ------------------------------------------------------------------ who acts
+
+
+def acting_model(env: gym.Env | VecEnv, **kwargs: Any) -> CuReSAC:
+    """Collects without updates; the task actor does -1, the curious one +1, so that the buffer tells who acted."""
+    model = tiny_model("CnnPolicy", env, gradient_steps=0, **kwargs)
+    fix_action(model.policy.actor, -1)
+    if model.policy.curious_actor is not None:
+        fix_action(model.policy.curious_actor, 1)
+    return model
+
+
+def stored_actions(model: CuReSAC) -> np.ndarray:
+    return model.replay_buffer.actions[: model.replay_buffer.pos]
+
+
+def test_probability_0_never_asks_the_curious_actor() -> None:
+    """p_c = 0: the task actor acts; the curious critic still learns, and with it the encoder."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity_prob=0.0)
+
+    def forbidden(*_: Any) -> None:
+        raise AssertionError("the curious actor was asked")
+
+    # `forward` is how actors act; updates call `action_log_prob`.
+    model.policy.curious_actor.forward = forbidden
+    fix_action(model.policy.actor, -1)
+    names = moved(model, lambda: model.learn(14))
+    assert names >= {"curious_actor", "curious_critic", "curious_log_ent_coef"}
+    with pytest.raises(AssertionError, match="was asked"):
+        model.predict_curious(model.observation_space.sample())
+
+
+def test_probability_1_always_asks_the_curious_actor_after_warmup() -> None:
+    """p_c = 1: uniform actions in the warm-up, the curious actor's ever after; the share is logged."""
+    model = acting_model(PixelBox(), curiosity_prob=1.0, learning_starts=15)
+    dumps = log_to(model)
+    model.learn(40, log_interval=1)
+    warmup, after = stored_actions(model)[:15], stored_actions(model)[15:]
+    assert (np.abs(warmup) < 0.999).all() and warmup.std() > 0.3
+    np.testing.assert_allclose(after, 1, atol=1e-3)
+    assert [dump["rollout/curious_share"] for dump in dumps] == [1.0, 1.0]
+
+
+def test_mixing_per_environment_and_step() -> None:
+    """p_c = 0.3: environments draw independently; the frequency is binomial; its mean between dumps is logged."""
+    model = acting_model(make_vec_env(3), curiosity_prob=0.3, learning_starts=0, buffer_size=1200)
+    dumps = log_to(model)
+    model.learn(900, log_interval=3)
+    curious = (stored_actions(model)[:, :, 0] > 0)[:300]
+    np.testing.assert_allclose(np.abs(stored_actions(model)), 1, atol=1e-3)
+    # Five standard deviations of a binomial
+    assert abs(curious.sum() - 270) < 5 * np.sqrt(900 * 0.3 * 0.7)
+    assert (np.abs(curious.sum(axis=0) - 90) < 5 * np.sqrt(300 * 0.3 * 0.7)).all()
+    # How many of three act curiously in one step: 0.343, 0.441, 0.189, 0.027 of the time
+    counts = np.bincount(curious.sum(axis=1), minlength=4) / 300
+    np.testing.assert_allclose(counts, [0.343, 0.441, 0.189, 0.027], atol=5 * np.sqrt(0.25 / 300))
+    # Three episodes of 20 steps end together, and each writes its own dump when it ends.
+    shares = [dump["rollout/curious_share"] for dump in dumps]
+    np.testing.assert_allclose(shares, curious.reshape(15, 60).mean(axis=1))
+
+
+def test_scheduled_probability() -> None:
+    """p_c may be a schedule of the remaining progress."""
+    model = acting_model(PixelBox(), curiosity_prob=lambda progress: float(progress > 0.5), learning_starts=10)
+    model.learn(40)
+    np.testing.assert_allclose(stored_actions(model)[10:20], 1, atol=1e-3)
+    np.testing.assert_allclose(stored_actions(model)[22:], -1, atol=1e-3)
+
+
+def test_random_second_actor_is_uniform() -> None:
+    """``curiosity="random"``: uniform within the bounds of the actions, and nothing is trained for it."""
+    env = RecordingBox(low=-1.0, high=3.0)
+    model = acting_model(env, curiosity="random", curiosity_prob=1.0)
+    assert model.policy.curious_actor is None
+    model.learn(500)
+    actions = np.array(env.actions[10:]).ravel()
+    counts, _ = np.histogram(actions, bins=8, range=(-1, 3))
+    assert counts.sum() == 980
+    np.testing.assert_allclose(counts, 980 / 8, atol=5 * np.sqrt(980 / 8 * 7 / 8))
+    with pytest.raises(ValueError, match="predict_curious"):
+        model.predict_curious(model.observation_space.sample())
+
+
+def test_random_second_actor_mixes() -> None:
+    """p_c counts for the random actor, too."""
+    model = acting_model(PixelBox(), curiosity="random", curiosity_prob=0.5)
+    model.learn(110)
+    random = np.abs(stored_actions(model)[10:]).min(axis=(1, 2)) < 0.999
+    assert 25 <= random.sum() <= 75
+
+
+def test_bonus_has_one_actor() -> None:
+    """``curiosity="bonus"``: there is no second actor, whatever p_c is."""
+    model = acting_model(PixelBox(), curiosity="bonus", curiosity_prob=1.0)
+    assert model.policy.curious_actor is None
+    model.learn(20)
+    np.testing.assert_allclose(stored_actions(model)[10:], -1, atol=1e-3)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_stored_actions_are_the_executed_ones(noise: bool) -> None:
+    """Whoever acts, in asymmetric bounds and with noise: what the buffer holds, rescaled, is what was executed."""
+    envs = [RecordingBox(low=-1.0, high=3.0) for _ in range(2)]
+    action_noise = NormalActionNoise(np.zeros(2), np.full(2, 0.5)) if noise else None
+    model = tiny_model(
+        "CnnPolicy", DummyVecEnv([lambda env=env: env for env in envs]), curiosity_prob=0.5, action_noise=action_noise
+    )
+    model.learn(60)
+    executed = np.stack([env.actions for env in envs], axis=1)
+    np.testing.assert_allclose(stored_actions(model) * 2 + 1, executed, atol=1e-6)
+    assert executed.min() >= -1 and executed.max() <= 3
+    # Noise of half the range reaches the bounds in all phases; without it nothing does.
+    assert (np.abs(stored_actions(model)[6:]) == 1).any() == noise
+
+
+# ------------------------------------------------------------ what is stored
+
+
+@pytest.mark.parametrize("curiosity", ["separate", "bonus", "random", None])
+def test_buffer_keeps_the_environments_rewards(curiosity: str | None) -> None:
+    """The curious reward is computed per batch and never stored."""
+    env = RecordingBox()
+    model = tiny_model("CnnPolicy", env, curiosity=curiosity, curiosity_beta=100.0).learn(30)
+    assert len(env.rewards) == 30
+    np.testing.assert_array_equal(model.replay_buffer.rewards[:30, 0], np.float32(env.rewards))
+
+
+@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_curious_reward_is_about_the_target(curiosity: str, target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rewarded error is that of the observation, or of the next one if ``curiosity_target`` says so."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Brightness, curiosity=curiosity, curiosity_target=target).learn(30)
+    batch = model.replay_buffer.sample(8)
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *args, **kwargs: batch)
+    assert not th.allclose(brightness(batch.observations), brightness(batch.next_observations))
+    dumps = log_to(model)
+    model.train(1, batch_size=8)
+    model.logger.dump()
+    expected = brightness(batch.observations if target == "observation" else batch.next_observations)
+    assert dumps[0]["train/curious_reward_raw_mean"] == pytest.approx(expected.mean().item(), rel=1e-6)
+    assert dumps[0]["train/curious_reward_raw_max"] == pytest.approx(expected.max().item(), rel=1e-6)
+
+
+def test_frame_stack_attribute_decides_on_the_buffer() -> None:
+    """The frame-sharing buffer is the default where the environment tells its ``frame_stack``, and only there."""
+    assert type(tiny_model("CnnPolicy", PixelBox()).replay_buffer) is FrameStackReplayBuffer
+    assert type(tiny_model("CnnPolicy", PixelBox(tells_frame_stack=False)).replay_buffer) is ReplayBuffer
+    assert type(tiny_model("CnnPolicy", PixelBox(), replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
+    assert type(tiny_model("MlpPolicy", VectorBox()).replay_buffer) is ReplayBuffer
+
+
+def test_buffer_smaller_than_batch_and_warmup() -> None:
+    """``buffer_size`` below ``batch_size`` or ``learning_starts`` is legal."""
+    model = tiny_model("CnnPolicy", PixelBox(), buffer_size=6, batch_size=16, learning_starts=12).learn(15)
+    assert (model._n_updates, model.replay_buffer.size()) == (3, 6)
+
+
+# ----------------------------------------------------------- parts of the method
+
+
+@both_updates
+@pytest.mark.parametrize("collector", ["curious", "random"])
+@pytest.mark.parametrize("curiosity", ["separate", None])
+def test_pretraining(curiosity: str | None, collector: str, update: str) -> None:
+    """Representation pretraining trains encoder and head (and the curious agent that collects), no task networks.
+
+    It leaves an empty buffer and zero counts; what follows is an ordinary run, curious only if curiosity is on.
+    """
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, update=update)
+    fresh = state_of(model)
+    actions: list[np.ndarray] = []
+
+    def watch(locals_: dict[str, Any], _: Any) -> bool:
+        actions.append(locals_["buffer_actions"])
+        if len(actions) == 1 and collector == "curious":
+            fix_action(model.policy.curious_actor, 1)
+            model.policy.curious_actor.optimizer.step = lambda: None  # it keeps its action
+        return True
+
+    model.pretrain(30, collector, callback=watch)
+    after = state_of(model)
+    names = {name.split(".")[1] for name in differences(fresh["policy"], after["policy"])}
+    assert {"encoder", "encoder_target", "srl"} <= names
+    assert not names & {"actor", "critic", "critic_target"}
+    for key in ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer", "log_ent_coef"):
+        assert differences(fresh[key], after[key]) == [], key
+    assert fresh.keys() == after.keys()
+    assert ({"curious_actor", "curious_critic"} <= names) == (curiosity == "separate" and collector == "curious")
+    if collector == "curious":
+        np.testing.assert_allclose(actions[10:], 1, atol=1e-3)
+    else:
+        assert np.abs(actions[10:]).max() < 0.9999 and np.std(actions[10:]) > 0.3
+    # The head's optimiser, for one, is kept.
+    assert after["policy.srl.optimizer"]["state"][0]["step"] == 20
+    assert (model.num_timesteps, model._n_updates, model.replay_buffer.size()) == (0, 0, 0)
+
+    fix_action(model.policy.actor, -1)
+    asked: list[int] = []
+    if curiosity is None:
+        assert model.policy.curious_actor is None and model.curious_log_ent_coef is None
+        assert not any("curious" in key for key in [*model.get_parameters(), *model.policy.state_dict()])
+        with pytest.raises(ValueError, match="predict_curious"):
+            model.predict_curious(model.observation_space.sample())
+    else:
+        model.policy.curious_actor.register_forward_hook(lambda *_: asked.append(1))
+    dumps = log_to(model)
+    model.learn(30)
+    model.logger.dump()
+    assert (model.num_timesteps, model._n_updates, model.replay_buffer.size()) == (30, 20, 30)
+    assert (
+        ("train/curious_critic_loss" in dumps[-1]) == ("train/latent_grad_norm_curious" in dumps[-1]) == bool(curiosity)
+    )
+    assert (0 < len(asked) < 20) == (curiosity == "separate")
+    # Random warm-up again
+    assert np.abs(stored_actions(model)[:10]).max() < 0.9999
+
+
+def test_pretraining_with_fixed_temperature_bonus_and_burst() -> None:
+    """Pretraining also works where the agent has a fixed temperature or a bonus; each run has its burst."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity="bonus", ent_coef=0.1, warmup_updates=5)
+    model.pretrain(14)
+    assert state_of(model)["policy.srl.optimizer"]["state"][0]["step"] == 5 + 4
+    model.learn(14)
+    assert model._n_updates == 5 + 4
+    assert state_of(model)["policy.srl.optimizer"]["state"][0]["step"] == 2 * (5 + 4)
+
+
+def test_pretraining_needs_a_head_and_a_known_collector() -> None:
+    """One sentence each."""
+    with pytest.raises(ValueError, match="srl=None"):
+        tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None).pretrain(10)
+    with pytest.raises(ValueError, match="'nobody'"):
+        tiny_model("CnnPolicy", PixelBox()).pretrain(10, collector="nobody")
+
+
+@both_updates
+def test_agent_without_task(update: str) -> None:
+    """``task=False``: the curious actor always acts, also in ``predict``; the task networks stay as they were made."""
+    model = tiny_model("CnnPolicy", PixelBox(), task=False, curiosity_prob=0.0, update=update)
+    dumps = log_to(model)
+    names = moved(model, lambda: model.learn(16))
+    model.logger.dump()
+    assert names == {"encoder", "encoder_target", "srl", *CURIOUS, *STATISTICS}
+    assert "train/curious_critic_loss" in dumps[-1] and "train/critic_loss" not in dumps[-1]
+    image = model.observation_space.sample()
+    np.testing.assert_array_equal(
+        model.predict(image, deterministic=True)[0], model.predict_curious(image, deterministic=True)[0]
+    )
+    model = acting_model(PixelBox(), task=False, curiosity_prob=0.0)
+    model.learn(20)
+    np.testing.assert_allclose(stored_actions(model)[10:], 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_any_features_extractor_is_the_shared_encoder(srl: str) -> None:
+    """SB3's NatureCNN as encoder: shared by all, trained by all, decoded by the autoencoder."""
+    policy_kwargs = dict(features_extractor_class=NatureCNN, features_extractor_kwargs=dict(features_dim=8))
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, policy_kwargs=policy_kwargs)
+    assert type(model.policy.encoder.trunk) is NatureCNN
+    names = moved(model, lambda: model.learn(14))
+    assert names >= {"encoder", "encoder_target", "srl", *TASK, *CURIOUS}
+    assert model.policy.encode(th.zeros(3, 6, 36, 36, dtype=th.uint8)).shape == (3, 8)
+
+
+def test_shared_encoder_without_srl() -> None:
+    """``share_encoder=True`` with ``srl=None``: this package's policy and update, without head or curious agent."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True))
+    assert type(model.policy) is CnnPolicy
+    dumps = log_to(model)
+    names = moved(model, lambda: model.learn(14))
+    model.logger.dump()
+    assert names == {"encoder", "encoder_target", *TASK}
+    assert "train/latent_grad_norm_task" in dumps[-1] and "train/srl_loss" not in dumps[-1]
+
+
+@both_updates
+def test_vectors(update: str) -> None:
+    """``CuReSAC("MlpPolicy", ...)`` learns from vectors with a vector autoencoder and a curious agent."""
+    model = tiny_model("MlpPolicy", VectorBox(), update=update, learning_rate=3e-3)
+    names = moved(model, lambda: model.learn(14))
+    assert names == {"encoder", "encoder_target", "srl", *TASK, *CURIOUS, *STATISTICS}
+    observations = th.as_tensor(np.random.default_rng(0).uniform(-1, 1, (200, 2)).astype(np.float32))
+
+    def error() -> float:
+        with th.no_grad():
+            drawn = model.policy.srl.reconstruct(model.policy.encode(observations))
+        return (drawn - observations).square().mean().item()
+
+    model.learn(60)
+    model.train(200, batch_size=32)
+    # The mean vector would score the variance.
+    assert error() < 0.2 * observations.var().item()
+
+
+# ------------------------------------------------------------------- logging
+
+
+def log_to(model: CuReSAC) -> list[dict[str, Any]]:
+    """Everything that the model's logger writes from now on, one dictionary per dump."""
+    dumps = Dumps()
+    model.set_logger(Logger(None, [dumps]))
+    return dumps.dumps
+
+
+#: What the user is promised to find in the logs
+METRICS = {
+    "train/srl_loss", "train/curious_reward_raw_mean", "train/curious_reward_raw_max", "train/curious_reward_mean",
+    "train/curious_reward_max", "rollout/curious_share", "train/ent_coef", "train/curious_ent_coef",
+    "train/critic_loss", "train/curious_critic_loss", "train/latent_grad_norm_srl", "train/latent_grad_norm_task",
+    "train/latent_grad_norm_curious", "train/latent_variance", "time/environment_steps", "time/total_timesteps",
+    "train/encoder_share_srl", "train/encoder_share_task", "train/encoder_share_curious", "train/actor_loss",
+    "train/curious_actor_loss", "train/n_updates", "train/learning_rate", "rollout/ep_rew_mean",
+}  # fmt: skip
+
+
+@both_updates
+def test_metrics(update: str) -> None:
+    """All promised metrics are written, as plain finite numbers; environment steps are agent steps x action repeat."""
+    model = tiny_model("CnnPolicy", PixelBox(action_repeat=4), update=update)
+    dumps = log_to(model)
+    model.learn(41, log_interval=1)
+    last = dumps[-1]
+    assert set(last) >= METRICS
+    for key in METRICS:
+        assert isinstance(last[key], int | float), key
+        assert np.isfinite(last[key]), key
+    assert (last["time/total_timesteps"], last["time/environment_steps"]) == (40, 160)
+    assert last["train/curious_reward_max"] <= 5 and last["train/curious_reward_raw_max"] > 0
+    assert sum(last[f"train/encoder_share_{source}"] for source in ("srl", "task", "curious")) == pytest.approx(1)
+
+
+def test_metrics_are_means_between_dumps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written is the mean over the updates since the last writing, also when a callback does the writing."""
+    recorded: dict[str, list[float]] = {}
+    record = Metrics.record
+
+    def spy(self: Metrics, logger: Logger, values: dict[str, th.Tensor]) -> None:
+        for key, value in values.items():
+            recorded.setdefault(key, []).append(float(value.detach()))
+        record(self, logger, values)
+
+    monkeypatch.setattr(Metrics, "record", spy)
+    means: list[dict[str, float]] = []
+
+    class Checker(Dumps):
+        def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+            super().write(key_values, key_excluded, step)
+            means.append({key: float(np.mean(values)) for key, values in recorded.items()})
+            recorded.clear()
+
+    model = tiny_model("CnnPolicy", PixelBox())
+    checker = Checker()
+    model.set_logger(Logger(None, [checker]))
+    # Dumps at episodes' ends (20, 40) and evaluations (15, 30), both
+    evaluation = EvalCallback(Monitor(PixelBox()), eval_freq=15, n_eval_episodes=1, verbose=0)
+    model.learn(41, callback=evaluation, log_interval=1)
+    assert ["eval/mean_reward" in dump for dump in checker.dumps] == [True, False, True, False]
+    for dump, mean in zip(checker.dumps, means, strict=True):
+        assert {"train/srl_loss", "train/critic_loss", "train/curious_critic_loss"} <= mean.keys()
+        for key, value in mean.items():
+            assert type(dump[key]) is float
+            assert dump[key] == pytest.approx(value, rel=1e-5), key
+
+
+def test_srl_loss_is_recorded_by_every_call_of_train() -> None:
+    """Between dumps the logger holds a detached tensor; reading its value is left to the dump."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(10)
+    for _ in range(2):
+        model.train(1, batch_size=8)
+        loss = model.logger.name_to_value["train/srl_loss"]
+        assert isinstance(loss, th.Tensor) and not loss.requires_grad and loss.shape == ()
+        model.logger.name_to_value.clear()
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_tensorboard(srl: str, tmp_path: Path) -> None:
+    """The event file has all metrics (bar those that SB3 leaves out) and, from a decoder, reconstructions."""
+    model = tiny_model("CnnPolicy", make_vec_env(1), srl=srl, tensorboard_log=str(tmp_path)).learn(41, log_interval=1)
+    model.logger.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["CuReSAC_1"]
+    events = EventAccumulator(str(tmp_path / "CuReSAC_1"))
+    events.Reload()
+    tags = events.Tags()
+    assert set(tags["scalars"]) >= METRICS - {"time/total_timesteps", "train/n_updates"}
+    assert [(event.step, event.value) for event in events.Scalars("time/environment_steps")] == [(20, 80), (40, 160)]
+    assert tags["histograms"] == []
+    assert tags["images"] == (["srl/reconstructions"] if srl == "rae" else [])
+    if srl == "rae":
+        # Eight observations above their reconstructions, after the first update
+        images = events.Images("srl/reconstructions")
+        assert [(image.step, image.width, image.height) for image in images] == [(20, 8 * 36, 2 * 36)]
+    model.tensorboard_log = str(tmp_path)
+    model.learn(5)
+    model.learn(5, reset_num_timesteps=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["CuReSAC_1", "CuReSAC_2"]
+
+
+def test_csv(tmp_path: Path) -> None:
+    """The CSV file has a header with all metrics and numbers below it."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(61, log_interval=1)
+    model.logger.close()
+    with open(tmp_path / "progress.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 and set(rows[0]) >= METRICS
+    for row in rows:
+        for key in METRICS:
+            assert np.isfinite(float(row[key])), key
+    assert [float(row["time/environment_steps"]) for row in rows] == [80, 160, 240]
+
+
+def test_training_offline_with_images(tmp_path: Path) -> None:
+    """``train`` on a given buffer, without ``learn``, logs like any other."""
+    collector = tiny_model("CnnPolicy", PixelBox(), gradient_steps=0).learn(30)
+    collector.save_replay_buffer(tmp_path / "buffer")
+    model = tiny_model("CnnPolicy", PixelBox())
+    model.set_logger(configure(str(tmp_path / "log"), ["tensorboard"]))
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.train(3, batch_size=8)
+    model.logger.dump()
+    model.logger.close()
+    events = EventAccumulator(str(tmp_path / "log"))
+    events.Reload()
+    assert events.Tags()["images"] == ["srl/reconstructions"]
+    assert np.isfinite(events.Scalars("train/srl_loss")[0].value)
+
+
+def test_callbacks_and_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """EvalCallback, CheckpointCallback and the progress bar together; the best model is a CuReSAC that loads."""
+    model = tiny_model("CnnPolicy", PixelBox(), verbose=1)
+    evaluation = EvalCallback(
+        Monitor(PixelBox()), eval_freq=20, n_eval_episodes=2, best_model_save_path=str(tmp_path), log_path=str(tmp_path),
+        verbose=0,
+    )  # fmt: skip
+    checkpoints = CheckpointCallback(25, str(tmp_path), name_prefix="at", save_replay_buffer=True)
+    model.learn(50, callback=[evaluation, checkpoints], log_interval=1, progress_bar=True)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "best_model.zip", "evaluations.npz", "at_25_steps.zip", "at_50_steps.zip",
+        "at_replay_buffer_25_steps.pkl", "at_replay_buffer_50_steps.pkl",
+    }  # fmt: skip
+    results = np.load(tmp_path / "evaluations.npz")
+    assert results["timesteps"].tolist() == [20, 40] and results["results"].shape == (2, 2)
+    best = CuReSAC.load(tmp_path / "best_model")
+    assert best.num_timesteps == [20, 40][int(results["results"].mean(axis=1).argmax())]
+    printed = capsys.readouterr().out
+    assert "tensor(" not in printed
+    for name in ("srl_loss", "curious_critic_loss", "environment_steps", "curious_share"):
+        assert name in printed
+
+
+def test_evaluating_both_policies() -> None:
+    """Separate rollouts of the two policies differ as the policies do."""
+    model = acting_model(PixelBox())
+    env = make_vec_env(1)
+    ends = []
+    for predict in (model.predict, model.predict_curious):
+        env.seed(0)
+        observation = env.reset()
+        for _ in range(19):
+            observation, *_ = env.step(predict(observation, deterministic=True)[0])
+        ends.append(env.get_attr("position")[0].tolist())
+    assert ends == [[-1, -1], [1, 1]]
