@@ -26,7 +26,7 @@ define apt_install
 	apt-get install -y -qq --no-install-recommends -o DPkg::Lock::Timeout=300 $(1) >/dev/null
 endef
 
-.venv: .venv/.installed  ## install into .venv (the default; another interpreter: make PYTHON=python3.12)
+.venv: .venv/.installed  ## install into .venv, the default (with another Python: make clean, then make PYTHON=python3.12)
 
 # pip, killed half-way, can leave packages that look complete. So .venv carries the mark `.unfinished` from before
 # its creation until the end, where it becomes the stamp; a .venv found with the mark is made anew.

@@ -6,7 +6,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -28,9 +27,16 @@ from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.checks import (
+    check_action_space,
+    check_arguments,
+    check_curious_agent,
+    check_rewards,
+    check_shared_encoder_space,
+)
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
-from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor, check_shared_encoder_space
+from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 
@@ -183,7 +189,7 @@ class CuReSAC(SAC):
     ):
         env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
         if env is not None:
-            self._check_action_space(env.action_space)
+            check_action_space(env.action_space)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -231,15 +237,15 @@ class CuReSAC(SAC):
     # ---------------------------------------------------------------- set-up
 
     @property
-    def _is_plain_sac(self) -> bool:
+    def is_plain_sac(self) -> bool:
         """Whether every extra is off, so that SB3's own SAC does the work."""
         return self.srl is None and self.curiosity is None and not self.policy_kwargs.get("share_encoder", False)
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        check_arguments(self)
         self._metrics = Metrics()
         self._read_env_attributes()
-        if self._is_plain_sac:
+        if self.is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
@@ -391,7 +397,7 @@ class CuReSAC(SAC):
         :return: Actions in the action space's bounds, and ``state``
         :raises ValueError: if there is no curious policy
         """
-        if self._is_plain_sac or self.policy.curious_actor is None:
+        if self.is_plain_sac or self.policy.curious_actor is None:
             raise ValueError(
                 f"predict_curious was called with curiosity={self.curiosity!r}, but only curiosity='separate' trains a "
                 "curious policy: use predict, or train with curiosity='separate'."
@@ -402,7 +408,7 @@ class CuReSAC(SAC):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self._is_plain_sac:
+        if self.is_plain_sac:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         # Noise is added below, once, whoever acts.
         _, actions = super()._sample_action(learning_starts, None, n_envs)
@@ -439,12 +445,7 @@ class CuReSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        if not np.isfinite(reward).all():
-            index = int(np.flatnonzero(~np.isfinite(reward))[0])
-            raise ValueError(
-                f"environment {index} returned the reward {reward[index]} at agent step {self.num_timesteps}, but "
-                "rewards must be finite: it was not stored; fix the environment's reward."
-            )
+        check_rewards(reward, self.num_timesteps)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     # -------------------------------------------------------------- learning
@@ -490,7 +491,7 @@ class CuReSAC(SAC):
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update
         """
-        if self._is_plain_sac:
+        if self.is_plain_sac:
             super().train(gradient_steps, batch_size)
             return
         self.policy.set_training_mode(True)
@@ -558,7 +559,7 @@ class CuReSAC(SAC):
                 self.policy.encoder_optimizer.pull("srl", encoded.latents, latents.grad)
             if srl.optimizer is not None:  # type: ignore[union-attr]
                 srl.optimizer.step()  # type: ignore[union-attr]
-        variance = encoded.latents.detach().var(dim=0).mean()
+        variance = encoded.latents.detach().var(dim=0, correction=0).mean()
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean(), "train/latent_variance": variance})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
@@ -732,7 +733,7 @@ class CuReSAC(SAC):
                 f"pretrain got collector={collector!r}, but data are collected by 'curious' or 'random': choose one."
             )
         if collector == "curious":
-            self._check_curious_agent()
+            check_curious_agent(self)
         self._collector = collector
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
@@ -799,7 +800,7 @@ class CuReSAC(SAC):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
-        if self._is_plain_sac:
+        if self.is_plain_sac:
             return state_dicts, variables
         state_dicts = [*state_dicts, "policy.encoder_optimizer"]
         if self.policy.srl is not None and self.policy.srl.optimizer is not None:
@@ -810,95 +811,6 @@ class CuReSAC(SAC):
                 state_dicts.append("curious_ent_coef_optimizer")
                 variables = [*variables, "curious_log_ent_coef"]
         return state_dicts, variables
-
-    # -------------------------------------------------------------- checking
-
-    @staticmethod
-    def _check_action_space(action_space: spaces.Space) -> None:
-        if not isinstance(action_space, spaces.Box):
-            raise ValueError(
-                f"the action space is {action_space}, but SAC needs continuous actions (a Box): use another algorithm "
-                "(DQN, PPO), or an environment with continuous actions."
-            )
-        if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
-            raise ValueError(
-                f"the action space is {action_space}, but SAC needs finite bounds: wrap the environment so that its "
-                "actions lie in, say, [-1, 1] (gymnasium's RescaleAction or ClipAction)."
-            )
-
-    def _check_arguments(self) -> None:
-        """Everything that can be known to be wrong before anything is built."""
-        if self.srl is not None:
-            get_srl_class(self.srl)
-        _check_choice("srl_schedule", self.srl_schedule, ("simultaneous", "alternating"))
-        _check_choice("curiosity", self.curiosity, ("separate", "bonus", "random", None))
-        _check_choice("curiosity_target", self.curiosity_target, ("observation", "next_observation"))
-        _check_choice("update", self.update, ("sequential", "joint"))
-        resolve_precision(self.precision, self.device)
-        CuriousMixer(self.curiosity_prob)
-        for name in ("gamma", "curiosity_gamma", "tau", "encoder_tau"):
-            _check_range(name, getattr(self, name), 0.0, 1.0)
-        for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts", "warmup_updates"):
-            if getattr(self, name) is not None:
-                _check_range(name, getattr(self, name), 0.0, np.inf)
-        for name in ("batch_size", "buffer_size", "srl_period", "actor_update_interval", "target_update_interval"):
-            _check_range(name, getattr(self, name), 1, np.inf)
-        if self.curiosity is not None and self.srl is None:
-            raise ValueError(
-                f"curiosity={self.curiosity!r} was given with srl=None, but the curious reward is the SRL error: "
-                "choose srl='rae', srl='curl' or a head of your own, or set curiosity=None."
-            )
-        if not self.task and self.curiosity != "separate":
-            raise ValueError(
-                f"task=False was given with curiosity={self.curiosity!r}, but an agent without task needs a curious "
-                "policy: set curiosity='separate'."
-            )
-        if self.curiosity == "separate":
-            self._check_curious_agent()
-        if self.use_sde and not self._is_plain_sac:
-            raise ValueError(
-                f"use_sde=True was given with srl={self.srl!r} and curiosity={self.curiosity!r}, but gSDE's noise "
-                "belongs to one actor on its own features: leave use_sde=False, or set srl=None and curiosity=None."
-            )
-        if self.n_steps > 1 and self.curiosity is not None:
-            raise ValueError(
-                f"n_steps={self.n_steps} was given with curiosity={self.curiosity!r}, but the curious reward is known "
-                "for single transitions only: set n_steps=1, or curiosity=None."
-            )
-        # Dictionaries, for which SB3 asks for 'MultiInputPolicy', are refused for themselves.
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        if not (self._is_plain_sac or is_dict or issubclass(self.policy_class, CuRePolicy)):
-            policy = f"{self.policy_class.__module__}.{self.policy_class.__name__}"
-            raise ValueError(
-                f"the policy is {policy}, but SRL and curiosity need a subclass of sb3_cure.policies.CuRePolicy: use "
-                "'CnnPolicy' or 'MlpPolicy'."
-            )
-
-    def _check_curious_agent(self) -> None:
-        """What a second actor-critic cannot learn from."""
-        if self.curiosity_gamma == 0 and self.curiosity_target == "observation":
-            raise ValueError(
-                "curiosity_gamma=0 was given with curiosity_target='observation', but the error of the observation "
-                "itself does not depend on the action, so that there is nothing to learn: set "
-                "curiosity_target='next_observation', or a curiosity_gamma > 0."
-            )
-        if self.n_steps > 1:
-            raise ValueError(
-                f"n_steps={self.n_steps} was given with a curious policy to train, but the curious reward is known "
-                "for single transitions only: set n_steps=1."
-            )
-
-
-def _check_choice(name: str, value: object, choices: tuple[object, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} is {value!r}, but it must be one of {', '.join(map(repr, choices))}: choose one.")
-
-
-def _check_range(name: str, value: Any, low: float, high: float) -> None:
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (is_number and low <= value <= high and np.isfinite(value)):
-        bounds = f"within [{low:g}, {high:g}]" if np.isfinite(high) else f"of at least {low:g}"
-        raise ValueError(f"{name} is {value!r}, but it must be a number {bounds}: change {name}.")
 
 
 @th.no_grad()

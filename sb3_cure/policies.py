@@ -5,7 +5,6 @@ import copy
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
@@ -164,7 +163,7 @@ class CuRePolicy(SACPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         blueprint = self._blueprint
-        if self.optimizer_class is th.optim.Adam:
+        if self.optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & self.optimizer_kwargs.keys():
             # One pass over memory per parameter instead of a dozen; the same update.
             self.optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
         self.learning_rate = lr_schedule(1)
@@ -305,38 +304,3 @@ class MlpPolicy(CuRePolicy):
 
     def __init__(self, *args: Any, features_extractor_class: type = VectorEncoder, **kwargs: Any):
         super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
-
-
-def check_shared_encoder_space(observation_space: spaces.Space, policy_class: type) -> None:
-    """Whether the shared encoder can read these observations.
-
-    :param observation_space: Observation space of the environment
-    :param policy_class: The policy that is to read it
-    :raises ValueError: if it cannot
-    """
-    if isinstance(observation_space, spaces.Dict | spaces.Tuple):
-        raise ValueError(
-            f"observations are {observation_space}, but the shared encoder reads one image or one vector: pick one "
-            "entry with a wrapper (gymnasium's FilterObservation and FlattenObservation), or use srl=None and "
-            "curiosity=None, which is SB3's own SAC."
-        )
-    image_like = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 3
-    if image_like and (
-        observation_space.dtype != np.uint8
-        or np.any(observation_space.low != 0)  # type: ignore[attr-defined]
-        or np.any(observation_space.high != 255)  # type: ignore[attr-defined]
-    ):
-        raise ValueError(
-            f"images arrive as {observation_space.dtype} in [{observation_space.low.min()}, "  # type: ignore[attr-defined]
-            f"{observation_space.high.max()}], but the encoder and the replay buffer take uint8 in [0, 255]: give "  # type: ignore[attr-defined]
-            "the environment's images as they are rendered, and VecNormalize with norm_obs=False."
-        )
-    if issubclass(policy_class, MlpPolicy) and image_like:
-        raise ValueError(
-            f"'MlpPolicy' got images of shape {observation_space.shape}, but it reads vectors: use 'CnnPolicy'."
-        )
-    if issubclass(policy_class, CnnPolicy) and not image_like:
-        raise ValueError(
-            f"'CnnPolicy' got observations of shape {observation_space.shape}, but it reads images (channels, height, "
-            "width): use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels."
-        )

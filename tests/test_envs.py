@@ -186,7 +186,8 @@ def test_fast_renderer_is_recorded_and_differs_only_in_pixels(make):
     flat = physics.render(36, 36, camera_id=0, render_flag_overrides={"shadow": False, "reflection": False})
     assert (flat != physics.render(36, 36, camera_id=0)).any()
     np.testing.assert_array_equal(obs["fast"][:3], flat.transpose(2, 0, 1))
-    assert physics.model.vis.quality.offsamples == 0
+    # Without multisampling a thin pole in a small image moves by whole pixels.
+    assert physics.model.vis.quality.offsamples == 4
     np.testing.assert_array_equal(envs["dmc"].unwrapped.physics.get_state(), envs["fast"].unwrapped.physics.get_state())
 
 

@@ -1,4 +1,4 @@
-"""Learning, not only running: on a tiny pixel task the return rises, and a curious policy finds what cannot be drawn."""
+"""Learning, not only running: the return rises on a tiny pixel task, and a curious policy finds the static."""
 
 import gymnasium as gym
 import numpy as np

@@ -33,7 +33,9 @@ def test_readmes_own_head_trains_saves_and_loads(tmp_path: Path) -> None:
     loaded = CuReSAC.load(tmp_path / "model.zip", custom_objects={"srl": head})
     observation, _ = env.reset(seed=0)
     for ours, theirs in ((model.predict, loaded.predict), (model.predict_curious, loaded.predict_curious)):
-        np.testing.assert_array_equal(ours(observation, deterministic=True)[0], theirs(observation, deterministic=True)[0])
+        np.testing.assert_array_equal(
+            ours(observation, deterministic=True)[0], theirs(observation, deterministic=True)[0]
+        )
     drawn = loaded.policy.srl.reconstruct(loaded.policy.encode(batch.observations))
     assert drawn.shape == batch.observations.shape and drawn.dtype == batch.observations.dtype
 

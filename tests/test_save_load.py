@@ -1,5 +1,6 @@
 """What is saved and loaded acts alike and learns on alike, whatever is switched on."""
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -153,6 +154,14 @@ def test_save_load_of_vectors(update: str, tmp_path: Path) -> None:
     """The same for MlpPolicy."""
     model = tiny_model("MlpPolicy", VectorBox(), update=update).learn(21)
     check_save_load(model, VectorBox, tmp_path, observations=np.eye(2, dtype=np.float32))
+
+
+def test_archive_holds_each_network_once(tmp_path: Path) -> None:
+    """Networks and optimisers are saved as tensors, and not pickled with the attributes once more."""
+    model = tiny_model("CnnPolicy", PixelBox(), policy_kwargs=dict(net_arch=[400, 400])).learn(12)
+    model.save(tmp_path / "model.zip")
+    attributes = zipfile.ZipFile(tmp_path / "model.zip").getinfo("data").file_size
+    assert attributes < 100_000 < 4 * sum(parameter.numel() for parameter in model.policy.actor.parameters())
 
 
 def test_saved_again(tmp_path: Path) -> None:
@@ -345,6 +354,22 @@ def test_policy_save_load(srl: str | type[SRLHead] | None, curiosity: str | None
                 np.testing.assert_array_equal(
                     policy.predict(IMAGES, deterministic=True)[0], loaded.predict(IMAGES, deterministic=True)[0]
                 )
+
+
+def test_policy_saved_while_pretraining(tmp_path: Path) -> None:
+    """The curious agent that exists only while pretraining is part of a policy that is saved then."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
+    actions = []
+
+    def save(locals_: dict[str, Any], _: Any) -> bool:
+        model.policy.save(tmp_path / "policy.pt")
+        actions.append(model.predict_curious(IMAGES, deterministic=True)[0])
+        return True
+
+    model.pretrain(14, callback=save)
+    loaded = CnnPolicy.load(tmp_path / "policy.pt")
+    with loaded.acting("curious_actor"):
+        np.testing.assert_array_equal(loaded.predict(IMAGES, deterministic=True)[0], actions[-1])
 
 
 def test_policy_without_task_acts_curiously_when_loaded(tmp_path: Path) -> None:

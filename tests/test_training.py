@@ -123,13 +123,19 @@ def test_burst_after_warmup(
     srl: str | type[SRLHead] | None, warmup_updates: int | None, burst: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The head says how many updates follow the warm-up, unless ``warmup_updates`` does; they come once."""
-    calls: list[int] = []
-    monkeypatch.setattr(CuReSAC, "train", lambda self, gradient_steps, batch_size: calls.append(gradient_steps))
+    calls: list[tuple[int, int]] = []
+
+    def train(self: CuReSAC, gradient_steps: int, batch_size: int) -> None:
+        calls.append((self.num_timesteps, gradient_steps))
+
+    monkeypatch.setattr(CuReSAC, "train", train)
     curiosity = None if srl is None else "separate"
     model = tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity, warmup_updates=warmup_updates)
     model.learn(14)
     model.learn(14)
-    assert calls == [burst] * (burst > 0) + [1] * 8
+    # Learning begins with the first step after the warm-up of 10, in either run.
+    after_warmup = [(step, 1) for step in (11, 12, 13, 14)]
+    assert calls == [(11, burst)] * (burst > 0) + after_warmup + after_warmup
 
 
 @pytest.mark.parametrize("extras", [{}, dict(srl=None, curiosity=None)], ids=["on", "off"])
@@ -330,12 +336,49 @@ def test_curious_reward_is_about_the_target(curiosity: str, target: str, monkeyp
     assert dumps[0]["train/curious_reward_raw_max"] == pytest.approx(expected.max().item(), rel=1e-6)
 
 
+@both_updates
+@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
+def test_rewards_of_the_critics(curiosity: str, update: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task critic learns the stored reward, plus beta x error if it is a bonus; the curious one beta x error."""
+    model = tiny_model(
+        "CnnPolicy", PixelBox(), srl=Brightness, curiosity=curiosity, update=update, curiosity_beta=0.1, gamma=0.0,
+        normalize_curiosity=False, curiosity_gamma=0.0, curiosity_target="next_observation", learning_rate=0.0,
+    ).learn(30)  # fmt: skip
+    batch = model.replay_buffer.sample(8)
+    monkeypatch.setattr(model.replay_buffer, "sample", lambda *args, **kwargs: batch)
+    dumps = log_to(model)
+    model.train(1, batch_size=8)
+    model.logger.dump()
+
+    curious_reward = 0.1 * brightness(batch.next_observations)[:, None]
+    cases = [("train/critic_loss", model.critic, batch.rewards + (curious_reward if curiosity == "bonus" else 0))]
+    if curiosity == "separate":
+        cases.append(("train/curious_critic_loss", model.policy.curious_critic, curious_reward))
+    for key, critic, target in cases:
+        with th.no_grad():
+            errors = [q - target for q in critic(model.policy.encode(batch.observations), batch.actions)]
+        # With discounts of zero the rewards are the targets.
+        assert dumps[0][key] == pytest.approx(sum(0.5 * error.square().mean().item() for error in errors), rel=1e-4)
+
+
 def test_frame_stack_attribute_decides_on_the_buffer() -> None:
     """The frame-sharing buffer is the default where the environment tells its ``frame_stack``, and only there."""
     assert type(tiny_model("CnnPolicy", PixelBox()).replay_buffer) is FrameStackReplayBuffer
     assert type(tiny_model("CnnPolicy", PixelBox(tells_frame_stack=False)).replay_buffer) is ReplayBuffer
     assert type(tiny_model("CnnPolicy", PixelBox(), replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
     assert type(tiny_model("MlpPolicy", VectorBox()).replay_buffer) is ReplayBuffer
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+def test_frame_stack_buffer_changes_nothing_but_memory(channels_last: bool) -> None:
+    """A run with it ends with the bits of a run with SB3's buffer, over resets and in several environments."""
+    states = []
+    for buffer_class in (None, ReplayBuffer):
+        env = make_vec_env(2, lambda: PixelBox(channels_last=channels_last, episode_length=9))
+        model = tiny_model("CnnPolicy", env, replay_buffer_class=buffer_class, buffer_size=40).learn(60)
+        assert (type(model.replay_buffer) is FrameStackReplayBuffer) == (buffer_class is None)
+        states.append(state_of(model))
+    assert differences(*states) == []
 
 
 def test_buffer_smaller_than_batch_and_warmup() -> None:
@@ -518,6 +561,15 @@ def test_metrics(update: str) -> None:
     assert sum(last[f"train/encoder_share_{source}"] for source in ("srl", "task", "curious")) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_metrics_of_batches_of_one(srl: str) -> None:
+    """The smallest batch is legal, and leaves no NaN in the logs."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, batch_size=1)
+    dumps = log_to(model)
+    model.learn(41, log_interval=1)
+    assert [key for key in METRICS if not np.isfinite(dumps[-1][key])] == []
+
+
 def test_metrics_are_means_between_dumps(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is written is the mean over the updates since the last writing, also when a callback does the writing."""
     recorded: dict[str, list[float]] = {}
@@ -619,8 +671,8 @@ def test_callbacks_and_progress_bar(tmp_path: Path, capsys: pytest.CaptureFixtur
     """EvalCallback, CheckpointCallback and the progress bar together; the best model is a CuReSAC that loads."""
     model = tiny_model("CnnPolicy", PixelBox(), verbose=1)
     evaluation = EvalCallback(
-        Monitor(PixelBox()), eval_freq=20, n_eval_episodes=2, best_model_save_path=str(tmp_path), log_path=str(tmp_path),
-        verbose=0,
+        Monitor(PixelBox()), eval_freq=20, n_eval_episodes=2, best_model_save_path=str(tmp_path),
+        log_path=str(tmp_path), verbose=0,
     )  # fmt: skip
     checkpoints = CheckpointCallback(25, str(tmp_path), name_prefix="at", save_replay_buffer=True)
     model.learn(50, callback=[evaluation, checkpoints], log_interval=1, progress_bar=True)

@@ -55,8 +55,6 @@ class DMCPixels(PixelObservation):
         buffer = model.vis.global_
         buffer.offwidth = max(buffer.offwidth, self.image_size)
         buffer.offheight = max(buffer.offheight, self.image_size)
-        if renderer == "fast":
-            model.vis.quality.offsamples = 0
 
     def frame(self) -> np.ndarray:
         if self._camera is None:
@@ -98,8 +96,8 @@ def make_dmc_env(
     :param action_repeat: Environment steps per agent step, whose rewards are summed; by default PlaNet's: 8 for
         cartpole, 2 for finger and walker, 4 for the others
     :param camera_id: Index of a camera of the model, -1 for its free camera; by default 0, and 2 for quadruped
-    :param renderer: ``"dmc"`` gives the pixels of ``physics.render``; ``"fast"`` leaves out shadows, reflections and
-        multisampling, which is several times faster without a GPU and shows other pixels: another environment
+    :param renderer: ``"dmc"`` gives the pixels of ``physics.render``; ``"fast"`` leaves out shadows and reflections,
+        which is several times faster without a GPU and shows other pixels: another environment
     :param render_mode: ``"rgb_array"`` lets ``render()`` give RGB frames of 256 x 256 for videos; it does not change
         the observations
     :param seed: Seed of the first ``reset`` that is given none; later ones go on with its random stream
