@@ -512,14 +512,15 @@ class CuReSAC(SAC):
         # Sequential: a fresh pass for each source, because the one before has moved the encoder.
         encode = lambda: shared or self._encode(observations, next_observations)  # noqa: E731
 
-        curious_reward = None
+        rewards = batch.rewards
         if self.policy.srl is not None:
             error = self._update_srl(batch, encode())
             if self._uses_curious_reward:
                 curious_reward = self._curious_reward(error)
+                if self.curiosity == "bonus":
+                    rewards = rewards + curious_reward
         if self._in_rl_phase:
             if self.task and self._collector is None:
-                rewards = batch.rewards + curious_reward if self.curiosity == "bonus" else batch.rewards
                 self._update_actor_critic(self._task_agent, encode(), next_latents, batch, rewards)
             if self._curious_agent is not None and self._collector != "random":
                 self._update_actor_critic(self._curious_agent, encode(), next_latents, batch, curious_reward)
@@ -533,6 +534,7 @@ class CuReSAC(SAC):
         with self._autocast():
             features = encoder.trunk(observations)
             latents = encoder.projection(features)
+        self._log({"train/latent_variance": latents.detach().var(dim=0, correction=0).mean()})
 
         def next_features() -> th.Tensor:
             with th.no_grad(), self._autocast():
@@ -540,27 +542,29 @@ class CuReSAC(SAC):
 
         return EncoderPass(features.detach(), latents, next_features)
 
+    @property
+    def _srl_head(self) -> SRLHead:
+        return self.policy.srl  # type: ignore[return-value]
+
     def _update_srl(self, batch: ReplayBufferSamples, encoded: EncoderPass) -> th.Tensor:
         """UpdateSRL of Algorithm 1: train head and encoder.
 
         :return: SRL error of the observations (or next observations) that the curious reward is about, [B]
         """
-        srl = self.policy.srl
-        trains = self._in_srl_phase
+        srl, trains = self._srl_head, self._in_srl_phase
         # The loss stops at a copy of the latents; the encoder's optimiser takes the gradient from there.
         latents = encoded.latents.detach().requires_grad_(trains)
         with th.set_grad_enabled(trains), self._autocast():
-            loss, error = srl.loss(batch, latents)  # type: ignore[union-attr, misc]
+            loss, error = srl.loss(batch, latents)
         if trains:
-            if srl.optimizer is not None:  # type: ignore[union-attr]
-                srl.optimizer.zero_grad()  # type: ignore[union-attr]
+            if srl.optimizer is not None:
+                srl.optimizer.zero_grad()
             loss.backward()
             if latents.grad is not None:
                 self.policy.encoder_optimizer.pull("srl", encoded.latents, latents.grad)
-            if srl.optimizer is not None:  # type: ignore[union-attr]
-                srl.optimizer.step()  # type: ignore[union-attr]
-        variance = encoded.latents.detach().var(dim=0, correction=0).mean()
-        self._log({"train/srl_loss": loss, "train/srl_error": error.mean(), "train/latent_variance": variance})
+            if srl.optimizer is not None:
+                srl.optimizer.step()
+        self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features)
@@ -671,7 +675,7 @@ class CuReSAC(SAC):
         owners = (policy.srl, policy.actor, policy.critic, policy.curious_actor, policy.curious_critic)
         for owner in owners:
             if owner is not None and owner.optimizer is not None:
-                update_learning_rate(owner.optimizer, learning_rate)
+                update_learning_rate(owner.optimizer, learning_rate)  # type: ignore[arg-type]
         for optimizer in (self.ent_coef_optimizer, self.curious_ent_coef_optimizer):
             if optimizer is not None:
                 update_learning_rate(optimizer, learning_rate * self.ent_coef_lr_factor)

@@ -47,7 +47,7 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
     errors = []
     with th.no_grad():
         for start in range(0, len(batch.observations), chunk):
-            part = ReplayBufferSamples(*[None if field is None else field[start : start + chunk] for field in batch])
+            part = ReplayBufferSamples(*[field[start : start + chunk] for field in batch if field is not None])
             errors.append(policy.srl.error(part, policy.encode(part.observations)).cpu().numpy())  # type: ignore[union-attr]
     return np.concatenate(errors)
 
@@ -104,7 +104,7 @@ def run_episodes(
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "srl", None) is not None:
             errors = srl_errors(model, _as_batch(model, seen, actions, rewards, dones))
-        yield Episode(np.array(rewards), errors, seen[:-1], frames)
+        yield Episode(np.array(rewards), errors, seen[:-1], frames)  # type: ignore[arg-type]
 
 
 def _as_batch(

@@ -62,11 +62,12 @@ class LatentCritic(ContinuousCritic):
         return tuple(self._q_value(q_net, inputs) for q_net in self.q_networks)
 
     @staticmethod
-    def _q_value(q_net: nn.Sequential, inputs: th.Tensor) -> th.Tensor:
-        for layer in list(q_net)[:-1]:
+    def _q_value(q_net: nn.Module, inputs: th.Tensor) -> th.Tensor:
+        *hidden, output = q_net.children()
+        for layer in hidden:
             inputs = layer(inputs)
         with full_precision(inputs):
-            return q_net[-1](inputs.float())
+            return output(inputs.float())
 
 
 class CuRePolicy(SACPolicy):
@@ -185,7 +186,8 @@ class CuRePolicy(SACPolicy):
         )
 
     def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
-        space, defaults = self.observation_space, {}
+        space = self.observation_space
+        defaults: dict[str, Any] = {}
         if srl_class is not None:
             space, defaults = srl_class.configure_encoder(self.observation_space, **srl_kwargs)
         if not issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
@@ -200,18 +202,18 @@ class CuRePolicy(SACPolicy):
             self.srl.bind_target_encoder(self.encoder_target)
             parameters = list(self.srl.parameters())
             # A head without parameters (say, one that scores latents) has nothing to optimise.
-            self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None  # type: ignore[assignment]
+            self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None
 
     def _make_actor_critic(self) -> tuple[TrunkActor, LatentCritic, LatentCritic]:
         encoder = self.encoder
         tanh = getattr(encoder.projection, "tanh", True)
         actor = TrunkActor(
-            **self.actor_kwargs,
+            **self.actor_kwargs,  # type: ignore[arg-type]
             features_extractor=Projection(encoder.trunk_dim, encoder.features_dim, tanh),
             features_dim=encoder.features_dim,
         )
         critic = LatentCritic(
-            **self.critic_kwargs,
+            **self.critic_kwargs,  # type: ignore[arg-type]
             features_extractor=nn.Identity(),  # type: ignore[arg-type]
             features_dim=encoder.features_dim,
         )
@@ -302,5 +304,14 @@ class CnnPolicy(CuRePolicy):
 class MlpPolicy(CuRePolicy):
     """``CuRePolicy`` for vectors: the same but for the encoder's default class."""
 
-    def __init__(self, *args: Any, features_extractor_class: type = VectorEncoder, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        features_extractor_class: type[BaseFeaturesExtractor] = VectorEncoder,
+        **kwargs: Any,
+    ):
+        super().__init__(
+            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
+        )

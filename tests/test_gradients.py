@@ -143,15 +143,18 @@ def test_pretraining_moves_no_task_network(collector: str, curiosity: str | None
 @UPDATES
 @pytest.mark.parametrize("task", [True, False])
 def test_actors_do_not_touch_what_critics_and_head_train(update: str, task: bool) -> None:
-    """With and without the actor's update encoder, head and critics are the same bit for bit."""
+    """With and without the actor's update encoder, head and critics are the same bit for bit, gradients included."""
     kwargs: dict[str, Any] = {"curiosity": None} if task else {"task": False}
-    after = []
+    after, gradients = [], []
     for n_updates in (WITH_ACTORS, WITHOUT_ACTORS):
         model = filled_model(**kwargs, update=update)
         train_once(model, n_updates)
         after.append(groups(model))
-    actor = TASK_ACTOR if task else CURIOUS_ACTOR
-    assert moved(*after) == actor
+        critic = model.policy.critic if task else model.policy.curious_critic
+        modules = (model.policy.encoder, model.policy.srl, critic)
+        gradients.append([parameter.grad for module in modules for parameter in module.parameters()])
+    assert moved(*after) == (TASK_ACTOR if task else CURIOUS_ACTOR)
+    assert equal(*gradients)
 
 
 @UPDATES

@@ -24,7 +24,9 @@ def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1) 
     with imageio.get_writer(path, fps=fps, macro_block_size=16) as writer:
         for step, frame in enumerate(episode.frames):
             caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
-            writer.append_data(_with_panel(frame, episode.srl_errors[: step + 1], len(episode.frames), top, caption))
+            writer.append_data(  # type: ignore[attr-defined]
+                _with_panel(frame, episode.srl_errors[: step + 1], len(episode.frames), top, caption)
+            )
 
 
 def _with_panel(frame: np.ndarray, errors: np.ndarray, length: int, top: float, caption: str) -> np.ndarray:

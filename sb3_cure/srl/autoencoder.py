@@ -31,7 +31,7 @@ class PixelDecoder(nn.Module):
             hidden += [nn.ConvTranspose2d(n_filters, n_filters, 3), nn.ReLU()]
         self.hidden = nn.Sequential(*hidden)
         # The strided convolution may drop the last row or column; output padding gives it back.
-        padding = tuple(size - (2 * (half - 1) + 3) for size, half in zip(sizes[0], sizes[1], strict=True))
+        padding = (sizes[0][0] - (2 * sizes[1][0] + 1), sizes[0][1] - (2 * sizes[1][1] + 1))
         self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2, output_padding=padding)
         init_weights(self)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]

@@ -34,6 +34,8 @@ class SRLHead(nn.Module):
 
     #: Gradient steps in one burst after the random warm-up, unless ``warmup_updates`` says otherwise
     warmup_updates: ClassVar[int] = 0
+    #: Optimiser of the head's own parameters, set by the policy; None if it has none
+    optimizer: th.optim.Optimizer | None = None
     #: Extra arguments of the optimiser of the head's own parameters, e.g. weight decay
     optimizer_kwargs: dict[str, Any]
 
