@@ -1,0 +1,56 @@
+"""What do the latents know of the image? A decoder fitted afterwards, on a frozen encoder."""
+
+import numpy as np
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.metrics import reconstruction_strip
+from sb3_cure.srl import PixelDecoder
+
+
+def reconstruct_with_probe(
+    model: CuReSAC, frame_stack: int, updates: int = 1000, batch_size: int = 64, columns: int = 8
+) -> np.ndarray | None:
+    """Observations of the replay buffer above what can be drawn from their latents.
+
+    Heads that reconstruct do it themselves. For the others (contrastive ones, say) a decoder is fitted to the latents
+    first; the encoder is not trained by it.
+
+    :param model: A trained model with images as observations
+    :param frame_stack: Frames per observation
+    :param updates: Updates of the decoder
+    :param batch_size: Observations per update
+    :param columns: How many observations to draw
+    :return: uint8 image (C, 2 * H, columns * W), see ``reconstruction_strip``
+    """
+    policy, buffer = model.policy, model.replay_buffer
+    if buffer is None:
+        raise ValueError("the model has no replay buffer to take observations from: train it, or load one.")
+    shown = buffer.sample(columns)
+    strip = reconstruction_strip(policy, shown, frame_stack, columns)
+    if strip is not None:
+        return strip
+    shape = policy.encoder_space.shape or ()
+    decoder: nn.Module = PixelDecoder(policy.encoder.features_dim, shape).to(model.device)
+    optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
+    for _ in range(updates):
+        observations = buffer.sample(batch_size).observations
+        with th.no_grad():
+            images = policy.center(observations)
+            latents = policy.encoder(images)
+        loss = F.mse_loss(decoder(latents), images - 0.5)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    with th.no_grad():
+        images = policy.center(shown.observations)
+        drawn = (decoder(policy.encoder(images)) + 0.5).clamp(0, 1)
+    return _strip(images, drawn, frame_stack)
+
+
+def _strip(images: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.ndarray:
+    channels = images.shape[1] // frame_stack
+    rows = [th.cat(list(each[:, -channels:]), dim=2) for each in (images, drawn)]
+    return (th.cat(rows, dim=1) * 255).to(th.uint8).cpu().numpy()
