@@ -1,0 +1,132 @@
+"""Both policies are evaluated in rollouts of their own, with the noise-free SRL error of what they see."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, tiny_model
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from sb3_cure.callbacks import EvalBothCallback
+from sb3_cure.evaluation import run_episodes
+from sb3_cure.experiments.probe import reconstruct_with_probe
+from sb3_cure.metrics import reconstruction_strip
+
+
+class Rows(KVWriter):
+    """A logger's output that keeps what is written."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        self.rows.append({**key_values, "step": step})
+
+    def close(self) -> None: ...
+
+
+class Recorder(PixelBox):
+    """Keeps the actions of the episode under way."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.actions: list[np.ndarray] = []
+        return super().reset(**kwargs)
+
+    def step(self, action: np.ndarray) -> Any:
+        self.actions.append(np.array(action))
+        return super().step(action)
+
+
+@pytest.mark.parametrize("actor", ["task", "curious", "random"])
+def test_each_episode_is_acted_by_the_policy_that_was_asked_for(actor: str) -> None:
+    """Actions are that policy's, rewards the environment's, errors those of the observations before each step."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(20)
+    env = Recorder(low=-2.0, high=3.0)
+    env.action_space = model.action_space
+    (episode,) = run_episodes(model, env, 1, actor, seed=5)
+    assert episode.observations.shape == (20, *env.observation_space.shape)
+    again, _ = PixelBox().reset(seed=5)
+    np.testing.assert_array_equal(episode.observations[0], again)
+    predict = {"task": model.predict, "curious": model.predict_curious}.get(actor)
+    if predict is None:
+        model.action_space.seed(5)
+        expected = np.array([model.action_space.sample() for _ in range(20)])
+    else:
+        expected = np.array([predict(observation, deterministic=True)[0] for observation in episode.observations])
+    np.testing.assert_allclose(np.array(env.actions), expected, atol=1e-6)
+    assert episode.total_reward == pytest.approx(sum(episode.rewards)) and len(episode.rewards) == 20
+    observations = th.as_tensor(episode.observations)
+    with th.no_grad():
+        drawn = model.policy.srl.decoder(model.policy.encode(observations))
+    target = (th.div(observations, 8, rounding_mode="floor").float() + 0.5) / 32 - 0.5
+    np.testing.assert_allclose(episode.srl_errors, (drawn - target).square().flatten(1).mean(1), rtol=1e-4)
+
+
+def test_unknown_actor_is_one_sentence() -> None:
+    """The names are given."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    with pytest.raises(ValueError, match=r"actor is 'best', but it must be one of 'task', 'curious', 'random'"):
+        list(run_episodes(model, PixelBox(), 1, "best"))
+
+
+def test_callback_logs_both_policies_at_its_interval() -> None:
+    """Rows at 20 and 40 steps with both returns and both errors, equal to evaluations by hand."""
+    writer = Rows()
+    model = tiny_model("CnnPolicy", PixelBox())
+    model.set_logger(Logger(None, [writer]))
+    callback = EvalBothCallback(PixelBox(), eval_freq=20, n_episodes=2, seed=3)
+    model.learn(45, callback=callback)
+    rows = [row for row in writer.rows if "eval/task_reward" in row]
+    assert [row["step"] for row in rows] == [20, 40] == [row["timesteps"] for row in callback.history]
+    last = callback.evaluate()
+    for actor in ("task", "curious"):
+        episodes = list(run_episodes(model, PixelBox(), 2, actor, seed=3))
+        assert last[f"eval/{actor}_reward"] == pytest.approx(np.mean([episode.total_reward for episode in episodes]))
+        errors = np.concatenate([episode.srl_errors for episode in episodes])
+        assert last[f"eval/{actor}_srl_error"] == pytest.approx(errors.mean())
+
+
+def test_callback_evaluates_a_model_without_extras() -> None:
+    """SB3's SAC has no curious policy and no SRL error: only the task's return is logged."""
+    model = tiny_model("MlpPolicy", "Pendulum-v1", srl=None, curiosity=None)
+    callback = EvalBothCallback(gym.make("Pendulum-v1"), eval_freq=20, n_episodes=1)
+    model.learn(25, callback=callback)
+    assert callback.history[0].keys() == {"timesteps", "eval/task_reward"}
+
+
+@pytest.mark.parametrize("arguments", [dict(eval_freq=0), dict(n_episodes=0)])
+def test_callback_refuses_nonsense(arguments: dict[str, int]) -> None:
+    """Before training starts."""
+    with pytest.raises(ValueError, match="each must be at least 1"):
+        EvalBothCallback(PixelBox(), **arguments)
+
+
+def test_reconstructions_show_the_newest_frames_above_what_is_drawn() -> None:
+    """Left to right the samples, top row their newest frames, bottom row the head's reconstruction of these."""
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=2)).learn(30)
+    batch = model.replay_buffer.sample(8)
+    strip = reconstruction_strip(model.policy, batch, frame_stack=2, columns=3)
+    assert strip.shape == (3, 72, 108) and strip.dtype == np.uint8
+    with th.no_grad():
+        drawn = model.policy.srl.reconstruct(model.policy.encode(batch.observations[:3]))
+    for column in range(3):
+        cut = strip[:, :, 36 * column : 36 * (column + 1)]
+        np.testing.assert_array_equal(cut[:, :36], batch.observations[column, 3:])
+        np.testing.assert_array_equal(cut[:, 36:], drawn[column, 3:])
+
+
+def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
+    """The encoder is bit-equal before and after; with more updates the drawing comes closer to the observation."""
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl="curl").learn(30)
+    before = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    distances = []
+    for updates in (1, 150):
+        th.manual_seed(0)
+        np.random.seed(0)
+        strip = reconstruct_with_probe(model, frame_stack=1, updates=updates, batch_size=16, columns=4)
+        observed, drawn = strip[:, :36].astype(float), strip[:, 36:].astype(float)
+        distances.append(np.abs(observed - drawn).mean())
+    assert distances[1] < 0.5 * distances[0]
+    assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
