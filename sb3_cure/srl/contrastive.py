@@ -158,7 +158,9 @@ class CURL(SRLHead):
         if len(negatives) > 0:
             bank = self._keys(self._augment(negatives, th.Generator().manual_seed(1)))
             logits = th.cat([logits, weighted @ bank.T], dim=1)
-        return F.cross_entropy(logits, th.zeros(len(logits), dtype=th.long, device=logits.device), reduction="none")
+        first = th.zeros(len(logits), dtype=th.long, device=logits.device)
+        # Rounding can leave a -0.0.
+        return F.cross_entropy(logits, first, reduction="none").clamp(min=0)
 
     def _augment(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         if self.crops:
