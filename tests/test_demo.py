@@ -18,6 +18,7 @@ def test_demo_writes_curve_pictures_video_and_model(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(
         demo, "SETTINGS", {**demo.SETTINGS, "learning_starts": 150, "warmup_updates": 5, "batch_size": 8}
     )
+    monkeypatch.setattr(demo, "EVALUATIONS", 2)
     status = demo.main(["--out", str(tmp_path), "--steps", "170", "--minutes", "5"])
 
     summary = json.loads((tmp_path / "summary.json").read_text())
