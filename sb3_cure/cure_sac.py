@@ -430,7 +430,7 @@ class CuReSAC(SAC):
 
     def _second_actor_actions(self, observations: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1], [n, action_dim]."""
-        if "random" in (self._collector, self.curiosity) and self._collector != "curious":
+        if (self._collector or self.curiosity) == "random":
             actions = np.array([self.action_space.sample() for _ in observations])
         else:
             actions, _ = self.predict_curious(observations)

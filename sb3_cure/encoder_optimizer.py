@@ -60,7 +60,9 @@ class EncoderOptimizer:
         """
         :param source: Name of a further loss that trains the encoder
         """
-        self.optimizers.setdefault(source if self.mode == "sequential" else "joint", self._make_optimizer())
+        name = source if self.mode == "sequential" else "joint"
+        if name not in self.optimizers:
+            self.optimizers[name] = self._make_optimizer()
         self.mean_squares[source] = th.zeros((), device=self.parameters[0].device)
         self.weights[source] = 0.0
 

@@ -71,8 +71,19 @@ def reconstruction_strip(
     drawn = policy.srl.reconstruct(policy.encode(observations))
     if drawn is None:
         return None
-    channels = observations.shape[1] // frame_stack
+    return image_strip(observations, drawn, frame_stack)
+
+
+def image_strip(observed: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.ndarray:
+    """Newest frames of images, side by side, above those of others.
+
+    :param observed: Images for the upper row, 0-255, [B, C, H, W]
+    :param drawn: Images for the lower row, 0-255, [B, C, H, W]
+    :param frame_stack: Frames per image
+    :return: uint8 image (C', 2 * H, B * W) with C' = 1 or 3
+    """
+    channels = observed.shape[1] // frame_stack
     if channels not in (1, 3):
         channels = 1
-    rows = [list(images[:, -channels:].cpu().numpy()) for images in (observations, drawn)]
-    return np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
+    rows = [th.cat(list(images[:, -channels:].to(th.uint8)), dim=2) for images in (observed, drawn)]
+    return th.cat(rows, dim=1).cpu().numpy()

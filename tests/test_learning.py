@@ -1,5 +1,7 @@
 """Learning, not only running: the return rises on a tiny pixel task, and a curious policy finds the static."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,7 +11,16 @@ from sb3_cure import CuReSAC
 from sb3_cure.evaluation import run_episodes
 
 SIZE = 24
-NETWORKS = dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=8, n_layers=3))
+#: What learns quickly here: short horizon, quick targets, an update of everything per step
+QUICK: dict[str, Any] = dict(
+    learning_starts=200,
+    batch_size=32,
+    tau=0.05,
+    actor_update_interval=1,
+    target_update_interval=1,
+    buffer_size=2000,
+    policy_kwargs=dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=8, n_layers=3)),
+)
 
 
 class StaticScreen(PixelBox):
@@ -42,14 +53,8 @@ def test_task_return_rises_well_above_random(srl: str, update: str) -> None:
         PixelBox(frame_stack=1, size=SIZE),
         srl=srl,
         update=update,
-        learning_starts=200,
-        batch_size=32,
-        tau=0.05,
         gamma=0.9,
-        actor_update_interval=1,
-        target_update_interval=1,
-        buffer_size=2000,
-        policy_kwargs=NETWORKS,
+        **QUICK,
     ).learn(1200)
     env = PixelBox(frame_stack=1, size=SIZE)
     random = mean_return(model, env, "random")
@@ -64,14 +69,8 @@ def test_curious_policy_visits_persistently_high_error_more_than_random() -> Non
         StaticScreen(),
         srl="rae",
         task=False,
-        learning_starts=200,
-        batch_size=32,
-        tau=0.05,
         curiosity_gamma=0.9,
-        actor_update_interval=1,
-        target_update_interval=1,
-        buffer_size=2000,
-        policy_kwargs=NETWORKS,
+        **QUICK,
     ).learn(1200)
     visits, errors = {}, {}
     for actor in ("curious", "random"):

@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import ACTORS, run_episodes
+from sb3_cure.evaluation import run_episodes
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.experiments.video import write_video
@@ -134,12 +134,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     print("Measuring the random, task and curious policies")
     errors, returns = {}, {}
-    for actor in reversed(ACTORS):
+    for actor in ("random", "task", "curious"):
         episodes = list(run_episodes(model, eval_env, 10, actor, seed=20_000))
         errors[actor] = np.concatenate([episode.srl_errors for episode in episodes])
         returns[actor] = [episode.total_reward for episode in episodes]
-    order = ("random", "task", "curious")
-    errors = {actor: errors[actor] for actor in order}
     random_return, final_return = float(np.mean(returns["random"])), float(np.mean(returns["task"]))
 
     title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({settings['srl']}), seed {options.seed}"
@@ -156,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "return_mean": np.mean(returns[actor]),
                 "return_std": np.std(returns[actor]),
             }
-            for actor in order
+            for actor in errors
         ],
     )
     plots.srl_error_bars(options.out / "srl_error.png", errors, "SRL error that each policy sees")

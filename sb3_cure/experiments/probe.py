@@ -6,7 +6,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.metrics import reconstruction_strip
+from sb3_cure.metrics import image_strip, reconstruction_strip
 from sb3_cure.srl import PixelDecoder
 
 
@@ -47,10 +47,4 @@ def reconstruct_with_probe(
     with th.no_grad():
         images = policy.center(shown.observations)
         drawn = (decoder(policy.encoder(images)) + 0.5).clamp(0, 1)
-    return _strip(images, drawn, frame_stack)
-
-
-def _strip(images: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.ndarray:
-    channels = images.shape[1] // frame_stack
-    rows = [th.cat(list(each[:, -channels:]), dim=2) for each in (images, drawn)]
-    return (th.cat(rows, dim=1) * 255).to(th.uint8).cpu().numpy()
+    return image_strip(images * 255, drawn * 255, frame_stack)

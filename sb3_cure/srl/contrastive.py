@@ -148,11 +148,9 @@ class CURL(SRLHead):
         :return: [B]
         """
         negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
-        # One generator per observation, so that neither batch size nor order matters.
-        own_views = [
-            self._augment(observation[None], th.Generator().manual_seed(0)) for observation in batch.observations
-        ]
-        own = self._keys(th.cat(own_views))
+        # The same offset for all, drawn for them as one image of many channels: neither batch size nor order matters.
+        views = self._augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
+        own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
         weighted = latents.float() @ self.W
         logits = (weighted * own).sum(dim=1, keepdim=True)
         if len(negatives) > 0:
