@@ -47,11 +47,18 @@ def check_arguments(model: "CuReSAC") -> None:
     CuriousMixer(model.curiosity_prob)
     for name in ("gamma", "curiosity_gamma", "tau", "encoder_tau"):
         _check_range(name, getattr(model, name), 0.0, 1.0)
-    for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts", "warmup_updates"):
-        if getattr(model, name) is not None:
-            _check_range(name, getattr(model, name), 0.0, np.inf)
+    for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts"):
+        _check_range(name, getattr(model, name), 0.0, np.inf)
+    if model.warmup_updates is not None:
+        _check_integer("warmup_updates", model.warmup_updates, 0)
     for name in ("batch_size", "buffer_size", "srl_period", "actor_update_interval", "target_update_interval"):
-        _check_range(name, getattr(model, name), 1, np.inf)
+        _check_integer(name, getattr(model, name), 1)
+    _check_ent_coef(model.ent_coef)
+    if model.srl is None and model.srl_kwargs:
+        raise ValueError(
+            f"srl_kwargs={model.srl_kwargs!r} was given with srl=None, but these are the arguments of an SRL head: "
+            "choose srl='rae', srl='curl' or a head of your own, or leave srl_kwargs out."
+        )
     if model.curiosity is not None and model.srl is None:
         raise ValueError(
             f"curiosity={model.curiosity!r} was given with srl=None, but the curious reward is the SRL error: "
@@ -162,3 +169,23 @@ def _check_range(name: str, value: Any, low: float, high: float) -> None:
     if not (is_number and low <= value <= high and np.isfinite(value)):
         bounds = f"within [{low:g}, {high:g}]" if np.isfinite(high) else f"of at least {low:g}"
         raise ValueError(f"{name} is {value!r}, but it must be a number {bounds}: change {name}.")
+
+
+def _check_integer(name: str, value: Any, low: int) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < low:
+        raise ValueError(f"{name} is {value!r}, but it must be a whole number of at least {low}: change {name}.")
+
+
+def _check_ent_coef(ent_coef: Any) -> None:
+    initial: Any = ent_coef
+    if isinstance(ent_coef, str) and ent_coef.startswith("auto"):
+        initial = ent_coef.removeprefix("auto").removeprefix("_") or 1.0
+    try:
+        works = float(initial) > 0 or (not isinstance(ent_coef, str) and float(initial) == 0)
+    except (TypeError, ValueError):
+        works = False
+    if not works:
+        raise ValueError(
+            f"ent_coef is {ent_coef!r}, but it must be 'auto', 'auto_<initial temperature > 0>' (say 'auto_0.1'), or a "
+            "fixed number >= 0: change ent_coef."
+        )

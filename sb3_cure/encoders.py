@@ -123,6 +123,14 @@ def make_encoder(
     :param observation_space: Space of what the encoder sees (after the head's crop, if it has one)
     :param kwargs: Passed on to the class
     :return: The encoder
+    :raises ValueError: if the class cannot read such observations
     """
-    extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
+    try:
+        extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
+    except (RuntimeError, AssertionError) as error:  # how torch and SB3's extractors say it
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{extractor_class.__name__} cannot read observations of shape {observation_space.shape} ({reason}): use a "
+            "larger image_size, or another policy_kwargs=dict(features_extractor_class=...)."
+        ) from error
     return extractor if isinstance(extractor, Encoder) else ExtractorEncoder(extractor)

@@ -9,6 +9,7 @@ import pytest
 import stable_baselines3.sac.policies as sb3_policies
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cure import CuReSAC
@@ -238,6 +239,36 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "precision is 'fp16', but it must be one of 'auto', 'fp32', 'bf16': choose one",
     ),
     "batch_size": ("CnnPolicy", FakeEnv(), {"batch_size": 0}, "batch_size is 0, .* at least 1: change batch_size"),
+    "batch_size in halves": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"batch_size": 12.5},
+        r"batch_size is 12\.5, but it must be a whole number of at least 1: change batch_size",
+    ),
+    "ent_coef of zero to learn": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"ent_coef": "auto_0"},
+        "ent_coef is 'auto_0', but it must be 'auto', 'auto_<initial temperature > 0>'.*change ent_coef",
+    ),
+    "ent_coef in words": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"ent_coef": "low"},
+        "ent_coef is 'low', but it must be 'auto', .* or a fixed number >= 0: change ent_coef",
+    ),
+    "srl_kwargs of no head": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"srl": None, "curiosity": None, "srl_kwargs": {"bits": 4}},
+        r"srl_kwargs=\{'bits': 4\} was given with srl=None, .* or leave srl_kwargs out",
+    ),
+    "too small for NatureCNN": (
+        "CnnPolicy",
+        images(3, 24, 24),
+        {"policy_kwargs": {"features_extractor_class": NatureCNN}},
+        r"NatureCNN cannot read observations of shape \(3, 24, 24\) \(.*\): use a larger image_size, or another",
+    ),
     "buffer_size": ("CnnPolicy", FakeEnv(), {"buffer_size": 0}, "buffer_size is 0, .* at least 1: change buffer_size"),
     "warmup_updates": ("CnnPolicy", FakeEnv(), {"warmup_updates": -1}, "warmup_updates is -1, .* at least 0: change"),
     "actor_update_interval": (

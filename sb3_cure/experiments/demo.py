@@ -65,7 +65,11 @@ class TimeLimit(BaseCallback):
         return time.monotonic() < self.deadline
 
 
-def _write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """
+    :param path: File to write
+    :param rows: Rows with the same keys, which become the header
+    """
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
@@ -141,9 +145,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     random_return, final_return = float(np.mean(returns["random"])), float(np.mean(returns["task"]))
 
     title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({settings['srl']}), seed {options.seed}"
-    _write_csv(options.out / "learning_curve.csv", curve.rows)
+    write_csv(options.out / "learning_curve.csv", curve.rows)
     plots.learning_curve(options.out / "learning_curve.png", curve.rows, random_return, title)
-    _write_csv(
+    write_csv(
         options.out / "srl_error.csv",
         [
             {

@@ -67,3 +67,32 @@ def reconstruction_grid(path: Path, strip: np.ndarray, title: str) -> None:
     axes.set_title(title)
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+def update_modes(
+    path: Path,
+    cells: Mapping[tuple[str, str], Mapping[int, Sequence[Mapping[str, float]]]],
+    measures: Mapping[str, str],
+) -> None:
+    """Curves of both update modes: one row per head, one column per measure; thin lines are seeds, thick ones means.
+
+    :param path: File to write
+    :param cells: Rows by (head, mode), by seed
+    :param measures: Column of the rows -> label of the axis
+    """
+    heads = list(dict.fromkeys(head for head, _ in cells))
+    size = (4 * len(measures), 3.2 * len(heads))
+    figure, grid = plt.subplots(len(heads), len(measures), figsize=size, layout="constrained", squeeze=False)
+    colors = {"sequential": "#1f77b4", "joint": "#ff7f0e"}
+    for (head, mode), seeds in cells.items():
+        for axes, (column, label) in zip(grid[heads.index(head)], measures.items(), strict=True):
+            for rows in seeds.values():
+                steps = [row["environment_steps"] for row in rows]
+                axes.plot(steps, [row[column] for row in rows], color=colors[mode], alpha=0.3, linewidth=0.8)
+            mean = np.mean([[row[column] for row in rows] for rows in seeds.values()], axis=0)
+            axes.plot(steps, mean, color=colors[mode], linewidth=2, label=f"{mode} (n={len(seeds)})")
+            axes.set(xlabel="environment steps", ylabel=label, title=head, ylim=(0, None))
+            axes.grid(alpha=0.3)
+    grid[0, 0].legend()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""How fast, how small: ``python -m benchmarks`` (or ``make bench``) measures all and writes the report."""
