@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.srl import CURL
 
 ACTORS = ("task", "curious", "random")
 
@@ -50,6 +51,26 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
             part = ReplayBufferSamples(*[field[start : start + chunk] for field in batch if field is not None])
             errors.append(policy.srl.error(part, policy.encode(part.observations)).cpu().numpy())  # type: ignore[union-attr]
     return np.concatenate(errors)
+
+
+def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> None:
+    """Before policies are compared by CURL's error: take its negatives evenly from what they see.
+
+    Rolls out an episode of each policy that the model has. Without this the negatives are those of the random
+    warm-up, to which the random policy's observations are the most alike. Heads without negatives are left alone.
+
+    :param model: A trained model
+    :param env: One (not vectorised) environment
+    :param seed: Seed of the resets and of random actions
+    """
+    head = model.policy.srl
+    if not isinstance(head, CURL):
+        return
+    actors = [actor for actor in ACTORS if actor != "curious" or model.policy.curious_actor is not None]
+    share = max(len(head.bank) // len(actors), 1)  # type: ignore[arg-type]
+    seen = [next(run_episodes(model, env, 1, actor, seed=seed)).observations for actor in actors]
+    frames = [each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen]
+    head.set_bank(th.as_tensor(np.concatenate(frames)[: len(head.bank)]))  # type: ignore[arg-type]
 
 
 def _actor(model: CuReSAC, env: gym.Env, actor: str, deterministic: bool) -> Callable[[np.ndarray], np.ndarray]:

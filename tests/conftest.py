@@ -4,6 +4,8 @@ import os
 
 # Without a display MuJoCo needs to be told to render off-screen, before it is imported.
 os.environ.setdefault("MUJOCO_GL", "egl")
+# For the processes that tests start; see below.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch as th
 

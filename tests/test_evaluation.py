@@ -10,7 +10,7 @@ from envs_for_tests import PixelBox, tiny_model
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import run_episodes
+from sb3_cure.evaluation import even_negatives, run_episodes
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.metrics import reconstruction_strip
 
@@ -69,6 +69,27 @@ def test_unknown_actor_is_one_sentence() -> None:
     model = tiny_model("CnnPolicy", PixelBox())
     with pytest.raises(ValueError, match=r"actor is 'best', but it must be one of 'task', 'curious', 'random'"):
         list(run_episodes(model, PixelBox(), 1, "best"))
+
+
+def test_negatives_are_taken_evenly_from_what_each_policy_sees() -> None:
+    """A third of CURL's bank from each policy's episode, spread over it; a model without such a head is left alone."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12)).learn(20)
+    env = PixelBox()
+    even_negatives(model, env, seed=3)
+    head = model.policy.srl
+    assert int(head.bank_filled) == 12
+    for third, actor in enumerate(("task", "curious", "random")):
+        (episode,) = run_episodes(model, env, 1, actor, seed=3)
+        expected = episode.observations[[0, 6, 12, 19]]
+        np.testing.assert_array_equal(head.bank[4 * third : 4 * third + 4].numpy(), expected)
+    # Two policies share it where there is no curious one.
+    plain = tiny_model("CnnPolicy", PixelBox(), srl="curl", curiosity=None).learn(20)
+    even_negatives(plain, env, seed=3)
+    assert int(plain.policy.srl.bank_filled) == 64
+    autoencoder = tiny_model("CnnPolicy", PixelBox(), srl="rae")
+    before = {key: value.clone() for key, value in autoencoder.policy.state_dict().items()}
+    even_negatives(autoencoder, env)
+    assert all(th.equal(value, before[key]) for key, value in autoencoder.policy.state_dict().items())
 
 
 def test_callback_logs_both_policies_at_its_interval() -> None:

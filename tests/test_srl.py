@@ -446,6 +446,22 @@ def test_bank_is_filled_once_from_the_first_batches() -> None:
     assert int(fresh.bank_filled) == 0
 
 
+def test_set_bank_chooses_the_negatives() -> None:
+    """They replace those of training, none of the old ones counts any more; nonsense is one sentence."""
+    encoder, head, space = trained_curl(bank_size=16)
+    chosen = noise_images(space, 5, seed=11)
+    head.set_bank(chosen)
+    assert int(head.bank_filled) == 5 and th.equal(head.bank[:5], chosen)
+    _, fresh = make(CURL, space, bank_size=16)
+    fresh.load_state_dict({**head.state_dict(), "bank": th.cat([chosen, th.zeros_like(head.bank[5:])])})
+    observations = noise_images(space, 4, seed=9)
+    latents = encoder(head.preprocess(observations))
+    assert th.equal(fresh.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
+    for wrong in (noise_images(space, 17), chosen[:0], chosen[:, :1]):
+        with pytest.raises(ValueError, match=r"set_bank got observations of shape .* the bank holds 1 to 16"):
+            head.set_bank(wrong)
+
+
 @pytest.mark.parametrize("trained_before", [False, True])
 def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
     """A restored head gives the same errors and goes on filling where the other stopped."""

@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import run_episodes
+from sb3_cure.evaluation import even_negatives, run_episodes
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.experiments.video import write_video
@@ -137,6 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         curve.evaluate()
 
     print("Measuring the random, task and curious policies")
+    even_negatives(model, eval_env, seed=15_000)
     errors, returns = {}, {}
     for actor in ("random", "task", "curious"):
         episodes = list(run_episodes(model, eval_env, 10, actor, seed=20_000))

@@ -160,6 +160,26 @@ class CURL(SRLHead):
         # Rounding can leave a -0.0.
         return F.cross_entropy(logits, first, reduction="none").clamp(min=0)
 
+    @th.no_grad()
+    def set_bank(self, observations: th.Tensor) -> None:
+        """Choose the negatives of ``error``, which otherwise are the first observations of training.
+
+        What the error says depends on them: observations score high that look like many of the bank. To compare
+        policies, take an even mix of what they see (``sb3_cure.evaluation.even_negatives``).
+
+        :param observations: 1 to ``bank_size`` observations as stored, [n, *shape], 0-255
+        :raises ValueError: if there are none, too many, or of another shape
+        """
+        bank: th.Tensor = self.bank  # type: ignore[assignment]
+        if not 1 <= len(observations) <= len(bank) or observations.shape[1:] != bank.shape[1:]:
+            raise ValueError(
+                f"set_bank got observations of shape {tuple(observations.shape)}, but the bank holds 1 to {len(bank)} "
+                f"of shape {tuple(bank.shape[1:])}: choose fewer, or another srl_kwargs=dict(bank_size=...)."
+            )
+        bank[: len(observations)] = observations.to(bank.device)
+        self._n_banked = len(observations)
+        self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
+
     def _augment(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         if self.crops:
             return random_crop(observations, self.crop_size, generator)
