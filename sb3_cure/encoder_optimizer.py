@@ -19,13 +19,16 @@ class EncoderOptimizer:
 
     ``"sequential"`` (the paper's Algorithm 1): every source has its own pass through the encoder, its own Adam state
     and its own step, taken at once. ``"joint"``: all sources share one pass; the gradient of each is divided by its
-    own running root-mean-square norm, and their sum goes back through the encoder once, for one step.
+    own running root-mean-square norm, and their sum goes back through the encoder once, for one step. Its learning rate
+    is multiplied by the square root of the number of sources n: Adam divides by the size of the sum, which for
+    uncorrelated gradients of equal size is sqrt(n) times that of each, so that the one step is what n Adams would make.
 
     :param encoder: The shared encoder
     :param sources: Names of the losses that train it, e.g. ``("srl", "task", "curious")``
     :param mode: ``"sequential"`` or ``"joint"``
     :param optimizer_class: Class of the optimisers
-    :param optimizer_kwargs: Their arguments, the learning rate among them
+    :param lr: Learning rate
+    :param optimizer_kwargs: Further arguments of the optimisers
     """
 
     #: Weight of the past in the running mean square of a source's gradient norm (joint)
@@ -37,16 +40,18 @@ class EncoderOptimizer:
         sources: tuple[str, ...],
         mode: str,
         optimizer_class: type[th.optim.Optimizer],
+        lr: float,
         **optimizer_kwargs: Any,
     ):
         self.parameters = list(encoder.parameters())
         self.mode = mode
-        self._make_optimizer = partial(optimizer_class, self.parameters, **optimizer_kwargs)
+        self._make_optimizer = partial(optimizer_class, self.parameters, lr=lr, **optimizer_kwargs)
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
         self.weights: dict[str, float] = {}
         for source in sources:
             self.add_source(source)
+        self.set_learning_rate(lr)
         self._pulls: dict[str, th.Tensor] = {}
         self._norms: dict[str, th.Tensor] = {}
         self._latents: th.Tensor | None = None
@@ -123,8 +128,10 @@ class EncoderOptimizer:
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """
-        :param learning_rate: New learning rate of all optimisers
+        :param learning_rate: New learning rate of all sources
         """
+        if self.mode == "joint":
+            learning_rate *= len(self.weights) ** 0.5
         for optimizer in self.optimizers.values():
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate

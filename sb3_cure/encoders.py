@@ -75,7 +75,7 @@ class PixelEncoder(Encoder):
         layers: list[nn.Module] = []
         for layer in range(n_layers):
             channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
-            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU()]
+            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU(inplace=True)]
         self.trunk = nn.Sequential(*layers, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
+from torch.nn import functional
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -74,6 +75,22 @@ def preprocess(observations: th.Tensor, observation_space: spaces.Space) -> th.T
 def full_precision(tensor: th.Tensor) -> th.autocast:
     """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
     return th.autocast(tensor.device.type, enabled=False)
+
+
+class ConvTranspose2d(nn.ConvTranspose2d):
+    """torch's transposed convolution, its bias added afterwards: inside, oneDNN's bias gradient costs as much as
+    that of the weights. Square strides, no padding but ``output_padding``."""
+
+    def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
+        """
+        :param images: [B, in_channels, H, W]
+        :param output_size: Must be None
+        :return: [B, out_channels, H', W']
+        """
+        drawn = functional.conv_transpose2d(
+            images, self.weight, None, self.stride, self.padding, self.output_padding, self.groups, self.dilation
+        )
+        return drawn.add_(self.bias.to(drawn.dtype).view(-1, 1, 1))  # type: ignore[union-attr]
 
 
 class FlattenImage(nn.Module):

@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from torch import nn
@@ -73,10 +74,13 @@ def test_sequential_is_one_adam_per_source_in_turn() -> None:
 
 
 def test_joint_is_one_adam_on_gradients_of_equal_size() -> None:
-    """The gradients at the latents, each divided by its root-mean-square norm so far (recent ones count more)."""
+    """The gradients at the latents, each divided by its root-mean-square norm so far (recent ones count more).
+
+    Adam divides by the norm of the sum of three, about sqrt(3) times one's: the learning rate makes up for that.
+    """
     encoder, optimizer = make("joint")
     expected = make_encoder()
-    adam = th.optim.Adam(expected.parameters(), lr=LR)
+    adam = th.optim.Adam(expected.parameters(), lr=LR * 3**0.5)
     squares: dict[str, list[float]] = {source: [] for source in SOURCES}
     for step in range(60):
         update(optimizer, encoder, step)
@@ -109,6 +113,29 @@ def test_joint_moves_nothing_before_step() -> None:
     assert not th.equal(moved, before)
     optimizer.step()
     assert th.equal(values(encoder), moved)
+
+
+def test_joint_step_is_as_long_as_the_steps_of_an_adam_per_source() -> None:
+    """Uncorrelated gradients of very different sizes: each source moves the encoder as far as its own Adam would."""
+    n_steps, sizes = 400, {"srl": 1e-4, "task": 1.0, "curious": 30.0}
+    moved = {}
+    for mode in ("sequential", "joint"):
+        weight = nn.Linear(1, 64, bias=False)
+        with th.no_grad():
+            weight.weight.zero_()
+        optimizer = EncoderOptimizer(weight, tuple(sizes), mode, th.optim.Adam, lr=LR)
+        noise = th.Generator().manual_seed(0)
+        lengths = []
+        for _ in range(n_steps):
+            before = weight.weight.detach().clone()
+            shared = weight(th.ones(1, 1))
+            for source, size in sizes.items():
+                latents = shared if mode == "joint" else weight(th.ones(1, 1))
+                optimizer.pull(source, latents, size * th.randn(1, 64, generator=noise))
+            optimizer.step()
+            lengths.append(float((weight.weight.detach() - before).norm()))
+        moved[mode] = np.mean(lengths[50:])
+    assert moved["joint"] == pytest.approx(moved["sequential"], rel=0.05)
 
 
 @pytest.mark.parametrize("mode", ["sequential", "joint"])

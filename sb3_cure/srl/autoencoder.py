@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_cure.augmentations import random_shift
 from sb3_cure.encoders import Encoder
-from sb3_cure.layers import conv_sizes, full_precision, init_weights
+from sb3_cure.layers import ConvTranspose2d, conv_sizes, full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -30,11 +30,11 @@ class PixelDecoder(nn.Module):
         self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
         hidden: list[nn.Module] = []
         for _ in range(n_layers - 1):
-            hidden += [nn.ConvTranspose2d(n_filters, n_filters, 3), nn.ReLU()]
+            hidden += [ConvTranspose2d(n_filters, n_filters, 3), nn.ReLU(inplace=True)]
         self.hidden = nn.Sequential(*hidden)
         # The strided convolution may drop the last row or column; output padding gives it back.
         padding = (sizes[0][0] - (2 * sizes[1][0] + 1), sizes[0][1] - (2 * sizes[1][1] + 1))
-        self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2, output_padding=padding)
+        self.output = ConvTranspose2d(n_filters, shape[0], 3, stride=2, output_padding=padding)
         init_weights(self)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
@@ -73,7 +73,7 @@ class _SquaredError(th.autograd.Function):
         difference = th.sub(drawn, target, out=target) if target.stride() == drawn.stride() else drawn - target
         ctx.save_for_backward(difference)
         flat = difference.permute(0, 2, 3, 1).flatten(1)  # a view where kernels write NHWC
-        return th.linalg.vecdot(flat, flat) / flat.shape[1]
+        return th.linalg.vector_norm(flat, dim=1).square() / flat.shape[1]
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
