@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -36,6 +37,7 @@ from sb3_cure.checks import (
 )
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
+from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -138,6 +140,8 @@ class CuReSAC(SAC):
     :param encoder_tau: Polyak rate of the target encoder
     :param update: ``"sequential"`` (Algorithm 1 to the letter) or ``"joint"`` (one encoder pass for all)
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 where the hardware computes it natively
+    :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: each update is
+        made during the next step, so that actions come from a policy that is one update behind
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number; also the curious agent's
     :param ent_coef_lr_factor: Learning rate of the temperatures as a multiple of ``learning_rate``
     :param kwargs: The remaining arguments of ``stable_baselines3.SAC`` (``seed``, ``verbose``, ``policy_kwargs``, ...)
@@ -182,6 +186,7 @@ class CuReSAC(SAC):
         encoder_tau: float = 0.05,
         update: str = "sequential",
         precision: str = "auto",
+        overlap: bool = False,
         ent_coef: str | float = "auto_0.1",
         ent_coef_lr_factor: float = 0.1,
         _init_setup_model: bool = True,
@@ -223,6 +228,7 @@ class CuReSAC(SAC):
         self.encoder_tau = encoder_tau
         self.update = update
         self.precision = precision
+        self.overlap = overlap
         self.ent_coef_lr_factor = ent_coef_lr_factor
 
         self.curious_log_ent_coef: th.Tensor | None = None
@@ -231,6 +237,8 @@ class CuReSAC(SAC):
         # Who collects while pretraining ("curious" or "random"); None otherwise.
         self._collector: str | None = None
         self._warmed_up = False
+        # While `learn` runs with overlap=True: the environments, which do updates as they step
+        self._overlapped: OverlappedVecEnv | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -245,6 +253,8 @@ class CuReSAC(SAC):
         check_arguments(self)
         self._metrics = Metrics()
         self._read_env_attributes()
+        if self.overlap and self.env is not None:
+            OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if self.is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
@@ -329,7 +339,8 @@ class CuReSAC(SAC):
             self.curious_ent_coef_optimizer = self._make_temperature_optimizer(log_ent_coef)
 
     def _make_temperature_optimizer(self, log_ent_coef: th.Tensor) -> th.optim.Adam:
-        return th.optim.Adam([log_ent_coef], lr=self.lr_schedule(1) * self.ent_coef_lr_factor, betas=(0.5, 0.999))
+        learning_rate = self.lr_schedule(1) * self.ent_coef_lr_factor
+        return th.optim.Adam([log_ent_coef], lr=learning_rate, betas=(0.5, 0.999), fused=True)
 
     def _create_agents(self) -> None:
         policy = self.policy
@@ -472,7 +483,7 @@ class CuReSAC(SAC):
         :return: What was collected
         """
         rollout = super().collect_rollouts(
-            env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
+            self._overlapped or env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
         )
         if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
             self._warmed_up = True
@@ -486,21 +497,30 @@ class CuReSAC(SAC):
         return rollout
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Sample, update, repeat.
+        """Sample, update, repeat (with ``overlap=True``, while ``learn`` runs: during the next step).
 
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update
         """
+        if self._overlapped is not None:
+            self._overlapped.defer(partial(self._train, gradient_steps, batch_size))
+        else:
+            self._train(gradient_steps, batch_size)
+
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
         if self.is_plain_sac:
             super().train(gradient_steps, batch_size)
-            return
-        self.policy.set_training_mode(True)
-        self._update_learning_rates()
-        for _ in range(gradient_steps):
-            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            self._gradient_step(batch)
-            self._n_updates += 1
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        else:
+            self.policy.set_training_mode(True)
+            self._update_learning_rates()
+            for _ in range(gradient_steps):
+                batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                self._gradient_step(batch)
+                self._n_updates += 1
+            self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self._overlapped is not None:
+            # In the middle of a rollout.
+            self.policy.set_training_mode(False)
 
     def _gradient_step(self, batch: ReplayBufferSamples) -> None:
         """One update, in the order of the paper's Algorithm 1: SRL, task agent, curious agent."""
@@ -700,7 +720,19 @@ class CuReSAC(SAC):
         """
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        return self
+
+    def _learn(self, *arguments: Any) -> None:
+        """SB3's ``learn``, with environments that overlap with the updates if they are to."""
+        if self.overlap and self.env is not None:
+            self._overlapped = OverlappedVecEnv(self.env)
+        try:
+            super().learn(*arguments)
+            if self._overlapped is not None:
+                self._overlapped.finish()
+        finally:
+            self._overlapped = None
 
     def pretrain(
         self: SelfCuReSAC,
@@ -747,7 +779,7 @@ class CuReSAC(SAC):
             self._setup_curious_temperature()
         self._create_agents()
         try:
-            super().learn(total_timesteps, callback, log_interval, tb_log_name, True, progress_bar)
+            self._learn(total_timesteps, callback, log_interval, tb_log_name, True, progress_bar)
         finally:
             self._end_pretraining()
         return self
@@ -800,7 +832,7 @@ class CuReSAC(SAC):
     # ---------------------------------------------------------------- saving
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_task_agent", "_curious_agent"]
+        return [*super()._excluded_save_params(), "_metrics", "_task_agent", "_curious_agent", "_overlapped"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

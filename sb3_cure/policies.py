@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +22,8 @@ from sb3_cure.srl import SRLHead
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
+# Keeps the logarithm finite where tanh is 1 in floating point, as in SB3.
+EPSILON = 1e-6
 
 
 class TrunkActor(Actor):
@@ -44,9 +47,14 @@ class TrunkActor(Actor):
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B]
         """
-        mean, log_std, kwargs = self.get_action_dist_params(obs)
+        mean, log_std, _ = self.get_action_dist_params(obs)
+        # What SB3's SquashedDiagGaussianDistribution computes; torch's Normal would read its arguments to check them,
+        # for which a GPU has to stop.
         with full_precision(mean):
-            return self.action_dist.log_prob_from_params(mean, log_std, **kwargs)
+            noise = th.randn_like(mean)
+            actions = th.tanh(mean + noise * log_std.exp())
+            log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - log_std
+            return actions, (log_prob - th.log(1 - actions.square() + EPSILON)).sum(dim=1)
 
 
 class LatentCritic(ContinuousCritic):

@@ -3,6 +3,7 @@
 import itertools
 import pickle
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -552,3 +553,46 @@ def test_refuses_observations_of_another_kind(which: str, bad: np.ndarray, part:
 def test_frame_stack_is_required() -> None:
     with pytest.raises(TypeError, match="frame_stack"):
         FrameStackReplayBuffer(10, GOOD, ACTIONS)  # type: ignore[call-arg]
+
+
+def test_frames_in_a_file_are_the_same_frames(tmp_path: Path) -> None:
+    """A buffer whose frames lie on disk samples what one in memory samples, also after pickling; nothing is left."""
+    space = spaces.Box(0, 255, (6, 8, 8), np.uint8)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    arguments: dict[str, Any] = dict(device="cpu", frame_stack=2)
+    in_memory = FrameStackReplayBuffer(20, space, action_space, **arguments)
+    in_file = FrameStackReplayBuffer(20, space, action_space, frames_dir=tmp_path, **arguments)
+    assert isinstance(in_file.frames, np.memmap)
+    rng = np.random.default_rng(0)
+    stack = rng.integers(0, 256, (1, 6, 8, 8), np.uint8)
+    for step in range(33):
+        following = np.concatenate([stack[:, 3:], rng.integers(0, 256, (1, 3, 8, 8), np.uint8)], axis=1)
+        for buffer in (in_memory, in_file):
+            buffer.add(stack, following, np.ones((1, 2)), np.array([step]), np.array([False]), [{}])
+        stack = following
+    copied = pickle.loads(pickle.dumps(in_file))
+    assert isinstance(copied.frames, np.memmap)
+    batches = []
+    for buffer in (in_memory, in_file, copied):
+        np.random.seed(0)
+        batches.append(buffer.sample(50))
+    for batch in batches[1:]:
+        for field, expected in zip(batch, batches[0], strict=True):
+            assert field is expected is None or th.equal(field, expected)
+    # Copies do not share the file.
+    copied.frames[:] = 0
+    np.random.seed(0)
+    assert th.equal(in_file.sample(50).observations, batches[0].observations)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
+    """Known before training, because a full disk would kill the process later."""
+    space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    with pytest.raises(
+        ValueError, match=r"frames_dir is '.*/none', but .* GB for frames cannot be reserved there \(No"
+    ):
+        FrameStackReplayBuffer(20, space, action_space, frame_stack=2, frames_dir=tmp_path / "none")
+    with pytest.raises(ValueError, match="name a directory on a disk with room, or make buffer_size smaller"):
+        FrameStackReplayBuffer(10**9, space, action_space, frame_stack=2, frames_dir=tmp_path)

@@ -1,0 +1,178 @@
+"""The quick ways of doing things do the same things: overlapped updates, bfloat16, no waiting for the device."""
+
+import copy
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, tiny_model
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from sb3_cure import CuReSAC
+
+# ------------------------------------------------------------- overlapped updates
+
+
+@pytest.mark.parametrize("extras", [{}, dict(srl=None, curiosity=None)], ids=["all", "plain SAC"])
+def test_updates_are_made_while_the_workers_step(extras: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every update but the last falls between sending the actions and fetching the results; none is lost."""
+    venv = SubprocVecEnv([PixelBox] * 2)
+    try:
+        model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0, **extras)
+        waiting, training_modes = [], []
+        train = model._train
+
+        def watched(*arguments: Any) -> None:
+            waiting.append(venv.waiting)
+            train(*arguments)
+            training_modes.append(model.policy.training)
+
+        monkeypatch.setattr(model, "_train", watched)
+        model.learn(40)
+        # Two environments: after steps 12, 14, ... 40, two updates each.
+        assert waiting == [True] * 14 + [False]
+        assert model._n_updates == 30
+        assert not any(training_modes)
+        # Outside of `learn` an update is made at once.
+        model.train(3, 8)
+        assert model._n_updates == 33
+    finally:
+        venv.close()
+
+
+def test_overlapped_updates_lag_one_step_behind() -> None:
+    """The update after step t is made during step t + 1, on the data of step t, and acts from step t + 2 on."""
+    venv = SubprocVecEnv([PixelBox])
+    try:
+        seen: list[tuple[int, int]] = []
+        model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0)
+        step = model._gradient_step
+
+        def watched(batch: Any) -> None:
+            seen.append((model.num_timesteps, model.replay_buffer.size()))
+            step(batch)
+
+        model._gradient_step = watched
+        model.learn(15)
+        assert seen == [(n, n) for n in range(11, 16)]
+    finally:
+        venv.close()
+
+
+def test_overlap_needs_worker_processes() -> None:
+    """Refused by the constructor, in one sentence; `load` without environments is fine."""
+    sentence = r"overlap=True was given with environments in this process .* vec_env_cls=SubprocVecEnv"
+    for env in (PixelBox(), DummyVecEnv([PixelBox])):
+        with pytest.raises(ValueError, match=sentence):
+            tiny_model("CnnPolicy", env, overlap=True)
+
+
+# ----------------------------------------------------------------------- bfloat16
+
+
+def _gradients(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
+    """Gradient of every part of the agent in one update from the model's state, as its optimiser receives it."""
+    policy = model.policy
+    owners = {
+        "encoder": policy.encoder,
+        "srl": policy.srl,
+        "actor": policy.actor,
+        "critic": policy.critic,
+        "curious actor": policy.curious_actor,
+        "curious critic": policy.curious_critic,
+    }
+    found: dict[str, th.Tensor] = {}
+
+    def keep(name: str, parameters: list[th.nn.Parameter], step: Any, *arguments: Any) -> Any:
+        found[name] = th.cat([p.grad.flatten().clone() for p in parameters if p.grad is not None])
+        return step(*arguments)
+
+    for name, owner in owners.items():
+        optimizer = policy.encoder_optimizer.optimizers["joint"] if name == "encoder" else owner.optimizer
+        optimizer.step = functools.partial(keep, name, list(owner.parameters()), optimizer.step)
+    th.manual_seed(seed)
+    np.random.seed(seed)
+    model._n_updates = 0
+    model.train(1, 128)
+    return found
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_bfloat16_gradients_point_where_those_of_float32_do(srl: str) -> None:
+    """One state, one batch, one stream of random numbers: cosine of at least 0.99 for every part of the agent."""
+    arguments: dict[str, Any] = dict(
+        srl=srl,
+        update="joint",
+        policy_kwargs=dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=16, n_layers=3)),
+    )
+    trained = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(60)
+    state = copy.deepcopy(trained.get_parameters())
+    found = {}
+    for precision in ("fp32", "bf16"):
+        model = tiny_model("CnnPolicy", PixelBox(), precision=precision, **arguments)
+        model.set_logger(trained.logger)
+        model.set_parameters(state)
+        model.replay_buffer = trained.replay_buffer
+        found[precision] = _gradients(model, seed=5)
+    assert found["fp32"].keys() == found["bf16"].keys() and len(found["fp32"]) == 6
+    for name, expected in found["fp32"].items():
+        cosine = float(th.cosine_similarity(expected, found["bf16"][name], dim=0))
+        assert cosine >= 0.99, (name, cosine)
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_losses_are_computed_in_float32(srl: str) -> None:
+    """Within bfloat16 networks the head's loss and errors, the Q values and the log-probabilities are float32."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, precision="bf16").learn(12)
+    policy, batch = model.policy, model.replay_buffer.sample(8)
+    with model._autocast():
+        images = policy.augment(batch.observations)
+        assert images.dtype == th.bfloat16
+        features = policy.encoder.trunk(images)
+        assert features.dtype == th.bfloat16
+        latents = policy.encoder.projection(features)
+        loss, error = policy.srl.loss(batch, latents)
+        actions, log_prob = policy.actor.action_log_prob(features)
+        q_values = policy.critic(latents, actions)
+    for value in (latents, loss, error, actions, log_prob, *q_values, policy.srl.error(batch, latents)):
+        assert value.dtype == th.float32
+
+
+# ------------------------------------------------------------ waiting for the device
+
+
+class CountReads(TorchDispatchMode):
+    """Counts operations that hand a tensor's value to Python: on a GPU each waits for all work to end."""
+
+    READS = ("_local_scalar_dense", "nonzero", "equal", "is_nonzero", "masked_select")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reads: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.__name__.split(".")[0]
+        if name in self.READS:
+            self.reads.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("update", ["sequential", "joint"])
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_updates_never_read_a_value_from_the_device(srl: str, update: str) -> None:
+    """No `.item()` in an update; the logger reads, when it writes."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, update=update).learn(20)
+    batch = model.replay_buffer.sample(8)
+    model._update_learning_rates()
+    with CountReads() as counter:
+        for _ in range(4):
+            model._gradient_step(batch)
+            model._n_updates += 1
+    assert counter.reads == []
+    # The counter does count.
+    with CountReads() as counter:
+        model.logger.dump(0)
+    assert counter.reads
