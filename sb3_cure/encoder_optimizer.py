@@ -45,7 +45,7 @@ class EncoderOptimizer:
     ):
         self.parameters = list(encoder.parameters())
         self.mode = mode
-        self._make_optimizer = partial(optimizer_class, self.parameters, lr=lr, **optimizer_kwargs)
+        self._make_optimizer = partial(optimizer_class, self.parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
         self.weights: dict[str, float] = {}

@@ -87,9 +87,7 @@ class ConvTranspose2d(nn.ConvTranspose2d):
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        drawn = functional.conv_transpose2d(
-            images, self.weight, None, self.stride, self.padding, self.output_padding, self.groups, self.dilation
-        )
+        drawn = functional.conv_transpose2d(images, self.weight, None, self.stride, output_padding=self.output_padding)
         return drawn.add_(self.bias.to(drawn.dtype).view(-1, 1, 1))  # type: ignore[union-attr]
 
 
