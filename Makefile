@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl demo test check notebooks clean help
+.PHONY: .venv gl demo test check bench notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -73,6 +73,9 @@ check: .venv/.installed  ## lint, formatting and types
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 	$(RUN) mypy
+
+bench: gl  ## measure speed and memory and write results/benchmarks/ (some 20 minutes; leave the machine alone)
+	$(RUN) benchmarks
 
 notebooks: gl  ## execute the notebooks in place
 	$(RUN) nbconvert --to notebook --execute --inplace notebooks/*.ipynb

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import collection, growth, rendering, replay, update
+from benchmarks import collection, growth, numerics, rendering, replay, update
 from benchmarks.harness import describe_machine, peak_memory_mb
+from sb3_cure.allocator import tune_allocator
 
 
 def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
@@ -45,6 +46,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder to write")
     parser.add_argument("--repeats", type=int, default=7, help="rounds of each comparison (default: 7)")
     options = parser.parse_args()
+    tune_allocator()
     machine = describe_machine()
     parts = {
         "update": lambda: update.measure(options.repeats),
@@ -52,6 +54,7 @@ def main() -> None:
         "replay": replay.measure,
         "rendering": rendering.measure,
         "end_to_end": collection.measure,
+        "bfloat16_against_float32": numerics.measure,
         "growth_with_batch": growth.by_batch,
         "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,

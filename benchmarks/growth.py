@@ -1,8 +1,18 @@
 """How time grows with the batch, the image and the buffer, and memory with a buffer that fills."""
 
+import time
 from typing import Any
 
-from benchmarks.harness import fill, interleaved, make_env, make_model, peak_memory_mb, stream, summary
+from benchmarks.harness import (
+    anonymous_memory_mb,
+    fill,
+    interleaved,
+    make_env,
+    make_model,
+    memory_mb,
+    stream,
+    summary,
+)
 from sb3_cure.buffers import FrameStackReplayBuffer
 
 
@@ -32,18 +42,52 @@ def by_image(sizes: tuple[int, ...] = (36, 48, 64, 84), repeats: int = 3) -> dic
 
 def by_buffer(sizes: tuple[int, ...] = (1000, 10_000, 80_000), repeats: int = 7) -> dict[str, Any]:
     """
-    :param sizes: Transitions stored, the same real frames over and over
+    :param sizes: Capacities; each buffer is filled twice over with the same real frames, again and again
     :param repeats: Rounds
-    :return: Time of ``sample(128)`` by size of the full buffer, and the process's peak memory after filling each
+    :return: By capacity: time of ``sample(128)``, and the process's memory when the buffer was full for the first time
+        and after another round, MiB
     """
     env = make_env()
     transitions = stream()
     results: dict[str, Any] = {}
     for size in sizes:
+        before = memory_mb()
         buffer = FrameStackReplayBuffer(size, env.observation_space, env.action_space, frame_stack=3)
-        for _ in range(-(-size // len(transitions)) + 1):
-            fill(buffer, transitions)
+        grown = []
+        for _ in range(2):
+            for _ in range(-(-size // len(transitions))):
+                fill(buffer, transitions)
+            grown.append(round(memory_mb() - before))
         times = interleaved({"sample": lambda b=buffer: b.sample(128)}, repeats, calls=5)
-        results[str(size)] = {**summary(times["sample"]), "peak_memory_mb": round(peak_memory_mb())}
+        results[f"{size} transitions"] = {
+            **summary(times["sample"]),
+            "full_mb": grown[0],
+            "one_round_later_mb": grown[1],
+        }
         del buffer
     return results
+
+
+def on_disk(size: int, directory: str) -> dict[str, Any]:
+    """
+    :param size: Capacity of a buffer whose frames lie in a file
+    :param directory: Where
+    :return: Time to fill it, time of ``sample(128)`` and the memory that the process itself needed, MiB
+    """
+    env = make_env()
+    transitions = stream()
+    before = anonymous_memory_mb()
+    buffer = FrameStackReplayBuffer(size, env.observation_space, env.action_space, frame_stack=3, frames_dir=directory)
+    start = time.perf_counter()
+    for _ in range(-(-size // len(transitions))):
+        fill(buffer, transitions)
+    filling = time.perf_counter() - start
+    times = interleaved({"sample": lambda: buffer.sample(128)}, 7, calls=5)
+    return {
+        f"{size} transitions": {
+            **summary(times["sample"]),
+            "seconds_to_fill": round(filling, 1),
+            "file_gb": round(buffer.frames.nbytes / 1e9, 2),
+            "own_memory_mb": round(anonymous_memory_mb() - before),
+        }
+    }

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import psutil
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
@@ -75,6 +76,21 @@ def peak_memory_mb() -> float:
     :return: Largest resident memory of this process so far, MiB
     """
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def memory_mb() -> float:
+    """
+    :return: Resident memory of this process, MiB
+    """
+    return psutil.Process().memory_info().rss / 2**20
+
+
+def anonymous_memory_mb() -> float:
+    """
+    :return: Resident memory of this process that is not a mapped file, MiB
+    """
+    memory = psutil.Process().memory_info()
+    return (memory.rss - memory.shared) / 2**20
 
 
 def _processor() -> str:

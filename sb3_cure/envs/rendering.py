@@ -23,13 +23,16 @@ def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if there is no display and ``MUJOCO_GL`` is not set.
 
-    No rendering context is made, so a process that has only called this can still be forked.
+    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set. No rendering context is
+    made, so a process that has only called this can still be forked.
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if headless:
         os.environ.setdefault("MUJOCO_GL", "egl")
+    # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     importlib.import_module("dm_control")  # outside of the try: its absence is no matter of OpenGL
     try:
         backend = importlib.import_module("dm_control._render").BACKEND

@@ -22,6 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.allocator import tune_allocator
 from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import even_negatives, run_episodes
 from sb3_cure.experiments import plots
@@ -117,6 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.minutes <= 0 or options.steps < 1:
         parser.error(f"--minutes is {options.minutes} and --steps {options.steps}, but both must be positive")
     options.out.mkdir(parents=True, exist_ok=True)
+    tune_allocator()
 
     env = make_dmc_env(DOMAIN, TASK, seed=options.seed, **ENV_KWARGS)
     eval_env = make_dmc_env(DOMAIN, TASK, render_mode="rgb_array", **ENV_KWARGS)
