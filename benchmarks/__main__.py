@@ -6,7 +6,7 @@ python -m benchmarks --out results/benchmarks
 import argparse
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,39 +40,48 @@ def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
     return lines
 
 
-def main() -> None:
-    """Run the benchmarks."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder to write")
-    parser.add_argument("--repeats", type=int, default=7, help="rounds of each comparison (default: 7)")
-    options = parser.parse_args()
-    tune_allocator()
-    machine = describe_machine()
-    parts = {
-        "update": lambda: update.measure(options.repeats),
-        "update_by_phase": lambda: {"rae": update.breakdown(srl="rae"), "curl": update.breakdown(srl="curl")},
+def parts(repeats: int) -> dict[str, Callable[[], dict[str, Any]]]:
+    """
+    :param repeats: Rounds of the comparisons
+    :return: What can be measured, by name, in the order of the report
+    """
+    return {
+        "update": lambda: update.measure(repeats),
+        "update_by_phase": lambda: {head: update.breakdown(srl=head) for head in ("rae", "curl")},
         "replay": replay.measure,
         "rendering": rendering.measure,
         "end_to_end": collection.measure,
-        "bfloat16_against_float32": numerics.measure,
         "growth_with_batch": growth.by_batch,
         "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,
+        "buffer_on_disk": lambda: growth.on_disk(1_000_000, "."),
+        "bfloat16_against_float32": numerics.measure,
     }
-    results: dict[str, Any] = {"machine": machine}
-    for name, measure in parts.items():
-        print(f"{name} ...", flush=True)
-        results[name] = measure()
-    results["peak_memory"] = {"whole_benchmark_mb": round(peak_memory_mb())}
+
+
+def main() -> None:
+    """Run the benchmarks."""
+    names = list(parts(1))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder to write")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds of each comparison (default: 7)")
+    parser.add_argument("--only", nargs="+", choices=names, help="measure these anew and keep the rest of the report")
+    options = parser.parse_args()
+    tune_allocator()
+    machine = describe_machine()
+    processor = machine["gpu"] or machine["processor"]
+    name = re.sub(r"[^a-z0-9]+", "-", f"{processor}-{machine['cores']}-cores".lower()).strip("-")
+    path = options.out / f"{name}.json"
+    old = json.loads(path.read_text()) if options.only and path.exists() else {}
     options.out.mkdir(parents=True, exist_ok=True)
-    name = (
-        re.sub(r"[^A-Za-z0-9]+", "-", f"{machine['gpu'] or machine['processor']}-{machine['cores']}-cores")
-        .strip("-")
-        .lower()
-    )
-    (options.out / f"{name}.json").write_text(json.dumps(results, indent=2) + "\n")
-    (options.out / f"{name}.md").write_text("\n".join(["# Benchmarks", "", *to_markdown(results, 2)]))
-    print(f"Wrote {options.out / name}.json and .md")
+    for part, measure in parts(options.repeats).items():
+        if options.only is None or part in options.only:
+            print(f"{part} ...", flush=True)
+            old[part] = {**measure(), "peak_memory_mb": round(peak_memory_mb())}
+            results = {"machine": machine, **{key: old[key] for key in names if key in old}}
+            path.write_text(json.dumps(results, indent=2) + "\n")
+            path.with_suffix(".md").write_text("\n".join(["# Benchmarks", "", *to_markdown(results, 2)]))
+    print(f"Wrote {path} and {path.with_suffix('.md').name}")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ def _seconds_per_step(model: CuReSAC, steps: int) -> float:
     return (time.perf_counter() - start) / (model.num_timesteps - before)
 
 
-def measure(n_envs: tuple[int, ...] = (1, 2, 4), steps: int = 40, repeats: int = 3, **kwargs: Any) -> dict[str, Any]:
+def measure(n_envs: tuple[int, ...] = (1, 2, 4), steps: int = 24, repeats: int = 3, **kwargs: Any) -> dict[str, Any]:
     """
     :param n_envs: Numbers of environments; several live in worker processes, which can overlap with updates
     :param steps: Agent steps per measurement

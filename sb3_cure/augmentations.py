@@ -51,6 +51,7 @@ def random_shift(images: th.Tensor, pad: int = 4, generator: th.Generator | None
 def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:
     """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, as one gather (the quickest way on uint8)."""
     batch, channels, _, width = images.shape
-    index = (rows[:, :, None] * width + columns[:, None, :]).view(batch, 1, -1).to(images.device)
+    rows, columns = rows.to(images.device), columns.to(images.device)
+    index = (rows[:, :, None] * width + columns[:, None, :]).view(batch, 1, -1)
     windows = images.flatten(2).gather(2, index.expand(-1, channels, -1))
     return windows.view(batch, channels, rows.shape[1], columns.shape[1])

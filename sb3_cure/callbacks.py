@@ -62,7 +62,8 @@ class EvalBothCallback(BaseCallback):
         """
         row: dict[str, float] = {"timesteps": self.num_timesteps}
         has_curious = getattr(self.model.policy, "curious_actor", None) is not None
-        for actor in ("task", "curious") if has_curious else ("task",):
+        has_task = getattr(self.model, "task", True)
+        for actor in ("task",) * has_task + ("curious",) * has_curious:
             episodes = run_episodes(
                 self.model,  # type: ignore[arg-type]
                 self.eval_env,

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_cure.mixers import CuriousMixer
@@ -49,6 +50,9 @@ def check_arguments(model: "CuReSAC") -> None:
         _check_range(name, getattr(model, name), 0.0, 1.0)
     for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts"):
         _check_range(name, getattr(model, name), 0.0, np.inf)
+    for name in ("task", "overlap", "normalize_curiosity", "curiosity_encoder_grad"):
+        if not isinstance(getattr(model, name), bool):
+            raise ValueError(f"{name} is {getattr(model, name)!r}, but it must be True or False: change {name}.")
     if model.warmup_updates is not None:
         _check_integer("warmup_updates", model.warmup_updates, 0)
     for name in ("batch_size", "buffer_size", "srl_period", "actor_update_interval", "target_update_interval"):
@@ -145,6 +149,26 @@ def check_shared_encoder_space(observation_space: spaces.Space, policy_class: ty
         )
 
 
+def check_srl_error(error: th.Tensor, batch_size: int, look: bool) -> None:
+    """
+    :param error: ``SRLOutput.error`` of a head
+    :param batch_size: Number of samples it was computed for
+    :param look: Whether to look at the values too, for which a GPU has to stop
+    :raises ValueError: if it is not one finite number >= 0 per sample
+    """
+    if error.shape != (batch_size,) or error.requires_grad:
+        kind = f"of shape {tuple(error.shape)}" + (" with a gradient" if error.requires_grad else "")
+        raise ValueError(
+            f"the SRL head returned an error {kind} for {batch_size} samples, but SRLOutput.error is one detached "
+            f"number per sample, shape ({batch_size},): average over all other dimensions, and detach()."
+        )
+    if look and not (th.isfinite(error).all() and (error >= 0).all()):
+        raise ValueError(
+            f"the SRL head returned errors from {float(error.min())} to {float(error.max())}, but SRLOutput.error must "
+            "be finite and >= 0: fix the head's loss()."
+        )
+
+
 def check_rewards(rewards: np.ndarray, timestep: int) -> None:
     """
     :param rewards: Rewards of one step, [n_envs]
@@ -178,8 +202,10 @@ def _check_integer(name: str, value: Any, low: int) -> None:
 
 def _check_ent_coef(ent_coef: Any) -> None:
     initial: Any = ent_coef
-    if isinstance(ent_coef, str) and ent_coef.startswith("auto"):
-        initial = ent_coef.removeprefix("auto").removeprefix("_") or 1.0
+    if ent_coef == "auto":
+        initial = 1.0
+    elif isinstance(ent_coef, str) and ent_coef.startswith("auto_"):
+        initial = ent_coef.removeprefix("auto_")
     try:
         works = float(initial) > 0 or (not isinstance(ent_coef, str) and float(initial) == 0)
     except (TypeError, ValueError):

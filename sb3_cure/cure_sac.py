@@ -34,6 +34,7 @@ from sb3_cure.checks import (
     check_curious_agent,
     check_rewards,
     check_shared_encoder_space,
+    check_srl_error,
 )
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
@@ -131,17 +132,19 @@ class CuReSAC(SAC):
     :param curiosity_beta: beta, factor of the curious reward
     :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"``
     :param normalize_curiosity: Standardise the error by running statistics, clipped to +-5; False: the paper's letter
-    :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
+    :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free), or
+        ``"next_observation"``, for which the head gets the batch with the next observations as its observations
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000)
     :param actor_update_interval: Updates between two updates of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
-    :param update: ``"sequential"`` (Algorithm 1 to the letter) or ``"joint"`` (one encoder pass for all)
+    :param update: ``"joint"`` (one encoder pass for all, see ``EncoderOptimizer``) or ``"sequential"`` (a pass and a
+        step for each loss: Algorithm 1 to the letter)
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 where the hardware computes it natively
-    :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: each update is
-        made during the next step, so that actions come from a policy that is one update behind
+    :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: the updates of
+        one step are made during the next, so that actions come from a policy that is one step behind
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number; also the curious agent's
     :param ent_coef_lr_factor: Learning rate of the temperatures as a multiple of ``learning_rate``
     :param kwargs: The remaining arguments of ``stable_baselines3.SAC`` (``seed``, ``verbose``, ``policy_kwargs``, ...)
@@ -184,7 +187,7 @@ class CuReSAC(SAC):
         actor_update_interval: int = 2,
         target_update_interval: int = 2,
         encoder_tau: float = 0.05,
-        update: str = "sequential",
+        update: str = "joint",
         precision: str = "auto",
         overlap: bool = False,
         ent_coef: str | float = "auto_0.1",
@@ -239,6 +242,8 @@ class CuReSAC(SAC):
         self._warmed_up = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
+        if overlap is True and self.env is not None:
+            OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if _init_setup_model:
             self._setup_model()
 
@@ -253,8 +258,6 @@ class CuReSAC(SAC):
         check_arguments(self)
         self._metrics = Metrics()
         self._read_env_attributes()
-        if self.overlap and self.env is not None:
-            OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if self.is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
@@ -306,6 +309,13 @@ class CuReSAC(SAC):
     def _choose_replay_buffer(self) -> None:
         """Keep each frame once where the environment says that its observations are stacked frames."""
         frame_stack = self._env_attribute("frame_stack")
+        if self.env is not None and frame_stack is None and "frames_dir" in self.replay_buffer_kwargs:
+            if "frame_stack" not in self.replay_buffer_kwargs:
+                raise ValueError(
+                    f"replay_buffer_kwargs got frames_dir={str(self.replay_buffer_kwargs['frames_dir'])!r}, but the "
+                    "environment does not tell its frame_stack, without which frames cannot be told apart: use "
+                    "make_dmc_env or make_pixel_env, or add replay_buffer_class=FrameStackReplayBuffer and frame_stack."
+                )
         if self.replay_buffer_class is None and self.n_steps == 1 and frame_stack is not None:
             if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
                 self.replay_buffer_class = FrameStackReplayBuffer
@@ -490,7 +500,7 @@ class CuReSAC(SAC):
             updates = self.warmup_updates
             if updates is None:
                 updates = 0 if self.srl is None else get_srl_class(self.srl).warmup_updates
-            if updates > 0:
+            if updates > 0 and self.gradient_steps != 0:
                 if self.verbose >= 1:
                     print(f"{updates} updates on the {self.num_timesteps} agent steps of the random warm-up")
                 self.train(gradient_steps=updates, batch_size=self.batch_size)
@@ -502,7 +512,7 @@ class CuReSAC(SAC):
         :param gradient_steps: Number of updates
         :param batch_size: Transitions per update
         """
-        if self._overlapped is not None:
+        if self._overlapped is not None and self.num_timesteps < self._total_timesteps:
             self._overlapped.defer(partial(self._train, gradient_steps, batch_size))
         else:
             self._train(gradient_steps, batch_size)
@@ -584,6 +594,7 @@ class CuReSAC(SAC):
                 self.policy.encoder_optimizer.pull("srl", encoded.latents, latents.grad)
             if srl.optimizer is not None:
                 srl.optimizer.step()
+        check_srl_error(error, len(batch.observations), look=self._n_updates == 0)
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
@@ -677,7 +688,8 @@ class CuReSAC(SAC):
 
     @property
     def _in_srl_phase(self) -> bool:
-        return self.srl_schedule == "simultaneous" or self._n_updates // self.srl_period % 2 == 0
+        only_srl = self._collector == "random"
+        return only_srl or self.srl_schedule == "simultaneous" or self._n_updates // self.srl_period % 2 == 0
 
     @property
     def _in_rl_phase(self) -> bool:
@@ -729,8 +741,6 @@ class CuReSAC(SAC):
             self._overlapped = OverlappedVecEnv(self.env)
         try:
             super().learn(*arguments)
-            if self._overlapped is not None:
-                self._overlapped.finish()
         finally:
             self._overlapped = None
 

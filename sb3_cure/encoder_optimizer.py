@@ -20,8 +20,9 @@ class EncoderOptimizer:
     ``"sequential"`` (the paper's Algorithm 1): every source has its own pass through the encoder, its own Adam state
     and its own step, taken at once. ``"joint"``: all sources share one pass; the gradient of each is divided by its
     own running root-mean-square norm, and their sum goes back through the encoder once, for one step. Its learning rate
-    is multiplied by the square root of the number of sources n: Adam divides by the size of the sum, which for
-    uncorrelated gradients of equal size is sqrt(n) times that of each, so that the one step is what n Adams would make.
+    is multiplied by the square root of the number n of sources that pull in the update: Adam divides by the size of the
+    sum, which for uncorrelated gradients of equal size is sqrt(n) times that of each, so that the one step is what n
+    Adams would make.
 
     :param encoder: The shared encoder
     :param sources: Names of the losses that train it, e.g. ``("srl", "task", "curious")``
@@ -51,7 +52,7 @@ class EncoderOptimizer:
         self.weights: dict[str, float] = {}
         for source in sources:
             self.add_source(source)
-        self.set_learning_rate(lr)
+        self.learning_rate = lr
         self._pulls: dict[str, th.Tensor] = {}
         self._norms: dict[str, th.Tensor] = {}
         self._latents: th.Tensor | None = None
@@ -116,6 +117,7 @@ class EncoderOptimizer:
         self.gradient_norms, self._norms = self._norms, {}
         if self.mode == "joint" and self._latents is not None:
             optimizer = self.optimizers["joint"]
+            self._set_rate(optimizer, self.learning_rate * len(self._pulls) ** 0.5)
             optimizer.zero_grad()
             self._latents.backward(th.stack(list(self._pulls.values())).sum(dim=0))
             optimizer.step()
@@ -130,11 +132,14 @@ class EncoderOptimizer:
         """
         :param learning_rate: New learning rate of all sources
         """
-        if self.mode == "joint":
-            learning_rate *= len(self.weights) ** 0.5
+        self.learning_rate = learning_rate
         for optimizer in self.optimizers.values():
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate
+            self._set_rate(optimizer, learning_rate)
+
+    @staticmethod
+    def _set_rate(optimizer: th.optim.Optimizer, learning_rate: float) -> None:
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate
 
     def state_dict(self) -> dict[str, Any]:
         """

@@ -18,7 +18,7 @@ class OverlappedVecEnv(VecEnvWrapper):
         if isinstance(venv.unwrapped, DummyVecEnv):
             raise ValueError(
                 "overlap=True was given with environments in this process (DummyVecEnv), where stepping and updating "
-                "cannot overlap: use make_vec_env(..., vec_env_cls=SubprocVecEnv), or leave overlap=False."
+                "cannot overlap: use make_vec_env(..., vec_env_cls=SubprocVecEnv), or overlap=False."
             )
         super().__init__(venv)
         self._work: list[Callable[[], None]] = []
@@ -47,7 +47,12 @@ class OverlappedVecEnv(VecEnvWrapper):
         :param actions: One per environment
         """
         self.venv.step_async(actions)
-        self.finish()
+        try:
+            self.finish()
+        except BaseException:
+            # Ctrl-C, say: the results under way must not be taken for those of a later step.
+            self.venv.step_wait()
+            raise
 
     def step_wait(self) -> VecEnvStepReturn:
         """

@@ -138,7 +138,7 @@ class CuRePolicy(SACPolicy):
         curious: bool = False,
         curiosity_kwargs: dict[str, Any] | None = None,
         encoder_sources: tuple[str, ...] = ("task",),
-        update: str = "sequential",
+        update: str = "joint",
         acting: str = "actor",
     ):
         if not (normalize_images and share_encoder) or use_sde:

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cure import CuReSAC
-from sb3_cure.srl import RAE
+from sb3_cure.srl import RAE, SRLOutput
 
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
@@ -250,6 +250,21 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         FakeEnv(),
         {"ent_coef": "auto_0"},
         "ent_coef is 'auto_0', but it must be 'auto', 'auto_<initial temperature > 0>'.*change ent_coef",
+    ),
+    "ent_coef without underscore": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"ent_coef": "auto0.5"},
+        "ent_coef is 'auto0.5', but it must be 'auto', 'auto_<initial",
+    ),
+    "ent_coef without number": ("CnnPolicy", FakeEnv(), {"ent_coef": "auto_"}, "ent_coef is 'auto_', but it must be"),
+    "task that is no boolean": ("CnnPolicy", FakeEnv(), {"task": None}, "task is None, but it must be True or False"),
+    "overlap in words": ("CnnPolicy", FakeEnv(), {"overlap": "no"}, "overlap is 'no', but it must be True or False"),
+    "frames on disk of an environment without frame_stack": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"replay_buffer_kwargs": {"frames_dir": "."}},
+        r"frames_dir='\.', but the environment does not tell its frame_stack",
     ),
     "ent_coef in words": (
         "CnnPolicy",
@@ -525,3 +540,25 @@ def test_a_schedule_that_leaves_its_range_stops_the_run() -> None:
     with pytest.raises(ValueError, match=r"curiosity_prob is 1\.\d+ \(progress remaining 0\.\d+\), but .*\[0, 1\]"):
         model.learn(100)
     assert 50 <= model.num_timesteps < 100
+
+
+@pytest.mark.parametrize(
+    "error, sentence",
+    [
+        (lambda e: e.unsqueeze(1), r"returned an error of shape \(8, 1\) for 8 samples, .* shape \(8,\)"),
+        (lambda e: e.mean(), r"returned an error of shape \(\) for 8 samples"),
+        (lambda e: e.clone().requires_grad_(), r"of shape \(8,\) with a gradient .* detach\(\)"),
+        (lambda e: e - 1e6, r"returned errors from -.* but SRLOutput\.error must be finite and >= 0"),
+        (lambda e: e * float("nan"), r"returned errors from nan to nan"),
+    ],
+)
+def test_errors_of_a_users_head(error: Callable[[Any], Any], sentence: str) -> None:
+    """Whatever is not one number per sample would train the curious agent on something else, silently."""
+
+    class Wrong(RAE):
+        def loss(self, batch: Any, latents: Any) -> Any:
+            loss, right = super().loss(batch, latents)
+            return SRLOutput(loss, error(right))
+
+    with pytest.raises(ValueError, match=sentence):
+        tiny_model("CnnPolicy", PixelBox(), srl=Wrong).learn(12)

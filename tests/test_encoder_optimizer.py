@@ -138,6 +138,19 @@ def test_joint_step_is_as_long_as_the_steps_of_an_adam_per_source() -> None:
     assert moved["joint"] == pytest.approx(moved["sequential"], rel=0.05)
 
 
+def test_joint_rate_counts_the_sources_that_pull() -> None:
+    """In a phase where one source pulls alone, its step is an Adam's own, however many others there are."""
+    moved = []
+    for sources in (("srl",), SOURCES):
+        encoder, optimizer = make("joint", sources)
+        for step in range(5):
+            latents = encoder(inputs(step))
+            optimizer.pull("srl", latents, gradient("srl", latents))
+            optimizer.step()
+        moved.append(values(encoder))
+    assert th.equal(moved[0], moved[1])
+
+
 @pytest.mark.parametrize("mode", ["sequential", "joint"])
 def test_other_optimizers_and_their_arguments(mode: str) -> None:
     """The class and all of its arguments are those given: weight decay alone shrinks an encoder without gradients."""

@@ -283,10 +283,7 @@ ALONE: dict[str, tuple[dict[str, Any], int, tuple[str, ...]]] = {
 @UPDATES
 @pytest.mark.parametrize("loss", ALONE)
 def test_size_of_the_encoders_step(loss: str, update: str) -> None:
-    """Gradient descent on the one loss that trains it, back to the first convolution.
-
-    Joint: scaled to unit norm, at a learning rate multiplied by the root of the number of sources.
-    """
+    """Gradient descent on the one loss that trains it, back to the first convolution; joint: scaled to unit norm."""
     kwargs, n_updates, agents = ALONE[loss]
     model = filled_model(srl_schedule="alternating", update=update, **kwargs)
     prepare(model)
@@ -297,9 +294,7 @@ def test_size_of_the_encoders_step(loss: str, update: str) -> None:
     train_once(model, n_updates)
     norm = 1.0
     if update == "joint":
-        optimizer = model.policy.encoder_optimizer
-        (norm,) = map(float, optimizer.gradient_norms.values())
-        norm /= len(optimizer.weights) ** 0.5
+        (norm,) = map(float, model.policy.encoder_optimizer.gradient_norms.values())
     for parameter, old, gradient in zip(encoder, before, gradients, strict=True):
         expected = old - 0.1 * gradient / norm
         distance = float((expected - old).norm())

@@ -225,7 +225,7 @@ def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     assert moved and all("target" in name for name in moved)
 
 
-@pytest.mark.parametrize("change", [dict(update="joint"), dict(curiosity_encoder_grad=False)], ids=str)
+@pytest.mark.parametrize("change", [dict(update="sequential"), dict(curiosity_encoder_grad=False)], ids=str)
 def test_loading_into_another_algorithm_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     """The encoder's optimiser states belong to the sources and the mode that they were made with."""
     tiny_model("CnnPolicy", PixelBox()).learn(12).save(tmp_path / "model")

@@ -2,12 +2,14 @@
 
 import copy
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 from envs_for_tests import PixelBox, tiny_model
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -62,8 +64,57 @@ def test_overlapped_updates_lag_one_step_behind() -> None:
         venv.close()
 
 
-def test_overlap_needs_worker_processes() -> None:
-    """Refused by the constructor, in one sentence; `load` without environments is fine."""
+def test_interrupted_overlap_leaves_usable_environments() -> None:
+    """Ctrl-C falls into an update, while the workers step: the next `learn` goes on as if nothing had happened."""
+    venv = SubprocVecEnv([PixelBox])
+    try:
+        model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0)
+        step = model._gradient_step
+
+        def interrupted(batch: Any) -> None:
+            raise KeyboardInterrupt
+
+        model._gradient_step = interrupted
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(20)
+        model._gradient_step = step
+        model.learn(20, reset_num_timesteps=False)
+        assert model._n_updates == 20 and not venv.waiting
+    finally:
+        venv.close()
+
+
+def test_callbacks_at_the_end_see_all_updates() -> None:
+    """What is saved when training ends holds the last step's updates and the burst."""
+
+    class AtTheEnd(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_training_end(self) -> None:
+            self.n_updates = self.model._n_updates
+
+    venv = SubprocVecEnv([PixelBox])
+    try:
+        callback = AtTheEnd()
+        tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=5).learn(12, callback=callback)
+        assert callback.n_updates == 5 + 2
+    finally:
+        venv.close()
+
+
+def test_overlap_needs_worker_processes(tmp_path: Path) -> None:
+    """Refused by the constructor and by `learn`, in one sentence; an archive loads with any environment, to predict."""
+    venv = SubprocVecEnv([PixelBox])
+    try:
+        tiny_model("CnnPolicy", venv, overlap=True).save(tmp_path / "model")
+    finally:
+        venv.close()
+    loaded = CuReSAC.load(tmp_path / "model", env=PixelBox())
+    assert loaded.overlap
+    with pytest.raises(ValueError, match="overlap=True was given with environments in this process"):
+        loaded.learn(5)
+    CuReSAC.load(tmp_path / "model", env=PixelBox(), overlap=False).learn(5)
     sentence = r"overlap=True was given with environments in this process .* vec_env_cls=SubprocVecEnv"
     for env in (PixelBox(), DummyVecEnv([PixelBox])):
         with pytest.raises(ValueError, match=sentence):

@@ -42,7 +42,6 @@ SETTINGS: dict[str, Any] = dict(
     gamma=0.98,
     tau=0.02,
     target_update_interval=1,
-    update="joint",
     policy_kwargs=dict(net_arch=[256, 256], features_extractor_kwargs=dict(n_filters=16)),
 )
 TOTAL_STEPS = 12_000
@@ -113,7 +112,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=10, help="training ends after so many minutes")
     parser.add_argument("--steps", type=int, default=TOTAL_STEPS, help="agent steps (environment steps / 8)")
-    parser.add_argument("--update", choices=("sequential", "joint"), help="instead of the demo's own, to compare")
     options = parser.parse_args(arguments)
     if options.minutes <= 0 or options.steps < 1:
         parser.error(f"--minutes is {options.minutes} and --steps {options.steps}, but both must be positive")
@@ -123,8 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     env = make_dmc_env(DOMAIN, TASK, seed=options.seed, **ENV_KWARGS)
     eval_env = make_dmc_env(DOMAIN, TASK, render_mode="rgb_array", **ENV_KWARGS)
     action_repeat = env.get_wrapper_attr("action_repeat")
-    settings = SETTINGS if options.update is None else {**SETTINGS, "update": options.update}
-    model = CuReSAC("CnnPolicy", env, seed=options.seed, **settings)
+    model = CuReSAC("CnnPolicy", env, seed=options.seed, **SETTINGS)
     curve = RecordCurve(
         eval_env, max(options.steps // EVALUATIONS, 1), n_episodes=3, seed=10_000, action_repeat=action_repeat
     )
@@ -147,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         returns[actor] = [episode.total_reward for episode in episodes]
     random_return, final_return = float(np.mean(returns["random"])), float(np.mean(returns["task"]))
 
-    title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({settings['srl']}), seed {options.seed}"
+    title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({SETTINGS['srl']}), seed {options.seed}"
     write_csv(options.out / "learning_curve.csv", curve.rows)
     plots.learning_curve(options.out / "learning_curve.png", curve.rows, random_return, title)
     write_csv(
@@ -184,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "final_return_std": round(float(np.std(returns["task"])), 1),
         "random_return_mean": round(random_return, 1),
         "ratio": round(final_return / random_return, 2),
-        "settings": settings,
+        "settings": SETTINGS,
         "environment": ENV_KWARGS,
         "versions": {
             "sb3_cure": sb3_cure.__version__,

@@ -28,7 +28,8 @@ class SRLHead(nn.Module):
     A head owns its parameters (trained by its loss alone) but not the encoder, whose latents it is given. ``batch`` is
     always SB3's ``ReplayBufferSamples`` with observations as stored: images unscaled in 0-255.
 
-    :param encoder: The shared encoder; read ``encoder.features_dim``, or encode with ``self.encode``
+    :param encoder: The shared encoder; read ``encoder.features_dim``. Only the latents that ``loss`` is given
+        carry its gradient to the encoder; what else is encoded with it counts as constant
     :param observation_space: Space of the stored observations
     """
 
