@@ -74,7 +74,7 @@ check: .venv/.installed  ## lint, formatting and types
 	$(RUN) ruff format --check
 	$(RUN) mypy
 
-bench: gl  ## measure speed and memory and write results/benchmarks/ (some 20 minutes; leave the machine alone)
+bench: gl  ## measure speed and memory and write results/benchmarks/ (half an hour; leave the machine alone)
 	$(RUN) benchmarks
 
 notebooks: gl  ## execute the notebooks in place

@@ -6,12 +6,16 @@ python -m benchmarks --out results/benchmarks
 import argparse
 import json
 import re
+import resource
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from benchmarks import collection, growth, numerics, rendering, replay, update
-from benchmarks.harness import describe_machine, peak_memory_mb
+from benchmarks.harness import describe_machine
 from sb3_cure.allocator import tune_allocator
 
 
@@ -40,47 +44,59 @@ def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
     return lines
 
 
-def parts(repeats: int) -> dict[str, Callable[[], dict[str, Any]]]:
+def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, Any]]]:
     """
     :param repeats: Rounds of the comparisons
+    :param disk: Directory for the buffer of a million transitions (22 GB), or None
     :return: What can be measured, by name, in the order of the report
     """
     return {
-        "update": lambda: update.measure(repeats),
-        "update_by_phase": lambda: {head: update.breakdown(srl=head) for head in ("rae", "curl")},
+        "update": partial(update.measure, repeats),
+        "update_by_phase": update.breakdowns,
         "replay": replay.measure,
         "rendering": rendering.measure,
         "end_to_end": collection.measure,
         "growth_with_batch": growth.by_batch,
         "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,
-        "buffer_on_disk": lambda: growth.on_disk(1_000_000, "."),
         "bfloat16_against_float32": numerics.measure,
+        **({"buffer_on_disk": partial(growth.on_disk, 1_000_000, disk)} if disk is not None else {}),
     }
 
 
+def _run(part: str, repeats: int, disk: str | None) -> tuple[dict[str, Any], float]:
+    """A part's results and the peak of the process's memory, MiB."""
+    tune_allocator()
+    results = parts(repeats, disk)[part]()
+    return results, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def main() -> None:
-    """Run the benchmarks."""
-    names = list(parts(1))
+    """Run the benchmarks, each part in a process of its own."""
+    names = list(parts(1, "."))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder to write")
     parser.add_argument("--repeats", type=int, default=7, help="rounds of each comparison (default: 7)")
     parser.add_argument("--only", nargs="+", choices=names, help="measure these anew and keep the rest of the report")
+    parser.add_argument(
+        "--disk", help="directory with 22 GB of room: also measure a buffer of a million transitions there"
+    )
     options = parser.parse_args()
-    tune_allocator()
     machine = describe_machine()
     processor = machine["gpu"] or machine["processor"]
     name = re.sub(r"[^a-z0-9]+", "-", f"{processor}-{machine['cores']}-cores".lower()).strip("-")
     path = options.out / f"{name}.json"
-    old = json.loads(path.read_text()) if options.only and path.exists() else {}
+    measured = json.loads(path.read_text()) if options.only and path.exists() else {}
     options.out.mkdir(parents=True, exist_ok=True)
-    for part, measure in parts(options.repeats).items():
+    for part in parts(1, options.disk):
         if options.only is None or part in options.only:
             print(f"{part} ...", flush=True)
-            old[part] = {**measure(), "peak_memory_mb": round(peak_memory_mb())}
-            results = {"machine": machine, **{key: old[key] for key in names if key in old}}
-            path.write_text(json.dumps(results, indent=2) + "\n")
-            path.with_suffix(".md").write_text("\n".join(["# Benchmarks", "", *to_markdown(results, 2)]))
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+                results, peak = process.submit(_run, part, options.repeats, options.disk).result()
+            measured[part] = {"peak_memory_mb": round(peak), **results}
+            report = {"machine": machine, **{key: measured[key] for key in names if key in measured}}
+            path.write_text(json.dumps(report, indent=2) + "\n")
+            path.with_suffix(".md").write_text("\n".join(["# Benchmarks", "", *to_markdown(report, 2)]))
     print(f"Wrote {path} and {path.with_suffix('.md').name}")
 
 

@@ -1,6 +1,7 @@
 """How time grows with the batch, the image and the buffer, and memory with a buffer that fills."""
 
 import time
+from functools import partial
 from typing import Any
 
 from benchmarks.harness import (
@@ -23,7 +24,7 @@ def by_batch(sizes: tuple[int, ...] = (32, 64, 128, 256), repeats: int = 3) -> d
     :return: Time of an update by batch size
     """
     model = make_model(warmup_updates=0)
-    variants = {str(size): lambda size=size: model.train(1, size) for size in sizes}
+    variants = {str(size): partial(model.train, 1, size) for size in sizes}
     return {name: summary(values) for name, values in interleaved(variants, repeats).items()}
 
 
@@ -36,7 +37,7 @@ def by_image(sizes: tuple[int, ...] = (36, 48, 64, 84), repeats: int = 3) -> dic
     variants = {}
     for size in sizes:
         model = make_model(env_kwargs=dict(image_size=size), warmup_updates=0)
-        variants[str(size)] = lambda model=model: model.train(1, 128)
+        variants[str(size)] = partial(model.train, 1, 128)
     return {name: summary(values) for name, values in interleaved(variants, repeats).items()}
 
 
@@ -58,7 +59,7 @@ def by_buffer(sizes: tuple[int, ...] = (1000, 10_000, 80_000), repeats: int = 7)
             for _ in range(-(-size // len(transitions))):
                 fill(buffer, transitions)
             grown.append(round(memory_mb() - before))
-        times = interleaved({"sample": lambda b=buffer: b.sample(128)}, repeats, calls=5)
+        times = interleaved({"sample": partial(buffer.sample, 128)}, repeats, calls=5)
         results[f"{size} transitions"] = {
             **summary(times["sample"]),
             "full_mb": grown[0],
@@ -72,22 +73,27 @@ def on_disk(size: int, directory: str) -> dict[str, Any]:
     """
     :param size: Capacity of a buffer whose frames lie in a file
     :param directory: Where
-    :return: Time to fill it, time of ``sample(128)`` and the memory that the process itself needed, MiB
+    :return: Time to fill it, time of ``sample(128)``, and the memory that the process itself needs beside the file,
+        when the buffer is full for the first time and after another round, MiB
     """
     env = make_env()
     transitions = stream()
     before = anonymous_memory_mb()
     buffer = FrameStackReplayBuffer(size, env.observation_space, env.action_space, frame_stack=3, frames_dir=directory)
-    start = time.perf_counter()
-    for _ in range(-(-size // len(transitions))):
-        fill(buffer, transitions)
-    filling = time.perf_counter() - start
-    times = interleaved({"sample": lambda: buffer.sample(128)}, 7, calls=5)
+    seconds, grown = [], []
+    for _ in range(2):
+        start = time.perf_counter()
+        for _ in range(-(-size // len(transitions))):
+            fill(buffer, transitions)
+        seconds.append(round(time.perf_counter() - start))
+        grown.append(round(anonymous_memory_mb() - before))
+    times = interleaved({"sample": partial(buffer.sample, 128)}, 7, calls=5)
     return {
         f"{size} transitions": {
             **summary(times["sample"]),
-            "seconds_to_fill": round(filling, 1),
             "file_gb": round(buffer.frames.nbytes / 1e9, 2),
-            "own_memory_mb": round(anonymous_memory_mb() - before),
+            "seconds_to_fill": seconds[0],
+            "own_memory_full_mb": grown[0],
+            "own_memory_one_round_later_mb": grown[1],
         }
     }

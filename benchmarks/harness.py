@@ -2,11 +2,11 @@
 
 import os
 import platform
-import resource
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium as gym
@@ -27,7 +27,7 @@ BATCH_SIZE = 128
 N_FRAMES = 600
 
 
-def interleaved(variants: dict[str, Callable[[], object]], repeats: int, calls: int = 2) -> Times:
+def interleaved(variants: Mapping[str, Callable[[], object]], repeats: int, calls: int = 2) -> Times:
     """Time several things in turn, so that a slow minute of the machine hits all of them.
 
     :param variants: What to call, by name
@@ -71,13 +71,6 @@ def summary(seconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def peak_memory_mb() -> float:
-    """
-    :return: Largest resident memory of this process so far, MiB
-    """
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def memory_mb() -> float:
     """
     :return: Resident memory of this process, MiB
@@ -93,10 +86,10 @@ def anonymous_memory_mb() -> float:
     return (memory.rss - memory.shared) / 2**20
 
 
-def _processor() -> str:
+def _processor(field: str = "model name") -> str:
     try:
         with open("/proc/cpuinfo") as file:
-            return next(line.split(":")[1].strip() for line in file if line.startswith("model name"))
+            return next(line.split(":")[1].strip() for line in file if line.startswith(field))
     except (OSError, StopIteration):
         return platform.processor()
 
@@ -109,12 +102,16 @@ def describe_machine() -> dict[str, Any]:
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)),
         "torch_threads": th.get_num_threads(),
+        "memory_gib": round(psutil.virtual_memory().total / 2**30),
         "instructions": th.backends.cpu.get_cpu_capability(),
+        "bf16_instructions": " ".join(flag for flag in ("avx512_bf16", "amx_bf16") if flag in _processor("flags"))
+        or None,
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "system": f"{platform.system()} {platform.machine()}",
         "versions": {
             "python": platform.python_version(),
             "torch": th.__version__,
+            "mujoco": version("mujoco"),
             "stable_baselines3": stable_baselines3.__version__,
             "sb3_cure": sb3_cure.__version__,
         },

@@ -34,7 +34,7 @@ def measure(updates: int = 2000, tail: int = 200, seeds: tuple[int, ...] = (0, 1
     results: dict[str, Any] = {}
     for head in ("rae", "curl"):
         values: dict[str, list[list[float]]] = {"fp32": [], "bf16": []}
-        arguments = dict(srl=head, env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
+        arguments: dict[str, Any] = dict(srl=head, env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
         state = copy.deepcopy(make_model(**arguments).get_parameters())
         for seed in seeds:
             for precision, found in values.items():

@@ -9,6 +9,7 @@ import copy
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
@@ -16,11 +17,11 @@ from torch.nn import functional as F
 def _init(layer: nn.Module) -> None:
     if isinstance(layer, nn.Linear):
         nn.init.orthogonal_(layer.weight)
-        nn.init.zeros_(layer.bias)
+        nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
     elif isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
         nn.init.zeros_(layer.weight)
         nn.init.orthogonal_(layer.weight.data[:, :, 1, 1], nn.init.calculate_gain("relu"))
-        nn.init.zeros_(layer.bias)
+        nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
 
 
 class _Encoder(nn.Module):
@@ -94,15 +95,16 @@ class PlainSacAe:
     :param channels: Channels of the observations
     :param actions: Size of the action
     :param hidden: Hidden units of actor and critics
+    :param device: Where to compute
     """
 
-    def __init__(self, channels: int = 9, actions: int = 1, hidden: int = 1024):
-        self.actor = _Actor(channels, actions, hidden).apply(_init)
-        self.critic = _Critic(channels, actions, hidden).apply(_init)
+    def __init__(self, channels: int = 9, actions: int = 1, hidden: int = 1024, device: th.device | str = "cpu"):
+        self.actor = _Actor(channels, actions, hidden).apply(_init).to(device)
+        self.critic = _Critic(channels, actions, hidden).apply(_init).to(device)
         self.critic_target = copy.deepcopy(self.critic)
         self.actor.encoder.convs = self.critic.encoder.convs
-        self.decoder = _Decoder(channels).apply(_init)
-        self.log_alpha = th.tensor(np.log(0.1), requires_grad=True)
+        self.decoder = _Decoder(channels).apply(_init).to(device)
+        self.log_alpha = th.tensor(np.log(0.1), device=device, requires_grad=True)
         self.target_entropy = -float(actions)
         adam = th.optim.Adam
         self.actor_optimizer = adam(self.actor.parameters(), lr=1e-3)
@@ -112,19 +114,13 @@ class PlainSacAe:
         self.decoder_optimizer = adam(self.decoder.parameters(), lr=1e-3, weight_decay=1e-7)
         self.step = 0
 
-    def update(
-        self, obs: np.ndarray, actions: np.ndarray, rewards: np.ndarray, next_obs: np.ndarray, not_done: np.ndarray
-    ) -> None:
+    def update(self, batch: ReplayBufferSamples) -> None:
         """One update of everything.
 
-        :param obs: uint8 [B, C, 84, 84]
-        :param actions: [B, actions]
-        :param rewards: [B, 1]
-        :param next_obs: uint8 [B, C, 84, 84]
-        :param not_done: [B, 1]
+        :param batch: Samples of the replay buffer, observations uint8 [B, C, 84, 84]
         """
-        images, next_images = th.as_tensor(obs).float(), th.as_tensor(next_obs).float()
-        self._update_critic(images, th.as_tensor(actions), th.as_tensor(rewards), next_images, th.as_tensor(not_done))
+        images, next_images = batch.observations.float(), batch.next_observations.float()
+        self._update_critic(images, batch.actions, batch.rewards, next_images, 1 - batch.dones)
         if self.step % 2 == 0:
             self._update_actor(images)
             self._update_targets()

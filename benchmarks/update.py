@@ -21,16 +21,9 @@ def _train_call(model: Any) -> Callable[[], object]:
 
 
 def _yardstick_call() -> Callable[[], object]:
-    buffer = make_model(srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True)).replay_buffer
-    agent = PlainSacAe(actions=1)
-
-    def update() -> None:
-        batch = buffer.sample(BATCH_SIZE)
-        arrays = [field.numpy() for field in batch if field is not None]
-        observations, actions, next_observations, dones, rewards = arrays
-        agent.update(observations, actions, rewards, next_observations, 1 - dones)
-
-    return update
+    buffer = make_model().replay_buffer
+    agent = PlainSacAe(actions=1, device=buffer.device)
+    return lambda: agent.update(buffer.sample(BATCH_SIZE))
 
 
 def measure(repeats: int = 7, precisions: tuple[str, ...] = ("fp32", "bf16")) -> dict[str, Any]:
@@ -137,3 +130,10 @@ def breakdown(updates: int = 20, **kwargs: Any) -> dict[str, float]:
     with timer.phase("rest"):
         model.train(updates, BATCH_SIZE)
     return {name: round(1e3 * value / updates, 2) for name, value in timer.seconds.items()}
+
+
+def breakdowns() -> dict[str, Any]:
+    """
+    :return: Result of ``breakdown`` by head, in the default mode
+    """
+    return {head: breakdown(srl=head) for head in ("rae", "curl")}

@@ -47,9 +47,9 @@ class FrameStackReplayBuffer(ReplayBuffer):
         as an infinite horizon task
     :param frame_stack: Number of frames in one observation, which its number of channels cannot tell
     :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
-        a million transitions of 84x84 take 22 GB. The room is reserved at once and given back at the end
-    :raises ValueError: If the observation space is not made of ``frame_stack`` uint8 images, channels first, if
-        ``optimize_memory_usage`` is set, or if ``frames_dir`` cannot hold the frames
+        a million transitions of 84x84 take 22 GB. The room is reserved by the first ``add`` and given back at the end
+    :raises ValueError: If the observation space is not made of ``frame_stack`` uint8 images, channels first, or if
+        ``optimize_memory_usage`` is set
     """
 
     # Room for the one frame that every episode has more than steps; with the index table and the action this stays
@@ -96,7 +96,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.frames_dir = frames_dir
         # Fresh zeros cost no memory until they are written to
         rows = (self.buffer_size, n_envs)
-        self.frames = self._room_for_frames()
+        # A file is reserved when it is needed: a model that is loaded to act needs none.
+        self.frames = np.zeros((0 if frames_dir else self.frame_capacity, *self.frame_shape), dtype=np.uint8)
         self.frame_slots = np.zeros((*rows, 2, frame_stack), dtype=np.int32)
         self.oldest_frame = np.zeros(self.buffer_size, dtype=np.int64)
         self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
@@ -106,19 +107,16 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self._tails = np.zeros((n_envs, frame_stack), dtype=np.int64)
         self.reset()
 
-        needed = self.nbytes - (0 if frames_dir is None else self.frames.nbytes)
-        if psutil is not None and needed > (mem_available := psutil.virtual_memory().available):
+        if psutil is not None and self.nbytes > (mem_available := psutil.virtual_memory().available):
             warnings.warn(
                 "This system does not have apparently enough memory to store the complete "
-                f"replay buffer {needed / 1e9:.2f}GB > {mem_available / 1e9:.2f}GB",
+                f"replay buffer {self.nbytes / 1e9:.2f}GB > {mem_available / 1e9:.2f}GB",
                 stacklevel=2,
             )
 
-    def _room_for_frames(self) -> npt.NDArray[np.uint8]:
-        """Zeros for all frames, in memory or in a file."""
+    def _file_for_frames(self) -> npt.NDArray[np.uint8]:
+        """Zeros for all frames, in an unnamed file that ends with this array."""
         shape = (self.frame_capacity, *self.frame_shape)
-        if self.frames_dir is None:
-            return np.zeros(shape, dtype=np.uint8)
         size = math.prod(shape)
         try:
             with tempfile.TemporaryFile(dir=self.frames_dir) as file:
@@ -169,8 +167,10 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param reward: Rewards, [n_envs]
         :param done: Whether the episode ended, [n_envs]
         :param infos: One dictionary per environment; ``TimeLimit.truncated`` is used
-        :raises ValueError: If observations have another dtype or shape
+        :raises ValueError: If observations have another dtype or shape, or ``frames_dir`` cannot hold all frames
         """
+        if len(self.frames) == 0:
+            self.frames = self._file_for_frames()
         stacks, next_stacks = self._split(obs, "obs"), self._split(next_obs, "next_obs")
         action = np.asarray(action).reshape((self.n_envs, self.action_dim))
 
@@ -297,8 +297,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         stored: npt.NDArray[np.uint8] = state["frames"]
         if self.frames_dir is None:
             self.frames = _grown(stored, self.frame_capacity)
-        else:
-            self.frames = self._room_for_frames()
+        elif len(stored) > 0:
+            self.frames = self._file_for_frames()
             self.frames[: len(stored)] = stored
 
 

@@ -562,7 +562,6 @@ def test_frames_in_a_file_are_the_same_frames(tmp_path: Path) -> None:
     arguments: dict[str, Any] = dict(device="cpu", frame_stack=2)
     in_memory = FrameStackReplayBuffer(20, space, action_space, **arguments)
     in_file = FrameStackReplayBuffer(20, space, action_space, frames_dir=tmp_path, **arguments)
-    assert isinstance(in_file.frames, np.memmap)
     rng = np.random.default_rng(0)
     stack = rng.integers(0, 256, (1, 6, 8, 8), np.uint8)
     for step in range(33):
@@ -570,6 +569,7 @@ def test_frames_in_a_file_are_the_same_frames(tmp_path: Path) -> None:
         for buffer in (in_memory, in_file):
             buffer.add(stack, following, np.ones((1, 2)), np.array([step]), np.array([False]), [{}])
         stack = following
+    assert isinstance(in_file.frames, np.memmap)
     copied = pickle.loads(pickle.dumps(in_file))
     assert isinstance(copied.frames, np.memmap)
     batches = []
@@ -587,12 +587,15 @@ def test_frames_in_a_file_are_the_same_frames(tmp_path: Path) -> None:
 
 
 def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
-    """Known before training, because a full disk would kill the process later."""
+    """Known at the first step, because a full disk would kill the process later; nothing is needed to only act."""
     space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
-    action_space = spaces.Box(-1, 1, (2,), np.float32)
+    stack = np.zeros((1, 6, 84, 84), np.uint8)
+    transition: tuple[Any, ...] = (stack, stack, np.ones((1, 2)), np.zeros(1), np.zeros(1), [{}])
+    nowhere = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "none")
     with pytest.raises(
         ValueError, match=r"frames_dir is '.*/none', but .* GB for frames cannot be reserved there \(No"
     ):
-        FrameStackReplayBuffer(20, space, action_space, frame_stack=2, frames_dir=tmp_path / "none")
+        nowhere.add(*transition)
+    huge = FrameStackReplayBuffer(10**8, space, ACTIONS, frame_stack=2, frames_dir=tmp_path)
     with pytest.raises(ValueError, match="name a directory on a disk with room, or make buffer_size smaller"):
-        FrameStackReplayBuffer(10**9, space, action_space, frame_stack=2, frames_dir=tmp_path)
+        huge.add(*transition)
