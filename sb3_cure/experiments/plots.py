@@ -8,6 +8,7 @@ import matplotlib
 matplotlib.use("Agg")  # Files only: works without a screen.
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import EngFormatter
 
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
 
@@ -91,8 +92,11 @@ def update_modes(
                 axes.plot(steps, [row[column] for row in rows], color=colors[mode], alpha=0.3, linewidth=0.8)
             mean = np.mean([[row[column] for row in rows] for rows in seeds.values()], axis=0)
             axes.plot(steps, mean, color=colors[mode], linewidth=2, label=f"{mode} (n={len(seeds)})")
-            axes.set(xlabel="environment steps", ylabel=label, title=head, ylim=(0, None))
+            axes.set(xlabel="environment steps", ylabel=label, title=head)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.grid(alpha=0.3)
+    for axes in grid.flat:
+        axes.set_ylim(0, None)  # last: it stops the upper limit from following the curves
     grid[0, 0].legend()
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -9,6 +9,7 @@ At the end ``curves.png`` and ``table.md`` are drawn from all cells in the folde
 
 import argparse
 import csv
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch as th
 
+import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.evaluation import run_episodes
 from sb3_cure.experiments import plots
@@ -29,7 +31,11 @@ HEADS: dict[str, dict[str, Any]] = {
 }
 EVALUATIONS = 10
 #: The numbers of one arm: column of the CSV, its name, decimals
-MEASURES = {"task_return": ("return", 0), "srl_loss": ("SRL loss", 5), "random_srl_error": ("SRL error", 5)}
+MEASURES = {
+    "task_return": ("return", 0),
+    "srl_loss": ("SRL loss", 5),
+    "random_srl_error": ("SRL error, random policy", 5),
+}
 
 Rows = list[dict[str, float]]
 
@@ -60,6 +66,21 @@ class RecordUpdates(RecordCurve):
         return row
 
 
+def settings_of(srl: str, steps: int) -> dict[str, Any]:
+    """
+    :param srl: A key of ``HEADS``
+    :param steps: Agent steps of each cell
+    :return: What all cells of a head have in common
+    """
+    return {
+        "task": f"{DOMAIN}-{TASK}",
+        "environment": ENV_KWARGS,
+        "agent_steps": steps,
+        "arguments": {**SETTINGS, **HEADS[srl]},
+        "version": sb3_cure.__version__,
+    }
+
+
 def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
     """Train one arm with one seed.
 
@@ -79,7 +100,6 @@ def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
         action_repeat=env.get_wrapper_attr("action_repeat"),
     )
     model.learn(steps, callback=curve)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_csv(path, curve.rows)
 
 
@@ -146,6 +166,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--steps is {options.steps}, but the curve has {EVALUATIONS} points: give at least as many steps")
     heads: Iterable[str] = [options.srl] if options.srl else HEADS
     for srl in heads:
+        settings = json.dumps(settings_of(srl, options.steps), indent=2) + "\n"
+        path = options.out / srl / "settings.json"
+        if path.exists() and path.read_text() != settings:
+            parser.error(
+                f"the cells of {path.parent} were run with other settings (see {path.name}), so that further ones "
+                "would not compare: choose another --out, or the --steps they were run with"
+            )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(settings)
         for seed in options.seeds:
             for mode in MODES:
                 path = options.out / srl / mode / f"seed{seed}.csv"
