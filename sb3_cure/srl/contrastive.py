@@ -157,8 +157,8 @@ class CURL(SRLHead):
             bank = self._keys(self._augment(negatives, th.Generator().manual_seed(1)))
             logits = th.cat([logits, weighted @ bank.T], dim=1)
         first = th.zeros(len(logits), dtype=th.long, device=logits.device)
-        # Rounding can leave a -0.0.
-        return F.cross_entropy(logits, first, reduction="none").clamp(min=0)
+        # Rounding can leave less than 0, or a -0.0.
+        return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
 
     @th.no_grad()
     def set_bank(self, observations: th.Tensor) -> None:
