@@ -6,17 +6,14 @@ python -m benchmarks --out results/benchmarks
 import argparse
 import json
 import re
-import resource
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks import collection, growth, numerics, rendering, replay, update
 from benchmarks.harness import describe_machine
-from sb3_cure.allocator import tune_allocator
+from benchmarks.parts import parts, run_part
 
 
 def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
@@ -44,33 +41,6 @@ def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
     return lines
 
 
-def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, Any]]]:
-    """
-    :param repeats: Rounds of the comparisons
-    :param disk: Directory for the buffer of a million transitions (22 GB), or None
-    :return: What can be measured, by name, in the order of the report
-    """
-    return {
-        "update": partial(update.measure, repeats),
-        "update_by_phase": update.breakdowns,
-        "replay": replay.measure,
-        "rendering": rendering.measure,
-        "end_to_end": collection.measure,
-        "growth_with_batch": growth.by_batch,
-        "growth_with_image": growth.by_image,
-        "growth_with_buffer": growth.by_buffer,
-        "bfloat16_against_float32": numerics.measure,
-        **({"buffer_on_disk": partial(growth.on_disk, 1_000_000, disk)} if disk is not None else {}),
-    }
-
-
-def _run(part: str, repeats: int, disk: str | None) -> tuple[dict[str, Any], float]:
-    """A part's results and the peak of the process's memory, MiB."""
-    tune_allocator()
-    results = parts(repeats, disk)[part]()
-    return results, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def main() -> None:
     """Run the benchmarks, each part in a process of its own."""
     names = list(parts(1, "."))
@@ -92,7 +62,7 @@ def main() -> None:
         if options.only is None or part in options.only:
             print(f"{part} ...", flush=True)
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-                results, peak = process.submit(_run, part, options.repeats, options.disk).result()
+                results, peak = process.submit(run_part, part, options.repeats, options.disk).result()
             measured[part] = {"peak_memory_mb": round(peak), **results}
             report = {"machine": machine, **{key: measured[key] for key in names if key in measured}}
             path.write_text(json.dumps(report, indent=2) + "\n")

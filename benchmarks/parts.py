@@ -1,0 +1,41 @@
+"""The parts of the report, each of which is run in a process of its own."""
+
+import resource
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from benchmarks import collection, growth, numerics, rendering, replay, update
+from sb3_cure.allocator import tune_allocator
+
+
+def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, Any]]]:
+    """
+    :param repeats: Rounds of the comparisons
+    :param disk: Directory for the buffer of a million transitions (22 GB), or None
+    :return: What can be measured, by name, in the order of the report
+    """
+    return {
+        "update": partial(update.measure, repeats),
+        "update_by_phase": update.breakdowns,
+        "replay": replay.measure,
+        "rendering": rendering.measure,
+        "end_to_end": collection.measure,
+        "growth_with_batch": growth.by_batch,
+        "growth_with_image": growth.by_image,
+        "growth_with_buffer": growth.by_buffer,
+        "bfloat16_against_float32": numerics.measure,
+        **({"buffer_on_disk": partial(growth.on_disk, 1_000_000, disk)} if disk is not None else {}),
+    }
+
+
+def run_part(part: str, repeats: int, disk: str | None) -> tuple[dict[str, Any], float]:
+    """
+    :param part: A name of ``parts``
+    :param repeats: Rounds of the comparisons
+    :param disk: As for ``parts``
+    :return: The part's results, and the peak of this process's memory, MiB
+    """
+    tune_allocator()
+    results = parts(repeats, disk)[part]()
+    return results, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
