@@ -236,7 +236,7 @@ def test_custom_optimizer(extras: dict[str, Any]) -> None:
     if extras is ON:
         optimizers += [policy.curious_actor.optimizer, policy.curious_critic.optimizer]
         optimizers += policy.encoder_optimizer.optimizers.values()
-        assert len(optimizers) == 7
+        assert len(optimizers) == 5
         # The head has a weight decay of its own.
         assert type(policy.srl.optimizer) is th.optim.AdamW
         assert policy.srl.optimizer.param_groups[0]["eps"] == 1e-3
@@ -695,8 +695,10 @@ def test_learning_rate_schedule(extras: dict[str, Any]) -> None:
     temperatures = [model.ent_coef_optimizer]
     if extras is ON:
         optimizers += [policy.curious_actor.optimizer, policy.curious_critic.optimizer, policy.srl.optimizer]
-        optimizers += policy.encoder_optimizer.optimizers.values()
         temperatures.append(model.curious_ent_coef_optimizer)
+        # The encoder's one step stands for those of three losses.
+        (joint,) = policy.encoder_optimizer.optimizers.values()
+        assert joint.param_groups[0]["lr"] == pytest.approx(5e-3 * 3**0.5)
     ratio = 0.1 if extras is ON else 1.0
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [5e-3] * len(optimizers)
     assert [optimizer.param_groups[0]["lr"] for optimizer in temperatures] == pytest.approx(

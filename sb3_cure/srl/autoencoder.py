@@ -73,7 +73,7 @@ class _SquaredError(th.autograd.Function):
         difference = th.sub(drawn, target, out=target) if target.stride() == drawn.stride() else drawn - target
         ctx.save_for_backward(difference)
         flat = difference.permute(0, 2, 3, 1).flatten(1)  # a view where kernels write NHWC
-        return th.linalg.vector_norm(flat, dim=1).square() / flat.shape[1]
+        return flat.square().mean(dim=1)
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
