@@ -2,7 +2,7 @@
 
 The same networks, losses, schedule and order of steps as the public implementation: observations as float tensors of
 0-255, five passes of the convolutions per update (critic, actor's next observation, target, actor, decoder), one Adam
-per loss, Polyak averages parameter by parameter. Only what the library itself does not use is written here.
+per loss, Polyak averages parameter by parameter.
 """
 
 import copy
@@ -13,15 +13,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
-
-def _init(layer: nn.Module) -> None:
-    if isinstance(layer, nn.Linear):
-        nn.init.orthogonal_(layer.weight)
-        nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    elif isinstance(layer, nn.Conv2d | nn.ConvTranspose2d):
-        nn.init.zeros_(layer.weight)
-        nn.init.orthogonal_(layer.weight.data[:, :, 1, 1], nn.init.calculate_gain("relu"))
-        nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+from sb3_cure.layers import init_weights
 
 
 class _Encoder(nn.Module):
@@ -99,11 +91,11 @@ class PlainSacAe:
     """
 
     def __init__(self, channels: int = 9, actions: int = 1, hidden: int = 1024, device: th.device | str = "cpu"):
-        self.actor = _Actor(channels, actions, hidden).apply(_init).to(device)
-        self.critic = _Critic(channels, actions, hidden).apply(_init).to(device)
+        self.actor = init_weights(_Actor(channels, actions, hidden)).to(device)
+        self.critic = init_weights(_Critic(channels, actions, hidden)).to(device)
         self.critic_target = copy.deepcopy(self.critic)
         self.actor.encoder.convs = self.critic.encoder.convs
-        self.decoder = _Decoder(channels).apply(_init).to(device)
+        self.decoder = init_weights(_Decoder(channels)).to(device)
         self.log_alpha = th.tensor(np.log(0.1), device=device, requires_grad=True)
         self.target_entropy = -float(actions)
         adam = th.optim.Adam

@@ -1,4 +1,4 @@
-"""How the C library's allocator treats large blocks, which costs an eighth of an update by default."""
+"""How the C library's allocator treats large blocks, which batches of images and activations are."""
 
 import ctypes
 import sys

@@ -97,7 +97,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         # Fresh zeros cost no memory until they are written to
         rows = (self.buffer_size, n_envs)
         # A file is reserved when it is needed: a model that is loaded to act needs none.
-        self.frames = np.zeros((0 if frames_dir else self.frame_capacity, *self.frame_shape), dtype=np.uint8)
+        self.frames = np.zeros((self.frame_capacity if frames_dir is None else 0, *self.frame_shape), dtype=np.uint8)
         self.frame_slots = np.zeros((*rows, 2, frame_stack), dtype=np.int32)
         self.oldest_frame = np.zeros(self.buffer_size, dtype=np.int64)
         self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))

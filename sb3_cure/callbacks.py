@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cure.evaluation import run_episodes
+from sb3_cure.evaluation import run_episodes, trained_actors
 
 
 class EvalBothCallback(BaseCallback):
@@ -61,9 +61,7 @@ class EvalBothCallback(BaseCallback):
         :return: Agent steps and the logged values
         """
         row: dict[str, float] = {"timesteps": self.num_timesteps}
-        has_curious = getattr(self.model.policy, "curious_actor", None) is not None
-        has_task = getattr(self.model, "task", True)
-        for actor in ("task",) * has_task + ("curious",) * has_curious:
+        for actor in trained_actors(self.model):  # type: ignore[arg-type]
             episodes = run_episodes(
                 self.model,  # type: ignore[arg-type]
                 self.eval_env,

@@ -53,6 +53,16 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
     return np.concatenate(errors)
 
 
+def trained_actors(model: CuReSAC) -> list[str]:
+    """
+    :param model: A model, also of SB3's own SAC
+    :return: Which of ``"task"`` and ``"curious"`` it trains
+    """
+    has_curious = getattr(model.policy, "curious_actor", None) is not None
+    there = {"task": getattr(model, "task", True), "curious": has_curious}
+    return [actor for actor, trained in there.items() if trained]
+
+
 def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> None:
     """Before policies are compared by CURL's error: take its negatives evenly from what they see.
 
@@ -66,7 +76,7 @@ def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Non
     head = model.policy.srl
     if not isinstance(head, CURL):
         return
-    actors = [actor for actor in ACTORS if actor != "curious" or model.policy.curious_actor is not None]
+    actors = [*trained_actors(model), "random"]
     share = max(len(head.bank) // len(actors), 1)  # type: ignore[arg-type]
     seen = [next(run_episodes(model, env, 1, actor, seed=seed)).observations for actor in actors]
     frames = [each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen]

@@ -1,6 +1,7 @@
 """The comparison of sequential and joint updates: what it runs, what it keeps, what it says."""
 
 import csv
+import json
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,8 @@ def write_cell(folder: Path, srl: str, mode: str, seed: int, value: float) -> No
     """Nine rows, of which the last three count: their columns are ``value`` - 1, ``value`` and ``value`` + 1."""
     path = folder / srl / mode / f"seed{seed}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    columns = ("environment_steps", *update_modes.MEASURES)
-    rows = [[8 * row, *[value + row - 7] * 3] for row in range(9)]
+    columns = ("environment_steps", *update_modes.MEASURES, "curious_srl_error", "task_srl_error", "seconds")
+    rows = [[8 * row, *[value + row - 7] * 3, 2 * (value + row - 7), 0.5 * (value + row - 7), row] for row in range(9)]
     with path.open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])
 
@@ -29,6 +30,14 @@ def test_table_pairs_the_arms_seed_by_seed(tmp_path: Path) -> None:
     lines = update_modes.summarise(update_modes.read_cells(tmp_path))
     numbers = {line.split("|")[2].strip(): [float(cell) for cell in line.split("|")[3:-1]] for line in lines[2:]}
     assert numbers == {"0": [10, 20] * 3, "3": [30, 60] * 3, "mean": [20, 40] * 3}
+
+
+def test_policies_are_compared_by_the_error_they_meet(tmp_path: Path) -> None:
+    """Errors over the random policy's, counted over all evaluations, and the time at the end of each run."""
+    for seed in (0, 1):
+        write_cell(tmp_path, "rae", "joint", seed, 20)
+    *_, line = update_modes.compare_policies(update_modes.read_cells(tmp_path))
+    assert line == "| rae | joint | 2.00 | 0.50 | 18 of 18 | 8 |"
 
 
 def test_cells_are_run_once_and_only_with_their_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,6 +69,7 @@ def test_a_cell_trains_on_real_pixels(tmp_path: Path, monkeypatch: pytest.Monkey
     update_modes.run_cell(tmp_path / "seed0.csv", "rae", "joint", 0, 20)
     with (tmp_path / "seed0.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
+    assert json.loads((tmp_path / "seed0.json").read_text())["seed"] == 0
     assert (row["agent_steps"], row["environment_steps"]) == ("20", "160")
     assert 0 < float(row["random_srl_error"]) < 0.3 and 0 < float(row["srl_loss"]) < 0.3
     assert float(row["task_return"]) > 0

@@ -33,7 +33,7 @@ DOMAIN, TASK = "cartpole", "swingup"
 # The camera that follows the cart: the usual one is far away, and the cart drives out of its view.
 ENV_KWARGS: dict[str, Any] = dict(image_size=36, grayscale=True, camera_id=1, renderer="fast")
 # Smaller images and networks than the paper's, and quicker targets, because ten minutes on two cores allow a fraction
-# of the paper's updates. Chosen by measurement, see the README.
+# of the paper's updates.
 SETTINGS: dict[str, Any] = dict(
     srl="curl",
     srl_kwargs=dict(augmentation="shift", pad=2),
@@ -74,6 +74,21 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer = csv.DictWriter(file, rows[0].keys())
         writer.writeheader()
         writer.writerows(rows)
+
+
+def describe_run() -> dict[str, Any]:
+    """
+    :return: Versions and machine, to be kept beside results
+    """
+    return {
+        "versions": {
+            "sb3_cure": sb3_cure.__version__,
+            "stable_baselines3": stable_baselines3.__version__,
+            "torch": th.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": f"{platform.machine()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
+    }
 
 
 class RecordCurve(EvalBothCallback):
@@ -183,13 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "ratio": round(final_return / random_return, 2),
         "settings": SETTINGS,
         "environment": ENV_KWARGS,
-        "versions": {
-            "sb3_cure": sb3_cure.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": th.__version__,
-            "python": platform.python_version(),
-        },
-        "machine": f"{platform.machine()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
+        **describe_run(),
         "precision": model._computed_precision,
     }
     (options.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")

@@ -21,7 +21,7 @@ import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.evaluation import run_episodes
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve, write_csv
+from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve, describe_run, write_csv
 
 MODES = ("sequential", "joint")
 HEADS: dict[str, dict[str, Any]] = {
@@ -100,6 +100,7 @@ def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
         action_repeat=env.get_wrapper_attr("action_repeat"),
     )
     model.learn(steps, callback=curve)
+    path.with_suffix(".json").write_text(json.dumps({"seed": seed, **describe_run()}, indent=2) + "\n")
     write_csv(path, curve.rows)
 
 
@@ -139,6 +140,29 @@ def summarise(cells: Mapping[tuple[str, str], Mapping[int, Rows]]) -> list[str]:
         for name, row in values.items():
             shown = " | ".join(f"{value:.{digit}f}" for value, digit in zip(row, digits, strict=True))
             lines.append(f"| {srl} | {name} | {shown} |")
+    return lines
+
+
+def compare_policies(cells: Mapping[tuple[str, str], Mapping[int, Rows]]) -> list[str]:
+    """SRL error of the trained policies over the random policy's (last third, mean over seeds), and the time taken.
+
+    :param cells: Result of ``read_cells``
+    :return: Lines of a Markdown table
+    """
+    lines = [
+        "| head | mode | error, curious / random | task / random | evaluations with curious > random | seconds |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (srl, mode), runs in cells.items():
+        errors = {
+            actor: np.array([_late_mean(rows, f"{actor}_srl_error") for rows in runs.values()])
+            for actor in ("curious", "task", "random")
+        }
+        ratios = [np.mean(errors[actor] / errors["random"]) for actor in ("curious", "task")]
+        above = [row["curious_srl_error"] > row["random_srl_error"] for rows in runs.values() for row in rows]
+        seconds = np.mean([rows[-1]["seconds"] for rows in runs.values()])
+        shown = " | ".join(f"{ratio:.2f}" for ratio in ratios)
+        lines.append(f"| {srl} | {mode} | {shown} | {sum(above)} of {len(above)} | {seconds:.0f} |")
     return lines
 
 
@@ -183,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     run_cell(path, srl, mode, seed, options.steps)
     cells = read_cells(options.out)
     plots.update_modes(options.out / "curves.png", cells, {column: name for column, (name, _) in MEASURES.items()})
-    table = summarise(cells)
+    table = [*summarise(cells), "", *compare_policies(cells)]
     (options.out / "table.md").write_text("\n".join(table) + "\n")
     print("\n".join(table))
     return 0

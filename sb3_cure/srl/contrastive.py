@@ -176,9 +176,7 @@ class CURL(SRLHead):
                 f"set_bank got observations of shape {tuple(observations.shape)}, but the bank holds 1 to {len(bank)} "
                 f"of shape {tuple(bank.shape[1:])}: choose fewer, or another srl_kwargs=dict(bank_size=...)."
             )
-        bank[: len(observations)] = observations.to(bank.device)
-        self._n_banked = len(observations)
-        self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
+        self._write_bank(0, observations)
 
     def _augment(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         if self.crops:
@@ -200,7 +198,10 @@ class CURL(SRLHead):
             self._n_banked = int(self.bank_filled)  # type: ignore[arg-type]
         room = len(bank) - self._n_banked
         if room > 0:
-            taken = observations[:room]
-            bank[self._n_banked : self._n_banked + len(taken)] = taken
-            self._n_banked += len(taken)
-            self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
+            self._write_bank(self._n_banked, observations[:room])
+
+    def _write_bank(self, start: int, observations: th.Tensor) -> None:
+        """Store observations from this place on, and forget what lies behind them."""
+        self._n_banked = start + len(observations)
+        self.bank[start : self._n_banked] = observations  # type: ignore[index, operator]
+        self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
