@@ -1,7 +1,7 @@
 """Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
 
 ACTORS = ("task", "curious", "random")
@@ -22,12 +23,14 @@ class Episode:
     :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
     :param observations: The observations before each step, [T, *shape]
     :param frames: ``env.render()`` after each step, if asked for
+    :param states: The true state of the environment before each step, [T, d], if asked for; else empty
     """
 
     rewards: np.ndarray
     srl_errors: np.ndarray
     observations: np.ndarray
     frames: list[np.ndarray]
+    states: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def total_reward(self) -> float:
@@ -101,6 +104,7 @@ def run_episodes(
     deterministic: bool = True,
     seed: int | None = None,
     render: bool = False,
+    states: bool | Callable[[gym.Env], np.ndarray] = False,
 ) -> Iterator[Episode]:
     """Roll out one policy alone, episode by episode (one is in memory at a time).
 
@@ -111,18 +115,24 @@ def run_episodes(
     :param deterministic: Whether policies act by their mean
     :param seed: Seed of the first reset and of random actions
     :param render: Whether to keep ``env.render()`` of each step
+    :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
+        (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]
     :return: The episodes
-    :raises ValueError: if the actor is unknown, or the model has no curious policy
+    :raises ValueError: if the actor is unknown, the model has no curious policy, or the environment no known state
     """
+    state_of = physics_state if states is True else states
     choose = _actor(model, env, actor, deterministic)
     if seed is not None:
         env.action_space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
         observations, actions, rewards, dones, frames = [observation], [], [], [], []
+        true_states = []
         done = False
         while not done:
             action = choose(observation)
+            if state_of:
+                true_states.append(np.array(state_of(env)))  # a copy
             observation, reward, terminated, truncated, _ = env.step(action)
             done = terminated or truncated
             observations.append(observation)
@@ -135,7 +145,10 @@ def run_episodes(
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "srl", None) is not None:
             errors = srl_errors(model, _as_batch(model, seen, actions, rewards, dones))
-        yield Episode(np.array(rewards), errors, seen[:-1], frames)  # type: ignore[arg-type]
+        episode = Episode(np.array(rewards), errors, seen[:-1], frames)  # type: ignore[arg-type]
+        if true_states:
+            episode.states = np.stack(true_states)
+        yield episode
 
 
 def _as_batch(

@@ -25,8 +25,12 @@ from sb3_cure.envs import (
     StackFrames,
     make_dmc_env,
     make_pixel_env,
+    physics_state,
+    physics_state_names,
+    physics_state_units,
     register_dmc_envs,
 )
+from sb3_cure.envs.physics import telling_coordinates
 from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
 
 load_gl()  # before any test imports dm_control
@@ -477,3 +481,59 @@ def test_backend_that_cannot_render_is_answered_in_one_sentence(backend, fix):
         pytest.raises(GLUnavailableError, match=fix),
     ):
         load_gl()
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "telling"),
+    [
+        ("cartpole", "swingup", ("hinge_1", "hinge_1_velocity")),
+        ("finger", "spin", ("proximal", "hinge_velocity")),
+        ("reacher", "easy", ("shoulder", "wrist")),
+        ("ball_in_cup", "catch", ("ball_x", "ball_z")),
+        ("quadruped", "walk", ("root_x", "root_y")),
+    ],
+)
+def test_true_state_is_that_of_the_physics_by_name(
+    make: Callable[..., gym.Env], domain: str, task: str, telling: tuple[str, str]
+) -> None:
+    """Positions and velocities as dm_control names them, through wrappers, as a copy; two of them for maps."""
+    env = gym.wrappers.RecordEpisodeStatistics(make(domain, task))
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.ones(env.action_space.shape, np.float32))
+    names, units, state = physics_state_names(env), physics_state_units(env), physics_state(env)
+    assert len(names) == len(set(names)) == len(units) == len(state)
+    named = env.get_wrapper_attr("physics").named.data
+    for name, unit, value in zip(names, units, state, strict=True):
+        joint = name.removesuffix("_velocity")
+        table = named.qvel if name.endswith("_velocity") else named.qpos
+        if domain == "quadruped" and joint.startswith("root_"):
+            free = ["x", "y", "z", "rx", "ry", "rz"] if joint != name else ["x", "y", "z", "qw", "qx", "qy", "qz"]
+            assert value == table["root"][free.index(joint.removeprefix("root_"))]
+        else:
+            assert np.isclose(np.sin(value), np.sin(table[joint].item()))
+            assert unit in (("m/s", "rad/s") if joint != name else ("m", "rad"))
+    assert telling_coordinates(names) == telling
+    before = state.copy()
+    env.step(-np.ones(env.action_space.shape, np.float32))
+    np.testing.assert_array_equal(state, before)
+    assert not np.array_equal(physics_state(env), before)
+
+
+def test_angles_that_turn_all_around_are_wrapped(make: Callable[..., gym.Env]) -> None:
+    """To (-pi, pi], whatever their turns; places and velocities are left as they are."""
+    env = make("cartpole", "swingup")
+    env.reset(seed=0)
+    data = env.get_wrapper_attr("physics").data
+    for turns in (-3, -1, 0, 1, 20):
+        for angle in (-3.1, -0.5, 0.0, 0.5, np.pi):
+            data.qpos[:] = 9.5, angle + 2 * np.pi * turns
+            data.qvel[:] = 40.0, -40.0
+            np.testing.assert_allclose(physics_state(env), [9.5, angle, 40.0, -40.0], atol=1e-12)
+
+
+def test_true_state_of_other_environments_is_refused() -> None:
+    """One sentence that says what to do."""
+    for function in (physics_state, physics_state_names, physics_state_units):
+        with pytest.raises(ValueError, match=r"Pendulum-v1.* has no physics of dm_control.*make_dmc_env, or give"):
+            function(gym.make("Pendulum-v1"))

@@ -64,6 +64,21 @@ def test_each_episode_is_acted_by_the_policy_that_was_asked_for(actor: str) -> N
     np.testing.assert_allclose(episode.srl_errors, (drawn - target).square().flatten(1).mean(1), rtol=1e-4)
 
 
+def test_true_states_are_kept_when_asked_for() -> None:
+    """Those before each step, as a function of the environment says; for dm_control that of its physics."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(20)
+    (episode,) = run_episodes(model, Recorder(), 1, "curious", seed=5)
+    assert episode.states.size == 0
+    env = Recorder()
+    (seen,) = run_episodes(model, env, 1, "curious", seed=5, states=lambda env: env.unwrapped.position)
+    np.testing.assert_array_equal(seen.observations, episode.observations)
+    assert seen.states.shape == (20, 2)
+    moved = np.clip(seen.states + 0.3 * np.array(env.actions), -1, 1)
+    np.testing.assert_allclose(seen.states[1:], moved[:-1], atol=1e-6)
+    with pytest.raises(ValueError, match="no physics of dm_control"):
+        list(run_episodes(model, env, 1, states=True))
+
+
 def test_unknown_actor_is_one_sentence() -> None:
     """The names are given."""
     model = tiny_model("CnnPolicy", PixelBox())

@@ -1,0 +1,90 @@
+"""The true state of a DeepMind Control environment, which agents that see pixels never get: for maps and statistics."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+# What a joint of each type of MuJoCo (free, ball, slide, hinge) adds to the state: names and units of its positions,
+# then of its velocities. "" is the joint itself.
+_METRES, _RADIANS = ("m", "m/s"), ("rad", "rad/s")
+_PLACE = [("_x", _METRES), ("_y", _METRES), ("_z", _METRES)]
+_QUATERNION = [("_qw", ("", "")), ("_qx", ("", "")), ("_qy", ("", "")), ("_qz", ("", ""))]
+_ROTATION = [("_rx", _RADIANS), ("_ry", _RADIANS), ("_rz", _RADIANS)]
+_POSITIONS = [_PLACE + _QUATERNION, _QUATERNION, [("", _METRES)], [("", _RADIANS)]]
+_VELOCITIES = [_PLACE + _ROTATION, _ROTATION, [("", _METRES)], [("", _RADIANS)]]
+_HINGE = 3
+
+# Two coordinates that show what a task is about, for every environment that has both; else the first two.
+_TELLING = [
+    ("hinge_1", "hinge_1_velocity"),  # cartpole: angle of the pole (0: upright)
+    ("proximal", "hinge_velocity"),  # finger: angle of the finger, spin of the body that it pushes
+    ("ball_x", "ball_z"),  # ball_in_cup, and the balls of manipulator
+    ("joint_0", "joint_1"),  # swimmer, lqr
+    ("rootz", "rooty"),  # walker, hopper, cheetah: height (from the start's) and pitch of the torso
+]
+
+
+def _physics(env: gym.Env) -> Any:
+    physics = env.get_wrapper_attr("physics") if env.has_wrapper_attr("physics") else None
+    if not hasattr(getattr(physics, "model", None), "jnt_type"):
+        raise ValueError(
+            f"{env} has no physics of dm_control, so its true state is unknown: use an environment of make_dmc_env, or "
+            "give a function of the state of your own where one can be given."
+        )
+    return physics
+
+
+def _coordinates(env: gym.Env) -> list[tuple[str, str]]:
+    """Name and unit of each coordinate of ``physics_state``."""
+    model = _physics(env).model
+    joints = [
+        (model.id2name(joint, "joint") or f"joint{joint}", int(model.jnt_type[joint])) for joint in range(model.njnt)
+    ]
+    positions = [(name + part, unit) for name, kind in joints for part, (unit, _) in _POSITIONS[kind]]
+    velocities = [(f"{name}{part}_velocity", unit) for name, kind in joints for part, (_, unit) in _VELOCITIES[kind]]
+    return positions + velocities
+
+
+def physics_state_names(env: gym.Env) -> list[str]:
+    """
+    :param env: A dm_control environment, such as ``make_dmc_env`` makes, in any wrappers
+    :return: What ``physics_state`` gives: MuJoCo's names of the joints, then the same with ``_velocity``
+    :raises ValueError: if the environment is not one of dm_control
+    """
+    return [name for name, _ in _coordinates(env)]
+
+
+def physics_state_units(env: gym.Env) -> list[str]:
+    """
+    :param env: As of ``physics_state_names``
+    :return: Unit of each coordinate: ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"``, or ``""`` for parts of quaternions
+    :raises ValueError: if the environment is not one of dm_control
+    """
+    return [unit for _, unit in _coordinates(env)]
+
+
+def physics_state(env: gym.Env) -> np.ndarray:
+    """The true state now: positions and velocities of all joints (MuJoCo's qpos and qvel).
+
+    Angles of joints that can turn all around are wrapped to (-pi, pi].
+
+    :param env: As of ``physics_state_names``
+    :return: A copy, float64 [d], in the order of ``physics_state_names``
+    :raises ValueError: if the environment is not one of dm_control
+    """
+    physics = _physics(env)
+    positions = np.array(physics.data.qpos, dtype=np.float64)
+    model = physics.model
+    around = model.jnt_qposadr[(model.jnt_type == _HINGE) & (model.jnt_limited == 0)]
+    positions[around] = np.pi - (np.pi - positions[around]) % (2 * np.pi)
+    return np.concatenate([positions, physics.data.qvel])
+
+
+def telling_coordinates(names: list[str]) -> tuple[str, str]:
+    """
+    :param names: Names as of ``physics_state_names``, at least two
+    :return: The two of them that show best what the agent does, for maps: of cartpole the pole's angle and its
+        velocity, of finger the finger's angle and the body's velocity, of reacher both angles, ...
+    """
+    return next((pair for pair in _TELLING if set(pair) <= set(names)), (names[0], names[1]))
