@@ -1,0 +1,107 @@
+"""Folders of results as experiments write them, with chosen numbers."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+EVAL_COLUMNS = (
+    "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
+    "task_srl_error", "curious_return_mean", "curious_srl_error",
+)  # fmt: skip
+RAE = {"policy": "CnnPolicy", "srl": "rae", "curiosity": None}
+CURE = {"policy": "CnnPolicy", "srl": "rae"}
+
+
+def write_grid(folder: Path, **changes: Any) -> dict[str, Any]:
+    """A grid of one task, two arms and two seeds, but for the changes.
+
+    :param folder: Folder of the experiment
+    :param changes: Keys of ``grid.json``
+    :return: The grid
+    """
+    grid: dict[str, Any] = {
+        "experiment": folder.name,
+        "kind": "curves",
+        "budget": 100_000,
+        "seeds": [0, 1],
+        "tasks": ["dmc_pixels/cartpole-swingup-v0"],
+        "methods": {"sac_ae": {"config": "../sac_ae.yml"}, "cure_sac_ae": {"config": "../cure_sac_ae.yml"}},
+        "baseline": "sac_ae",
+        "evaluation": {"every": 10_000, "episodes": 10},
+        **changes,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "grid.json").write_text(json.dumps(grid))
+    return grid
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
+
+
+def write_cell(
+    folder: Path,
+    task: str,
+    method: str,
+    seed: int,
+    curve: Mapping[int, float],
+    *,
+    arguments: Mapping[str, Any] = RAE,
+    budget: int = 100_000,
+    done: bool = True,
+    visitation: Sequence[Sequence[Any]] = (),
+    states: Mapping[str, np.ndarray] | None = None,
+    curious: bool = False,
+    **config: Any,
+) -> Path:
+    """One cell.
+
+    :param folder: Folder of the experiment
+    :param task: Short name
+    :param method: Arm
+    :param seed: Seed
+    :param curve: Return by environment steps
+    :param arguments: CuReSAC's arguments
+    :param budget: Environment steps
+    :param done: Whether it is marked as finished
+    :param visitation: Rows of ``visitation.csv``: actor, head, episode, min, mean, max, return
+    :param states: True states by actor
+    :param curious: Whether the columns of a curious actor are filled
+    :param config: Further keys of ``config.json``
+    :return: Its folder
+    """
+    cell = folder / task / method / f"seed{seed}"
+    cell.mkdir(parents=True, exist_ok=True)
+    content = {
+        "experiment": folder.name, "task": f"dmc_pixels/{task}-v0", "method": method, "seed": seed, "budget": budget,
+        "action_repeat": 8, "n_envs": 1, "env_kwargs": {}, "arguments": dict(arguments), **config,
+    }  # fmt: skip
+    (cell / "config.json").write_text(json.dumps(content))
+    run = {
+        "versions": {"sb3_cure": "0.1.0", "torch": "2.13.0"}, "machine": "x86_64, 2 threads, AVX512", "device": "cpu",
+        "precision": "bf16", "commit": "abc1234", "started": "2026-01-01T00:00:00", "finished": "2026-01-01T01:00:00",
+        "seconds": 3600.0, "attempts": 1,
+    }  # fmt: skip
+    (cell / "run.json").write_text(json.dumps(run))
+    rows = [
+        [step, step // 8, step // 8, step / 100, value, 5.0, "" if step == 0 else 1e-3 / (1 + step / 5e4), 0.001]
+        + ([value / 2, 0.002] if curious else ["", ""])
+        for step, value in curve.items()
+    ]
+    write_csv(cell / "eval.csv", EVAL_COLUMNS, rows)
+    if visitation:
+        columns = ("actor", "head", "episode", "error_min", "error_mean", "error_max", "return")
+        write_csv(cell / "visitation.csv", columns, visitation)
+    if states is not None:
+        arrays = {f"{actor}_states": values for actor, values in states.items()}
+        errors = {f"{actor}_errors": np.zeros(len(values)) for actor, values in states.items()}
+        names = np.array([f"x{index}" for index in range(next(iter(states.values())).shape[1])])
+        np.savez(cell / "visits.npz", **arrays, **errors, state_names=names)
+    if done:
+        (cell / "DONE").touch()
+    return cell

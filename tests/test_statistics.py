@@ -1,0 +1,309 @@
+"""Numbers of the report: read from folders of results, against values computed by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from results_for_tests import CURE, RAE, write_cell, write_grid
+from scipy import stats
+
+from sb3_cure.experiments import published, statistics
+from sb3_cure.experiments.statistics import ResultsError, read_results
+
+TASK = "cartpole-swingup"
+returns = st.floats(-1e3, 1e3, allow_nan=False)
+
+
+def curve(*values: float) -> dict[int, float]:
+    """Evaluations that divide 100 000 environment steps evenly."""
+    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Two arms and two seeds, all done: areas 50, 100 (baseline) and 100, 200; finals 100, 200 and 200, 400."""
+    folder = tmp_path / "curves"
+    write_grid(folder)
+    for seed in (0, 1):
+        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
+        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)
+    return folder
+
+
+def test_areas_finals_and_thresholds(results: Path) -> None:
+    (experiment,) = read_results(results)
+    arm = statistics.summarise_arm(experiment, TASK, "sac_ae", thresholds=(100, 150, 500))
+    assert arm.seeds == (0, 1)
+    np.testing.assert_allclose(arm.areas, [50, 100])
+    np.testing.assert_allclose(arm.finals, [100, 200])
+    # Over two values a, b the range from the 25th to the 75th percentile is |a - b| / 2: 0, 25 and 50 on the curve.
+    assert arm.curve_iqr == pytest.approx(25)
+    assert statistics.interquartile_range(arm.finals) == pytest.approx(50)
+    np.testing.assert_array_equal(arm.reached[100], [100_000, 50_000])
+    np.testing.assert_array_equal(arm.reached[150], [np.inf, 100_000])
+    np.testing.assert_array_equal(arm.reached[500], [np.inf, np.inf])
+
+
+def test_area_counts_steps_not_evaluations() -> None:
+    """Trapezoids: 10 on 0..10, then 5 on average over 90 steps."""
+    area = statistics.area_under_curve(np.array([0, 10, 100]), np.array([10.0, 10.0, 0.0]))
+    assert area == pytest.approx((10 * 10 + 90 * 5) / 100)
+
+
+def test_differences_pair_the_seeds(results: Path) -> None:
+    """50 and 100: mean 75, standard error 25, t with one degree of freedom."""
+    (experiment,) = read_results(results)
+    (difference,) = statistics.paired_differences(experiment)
+    assert (difference.method, difference.task, difference.wins, difference.pairs) == ("cure_sac_ae", TASK, 2, 2)
+    assert difference.t.value == pytest.approx(75)
+    assert difference.t.high == pytest.approx(75 + 12.7062 * 25, rel=1e-5)
+    assert (difference.percentile.low, difference.percentile.high) == (50, 100)
+    assert difference.t.verdict == "inconclusive"
+    (final,) = statistics.paired_differences(experiment, "finals")
+    assert final.t.value == pytest.approx(150)
+
+
+def test_only_what_both_arms_finished_is_paired(results: Path) -> None:
+    """An unfinished cell enters nothing, whatever its files hold; with one pair left there is no interval."""
+    (results / TASK / "cure_sac_ae" / "seed1" / "DONE").unlink()
+    (results / TASK / "cure_sac_ae" / "seed1" / "eval.csv").write_text("half a li")
+    write_cell(results, TASK, "cure_sac_ae", 7, curve(0, 900))  # a seed that the baseline has not
+    (experiment,) = read_results(results.parent)
+    statuses = {(method, seed): cell.status for (_, method, seed), cell in experiment.cells.items()}
+    assert statuses["cure_sac_ae", 1] == "unfinished"
+    (difference,) = statistics.paired_differences(experiment)
+    assert (difference.pairs, difference.t.value, difference.t.low) == (1, 50, None)
+    assert difference.t.verdict == "one seed: no interval"
+
+
+def test_cells_that_are_missing_or_of_another_budget(tmp_path: Path) -> None:
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=[0, 1, 2])
+    write_cell(folder, TASK, "sac_ae", 0, curve(0, 10))
+    write_cell(folder, TASK, "sac_ae", 1, curve(0, 10), budget=50_000)
+    (experiment,) = read_results(folder)
+    assert [cell.status for cell in experiment.cells.values()] == [
+        "done", "other budget: 50000 steps", "not run", "not run", "not run", "not run",
+    ]  # fmt: skip
+    assert list(experiment.done(TASK, "sac_ae")) == [0]
+    assert statistics.paired_differences(experiment) == []
+
+
+def test_several_tasks_count_alike(tmp_path: Path) -> None:
+    """Differences 0, 20 on one task and 100, 100, 130 on the other: 10 and 110 make 60, not the mean of all five."""
+    folder = tmp_path / "curves"
+    write_grid(folder, tasks=["a/x-y-v0", "a/z-w-v0"], seeds=3)
+    for task, differences in {"x-y": (0, 20), "z-w": (100, 100, 130)}.items():
+        for seed, difference in enumerate(differences):
+            write_cell(folder, task, "sac_ae", seed, curve(100, 100))
+            write_cell(folder, task, "cure_sac_ae", seed, curve(100 + difference, 100 + difference))
+    pooled, *rows = statistics.paired_differences(read_results(folder)[0])
+    assert pooled.task is None and [row.task for row in rows] == ["x-y", "z-w"]
+    assert pooled.t.value == pytest.approx(60) and pooled.t.n == 5
+    assert pooled.t.low is not None and pooled.t.high is not None
+    assert pooled.t.low < pooled.percentile.low and pooled.t.high > pooled.percentile.high  # type: ignore[operator]
+
+
+def test_t_interval_covers_what_it_says_with_three_seeds_and_percentiles_do_not() -> None:
+    """Three pairs around a true difference of 1, 400 times."""
+    samples = np.random.default_rng(0).normal(1, 5, size=(400, 3))
+    hits = {"t": 0, "percentile": 0}
+    for sample in samples:
+        intervals = {
+            "t": statistics.t_interval([sample]),
+            "percentile": statistics.percentile_interval([sample], draws=500),
+        }
+        for name, interval in intervals.items():
+            hits[name] += interval.low <= 1 <= interval.high  # type: ignore[operator]
+    assert hits["t"] / 400 > 0.92
+    assert hits["percentile"] / 400 < 0.85
+
+
+def test_interval_over_tasks_agrees_with_theory() -> None:
+    """Many seeds on two tasks: Student's t is normal, the mean of two has the root of the summed variances / 2."""
+    groups = [np.random.default_rng(seed).normal(0, scale, 400) for seed, scale in ((0, 1.0), (1, 3.0))]
+    estimate = statistics.t_interval(groups)
+    expected = stats.norm.ppf(0.975) * np.sqrt(sum(group.var(ddof=1) / 400 for group in groups)) / 2
+    assert estimate.high is not None
+    assert estimate.high - estimate.value == pytest.approx(expected, rel=0.02)
+
+
+@given(st.lists(st.tuples(st.integers(1, 10_000), returns), min_size=2, max_size=20))
+def test_area_lies_between_lowest_and_highest_return(points: list[tuple[int, float]]) -> None:
+    steps = np.cumsum([step for step, _ in points])
+    values = np.array([value for _, value in points])
+    area = statistics.area_under_curve(steps, values)
+    assert values.min() - 1e-6 <= area <= values.max() + 1e-6
+
+
+@given(st.lists(st.integers(1, 5), min_size=1, max_size=4))
+def test_identical_arms_differ_by_nothing(sizes: list[int]) -> None:
+    groups = [np.zeros(size) for size in sizes]
+    for estimate in (statistics.t_interval(groups, draws=100), statistics.percentile_interval(groups, draws=100)):
+        assert estimate.value == 0
+        assert (estimate.low, estimate.high) == ((None, None) if max(sizes) == 1 else (0, 0))
+
+
+@given(st.lists(st.lists(returns, min_size=1, max_size=5), min_size=1, max_size=3), st.randoms())
+def test_order_of_seeds_changes_nothing(groups: list[list[float]], random: object) -> None:
+    shuffled = [list(group) for group in groups]
+    for group in shuffled:
+        random.shuffle(group)  # type: ignore[attr-defined]
+    for interval in (statistics.t_interval, statistics.percentile_interval):
+        first = interval([np.array(group) for group in groups], draws=100)
+        assert interval([np.array(group) for group in shuffled], draws=100) == first
+
+
+@given(st.lists(st.lists(returns, min_size=2, max_size=5), min_size=1, max_size=3))
+def test_swapping_the_arms_mirrors_the_interval(groups: list[list[float]]) -> None:
+    estimate = statistics.t_interval([np.array(group) for group in groups], draws=100)
+    mirrored = statistics.t_interval([-np.array(group) for group in groups], draws=100)
+    assert mirrored.value == pytest.approx(-estimate.value, abs=1e-6)
+    assert mirrored.low == pytest.approx(-estimate.high, abs=1e-6)  # type: ignore[operator]
+
+
+def test_rliable_aggregates(tmp_path: Path) -> None:
+    """Interquartile mean of 8 scores, profile, probability of improvement; and numpy's generator is left alone."""
+    pytest.importorskip("rliable")
+    folder = tmp_path / "curves"
+    write_grid(folder, tasks=["a/x-y-v0", "a/z-w-v0"], seeds=4)
+    for task in ("x-y", "z-w"):
+        for seed, final in enumerate((0, 100, 200, 1000)):
+            write_cell(folder, task, "sac_ae", seed, curve(0, final))
+            write_cell(folder, task, "cure_sac_ae", seed, curve(0, final + 2000))
+    (experiment,) = read_results(folder)
+    state = np.random.get_state()[1].copy()  # type: ignore[index, union-attr]
+    aggregates = statistics.aggregate(experiment)
+    assert aggregates is not None
+    np.testing.assert_array_equal(np.random.get_state()[1], state)  # type: ignore[index]
+    assert (aggregates.tasks, aggregates.seeds) == (("x-y", "z-w"), 4)
+    assert aggregates.iqm["sac_ae"].value == pytest.approx(0.15)  # of 0 0 .1 .1 .2 .2 1 1 the middle four
+    assert aggregates.iqm["sac_ae"].low < 0.15 < aggregates.iqm["sac_ae"].high  # type: ignore[operator]
+    assert aggregates.improvement == {"cure_sac_ae": statistics.Estimate(1, 1, 1, 4)}
+    at_half = int(np.argmin(np.abs(aggregates.taus - 0.5)))
+    assert aggregates.profiles["sac_ae"][0][at_half] == pytest.approx(0.25)
+    assert statistics.aggregate(experiment).iqm == aggregates.iqm  # type: ignore[union-attr]
+
+
+def test_missing_rliable_is_one_sentence(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "rliable", None)
+    with pytest.raises(ResultsError, match=r"pip install 'sb3-cure\[experiments\]'"):
+        statistics.aggregate(read_results(results)[0])
+
+
+def test_errors_and_their_ratio(tmp_path: Path) -> None:
+    """Curious over random: 4 and 9 in the two seeds, 6 in the geometric mean."""
+    folder = tmp_path / "visitation"
+    write_grid(folder, kind="visitation")
+    for seed, ratio in enumerate((4.0, 9.0)):
+        rows = [
+            ("random", "own", 0, 0.001, 0.002, 0.003, 1), ("random", "own", 1, 0.002, 0.004, 0.008, 1),
+            ("curious", "own", 0, 0.001, 0.003 * ratio, 0.05 + seed, 1), ("random", "zero", 0, 0.05, 0.05, 0.05, 1),
+        ]  # fmt: skip
+        write_cell(folder, TASK, "cure_sac_ae", seed, {}, visitation=rows)
+    summary = {(row.head, row.actor): row for row in statistics.summarise_errors(read_results(folder)[0])}
+    assert list(summary) == [("own", "random"), ("own", "curious"), ("zero", "random")]
+    random, curious = summary["own", "random"], summary["own", "curious"]
+    assert (random.error_min, random.error_mean, random.error_max) == pytest.approx((0.001, 0.003, 0.008))
+    assert curious.error_mean == pytest.approx(0.003 * 6.5) and curious.error_max == pytest.approx(1.05)
+    assert curious.ratio.value == pytest.approx(6)
+    spread = stats.t.ppf(0.975, 1) * np.log(9 / 4) / 2
+    assert curious.ratio.high == pytest.approx(6 * np.exp(spread))
+    assert np.isnan(random.ratio.value)
+
+
+def test_coverage_counts_cells_of_equally_many_states(tmp_path: Path) -> None:
+    """Random stays in one corner, curious visits two opposite ones; a longer run does not count for more."""
+    folder = tmp_path / "visitation"
+    write_grid(folder, kind="visitation", seeds=1)
+    corners = np.array([[0.0, 0.0], [1.0, 1.0]])
+    states = {"random": np.repeat(corners[:1], 100, axis=0), "curious": np.tile(corners, (200, 1))}
+    write_cell(folder, TASK, "cure_sac_ae", 0, {}, states=states)
+    random, curious = statistics.state_coverage(read_results(folder)[0])
+    assert (random.actor, random.occupied.tolist(), random.entropy.tolist()) == ("random", [1], [0.0])
+    assert (curious.actor, curious.occupied.tolist(), curious.steps, curious.grid) == ("curious", [2], 100, 100)
+    assert curious.entropy[0] == pytest.approx(1, abs=0.02)
+    assert curious.ratio == statistics.Estimate(2, None, None, 1) and np.isnan(random.ratio.value)
+
+
+@given(st.integers(1, 40))
+def test_grid_stays_small_in_any_dimension(dimensions: int) -> None:
+    intervals = statistics.grid_intervals(dimensions)
+    assert intervals == 2 or intervals**dimensions <= statistics.GRID_CELLS < (intervals + 1) ** dimensions
+
+
+@given(st.lists(st.integers(1, 1000), min_size=1, max_size=30))
+def test_entropy_is_at_most_that_of_even_visits(counts: list[int]) -> None:
+    assert -1e-9 <= statistics.entropy_bits(np.array(counts)) <= np.log2(len(counts)) + 1e-9
+
+
+def test_comparison_with_published_returns(results: Path) -> None:
+    """150 on average where SAC-AE published 311 is below 0.75 of it: suspected; arms with curiosity are not judged."""
+    baseline, cure = statistics.compare_with_published(read_results(results))
+    assert (baseline.method, baseline.steps, baseline.ours, baseline.theirs) == ("sac_ae", 100_000, 150, (311, 11))
+    assert baseline.suspect and baseline.same_method and baseline.std == pytest.approx(70.71, abs=0.01)
+    assert (cure.published_as, cure.same_method, cure.suspect) == ("SAC-AE", False, False)
+
+
+@pytest.mark.parametrize(("final", "suspect"), [(233.0, True), (233.5, False)])
+def test_bar_of_suspicion(tmp_path: Path, final: float, suspect: bool) -> None:
+    """0.75 x 311 = 233.25."""
+    folder = tmp_path / "curves"
+    write_grid(folder)
+    write_cell(folder, TASK, "sac_ae", 0, curve(0, final), arguments=RAE)
+    (row,) = statistics.compare_with_published(read_results(folder))
+    assert row.suspect is suspect and np.isnan(row.std)
+
+
+def test_the_papers_tables() -> None:
+    """Every task of both tables, and the ratio that the paper calls two orders of magnitude."""
+    assert {len(tasks) for tasks in published.PRETRAINING.values()} == {6}
+    assert published.PRETRAINING["cure_pretraining"]["ball_in_cup_catch"] == (504, 187)
+    assert set(published.SRL_ERROR) == set(published.PRETRAINING["vanilla"])
+    ratios = {task: row["curious"].mean / row["random"].mean for task, row in published.SRL_ERROR.items()}
+    assert min(ratios.values()) > 100 and ratios["cartpole_swingup"] == pytest.approx(270)
+    for policies in published.SRL_ERROR.values():
+        assert all(low <= mean <= high for low, mean, high in policies.values())
+    assert published.task_key("finger-turn_easy") in published.RETURNS["DrQ-v2"][100_000]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("grid.json", "{", r"grid\.json is no JSON"),
+        ("grid.json", "[]", r"grid\.json holds a list"),
+        ("grid.json", '{"experiment": "x"}', r"grid\.json has kind None"),
+        ("eval.csv", "environment_steps\n1\n", r"eval\.csv has no column 'return_mean'"),
+        ("eval.csv", "environment_steps,return_mean\n0,x\n", r"eval\.csv has 'x' as return_mean in line 2"),
+        ("eval.csv", "environment_steps,return_mean\n0,1,2\n", r"eval\.csv has a row that is shorter or longer"),
+        ("eval.csv", "environment_steps,return_mean\n8,1\n8,2\n", r"eval\.csv has environment_steps that do not grow"),
+        ("eval.csv", b"\xff\xfe\x00", r"eval\.csv cannot be read"),
+        ("run.json", "", r"run\.json is no JSON"),
+        ("config.json", '{"method": "other", "seed": 0}', r"config\.json is of method 'other'"),
+    ],
+)
+def test_damaged_files_are_named_in_one_sentence(results: Path, name: str, content: str | bytes, sentence: str) -> None:
+    path = results / name if name == "grid.json" else results / TASK / "sac_ae" / "seed0" / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ResultsError, match=sentence) as caught:
+        read_results(results)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_states_and_missing_folders(results: Path, tmp_path: Path) -> None:
+    (results / TASK / "sac_ae" / "seed0" / "visits.npz").write_bytes(b"PK no zip")
+    with pytest.raises(ResultsError, match=r"visits\.npz cannot be read"):
+        statistics.state_coverage(read_results(results)[0])
+    with pytest.raises(ResultsError, match="is no folder"):
+        read_results(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ResultsError, match="holds no experiment"):
+        read_results(tmp_path / "empty")
+
+
+def test_names_in_the_grid_cannot_leave_the_folder(results: Path) -> None:
+    write_grid(results, methods={"../../secret": {}, "sac_ae": {}})
+    with pytest.raises(ResultsError, match="cannot be the name of a folder"):
+        read_results(results)
