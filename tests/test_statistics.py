@@ -187,6 +187,18 @@ def test_rliable_aggregates(tmp_path: Path) -> None:
     assert statistics.aggregate(experiment).iqm == aggregates.iqm  # type: ignore[union-attr]
 
 
+@given(st.integers(2, 6), st.integers(1, 4), st.integers(0, 1000))
+def test_measures_are_those_of_rliable(seeds: int, tasks: int, seed: int) -> None:
+    """With ties, too: scores are tenths."""
+    metrics, library = pytest.importorskip("rliable.metrics"), pytest.importorskip("rliable.library")
+    arm, base = np.random.default_rng(seed).integers(0, 11, (2, seeds, tasks)) / 10
+    taus = np.linspace(0, 1, 7)
+    assert statistics.interquartile_mean(arm) == pytest.approx(metrics.aggregate_iqm(arm))
+    expected = metrics.probability_of_improvement(arm, base)
+    assert statistics.probability_of_improvement(arm, base) == pytest.approx(expected)
+    np.testing.assert_allclose(statistics.share_above(arm, taus), library.score_distributions(arm, taus))
+
+
 def test_missing_rliable_is_one_sentence(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rliable", None)
     with pytest.raises(ResultsError, match=r"pip install 'sb3-cure\[experiments\]'"):
