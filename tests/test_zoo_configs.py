@@ -1,71 +1,124 @@
-"""The YAML files hold the paper's settings and can be trained by rl-zoo3."""
+"""The YAML files hold the paper's settings, or the demo's, and rl-zoo3 trains from each of them."""
 
+import copy
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
-import rl_zoo3.utils
 import yaml
-from rl_zoo3.exp_manager import ExperimentManager
 
-import sb3_cure  # noqa: F401  (registers the ids)
-from sb3_cure import CuReSAC
-from sb3_cure.envs import make_dmc_env
+from sb3_cure import CuReSAC, zoo
+from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
 
-CONFIG = Path(__file__).parent.parent / "zoo_configs" / "cure_sac.yml"
-ENTRIES = yaml.safe_load(CONFIG.read_text())
-SIX_TASKS = {
-    "dmc_pixels/cartpole-swingup-v0",
-    "dmc_pixels/finger-spin-v0",
-    "dmc_pixels/finger-turn_easy-v0",
-    "dmc_pixels/reacher-easy-v0",
-    "dmc_pixels/reacher-hard-v0",
-    "dmc_pixels/ball_in_cup-catch-v0",
+FOLDER = Path(__file__).parent.parent / "zoo_configs"
+METHODS = {
+    "sac_ae": {"srl": "rae", "curiosity": None},
+    "curl": {"srl": "curl", "curiosity": None},
+    "cure_sac_ae": {"srl": "rae", "curiosity": "separate"},
+    "cure_curl": {"srl": "curl", "curiosity": "separate"},
 }
+# Task: action repeat
+SIX_TASKS = {
+    "dmc_pixels/cartpole-swingup-v0": 8,
+    "dmc_pixels/finger-spin-v0": 2,
+    "dmc_pixels/finger-turn_easy-v0": 2,
+    "dmc_pixels/reacher-easy-v0": 4,
+    "dmc_pixels/reacher-hard-v0": 4,
+    "dmc_pixels/ball_in_cup-catch-v0": 4,
+}
+# A task that no file names
+ANY_OTHER = "dmc_pixels/cheetah-run-v0"
+# Networks of the files' own sizes take a second to initialise.
+SMALL = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4}}
 
 
-def test_the_papers_six_tasks_and_a_default() -> None:
-    """All six tasks are there, as registered ids, and a default for any other."""
-    assert ENTRIES.keys() == SIX_TASKS | {"default"}
-    assert SIX_TASKS <= gym.registry.keys()
+def entries(folder: Path) -> list[tuple[str, str]]:
+    """Method and task of every entry of the files in a folder, ``default`` as a task that has none of its own."""
+    found = [(path.stem, name) for path in sorted(folder.glob("*.yml")) for name in yaml.safe_load(path.read_text())]
+    return [(method, ANY_OTHER if name == "default" else name) for method, name in found]
 
 
-@pytest.mark.parametrize("name", ENTRIES)
-def test_entries_hold_the_papers_table(name: str) -> None:
-    """Batch 128, capacity 80 000, p_c 0.2, ... and 500k environment steps in agent steps."""
-    entry = ENTRIES[name]
+def entry_of(path: Path, task: str) -> dict[str, Any]:
+    """What the file says about a task."""
+    content = yaml.safe_load(path.read_text())
+    return content.get(task, content["default"])
+
+
+def set_up(config: Path, task: str, log_folder: Path, **changes: Any) -> tuple[CuReSAC, zoo.ExperimentManager]:
+    """The model and the manager of a training from this file, as ``sb3-cure train`` makes them."""
+    zoo.register()
+    changes = copy.deepcopy(changes)  # SB3 adds to policy_kwargs
+    arguments = type("Arguments", (), {})()
+    n_timesteps = changes.pop("n_timesteps", 0)
+    manager = zoo.ExperimentManager(
+        arguments, "cure_sac", task, str(log_folder), n_timesteps=n_timesteps, config=str(config),
+        hyperparams=changes, eval_freq=-1, n_eval_episodes=1, device="cpu", verbose=0,
+    )  # fmt: skip
+    model, _ = manager.setup_experiment()  # type: ignore[misc]
+    return model, manager  # type: ignore[return-value]
+
+
+def test_the_files_and_their_entries() -> None:
+    """Each method twice; the paper's six tasks and a default, all registered ids."""
+    for folder in (FOLDER, FOLDER / "fast"):
+        assert {path.stem for path in folder.glob("*.yml")} == METHODS.keys()
+    for method in METHODS:
+        names = yaml.safe_load((FOLDER / f"{method}.yml").read_text()).keys()
+        assert names == SIX_TASKS.keys() | {"default"}
+        assert "default" in yaml.safe_load((FOLDER / "fast" / f"{method}.yml").read_text())
+    assert {task for folder in (FOLDER, FOLDER / "fast") for _, task in entries(folder)} <= gym.registry.keys()
+
+
+@pytest.mark.parametrize(("method", "task"), entries(FOLDER))
+def test_every_entry_is_the_papers_table(method: str, task: str, tmp_path: Path) -> None:
+    """rl-zoo3 builds each entry: the paper's numbers, action repeats, image sizes, and 500k environment steps."""
+    path = FOLDER / f"{method}.yml"
+    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
     table = dict(
-        batch_size=128, buffer_size=80_000, gamma=0.99, curiosity_prob=0.2, learning_rate=1e-3, tau=0.01,
-        target_update_interval=2, actor_update_interval=2, ent_coef="auto_0.1", learning_starts=1000,
-        policy_kwargs="dict(net_arch=[1024, 1024])",
+        **METHODS[method], batch_size=128, buffer_size=80_000, gamma=0.99, learning_starts=1000, tau=0.01,
+        encoder_tau=0.05, target_update_interval=2, actor_update_interval=2, ent_coef="auto_0.1", gradient_steps=-1,
+        warmup_updates=1000 if model.srl == "rae" else 0, curiosity_prob=0.2, curiosity_gamma=0.99, curiosity_beta=1.0,
     )  # fmt: skip
-    assert {key: entry[key] for key in table} == table
-    domain = name.removeprefix("dmc_pixels/").split("-")[0]
-    repeat = {"cartpole": 8, "finger": 2}.get(domain, 4)
-    assert entry["n_timesteps"] * repeat == 500_000
+    assert {name: getattr(model, name) for name in table} == table
+    assert model.lr_schedule(1) == 1e-3
+    assert entry_of(path, task)["policy_kwargs"] == {"net_arch": [1024, 1024]}
+    repeat = model.env.get_attr("action_repeat")[0]  # type: ignore[union-attr]
+    assert repeat == SIX_TASKS.get(task, 4)
+    assert manager.n_timesteps * repeat == 500_000
+    # CURL crops 84 pixels out of 100; the encoder of all methods sees 84.
+    size = 100 if model.srl == "curl" else 84
+    assert model.observation_space.shape == (9, size, size)
 
 
-def test_rl_zoo_builds_and_trains_the_agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """rl-zoo3 reads the file, passes every setting to CuReSAC and trains it on the real environment."""
-    monkeypatch.setitem(rl_zoo3.utils.ALGOS, "cure_sac", CuReSAC)
-    monkeypatch.setitem(rl_zoo3.exp_manager.ALGOS, "cure_sac", CuReSAC)
-    manager = ExperimentManager(
-        type("Arguments", (), {"conf_file": str(CONFIG)})(),
-        "cure_sac",
-        "dmc_pixels/cartpole-swingup-v0",
-        str(tmp_path),
-        n_timesteps=3,
-        config=str(CONFIG),
-        # The paper's sizes would take minutes here.
-        hyperparams=dict(
-            learning_starts=2, warmup_updates=1, batch_size=2, buffer_size=100,
-            policy_kwargs="dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))",
-        ),
-    )  # fmt: skip
-    model, _ = manager.setup_experiment()
-    assert isinstance(model, CuReSAC)
-    assert (model.srl, model.curiosity, model.curiosity_prob) == ("rae", "separate", 0.2)
-    assert model.observation_space == make_dmc_env("cartpole", "swingup").observation_space
-    model.learn(3)
-    # One burst, then one update for the step after the warm-up.
-    assert model._n_updates == 2
+@pytest.mark.parametrize(("method", "task"), entries(FOLDER / "fast"))
+def test_every_fast_entry_is_the_demos_settings(method: str, task: str, tmp_path: Path) -> None:
+    """The demo's networks and, for cartpole, its camera; 100k environment steps."""
+    path = FOLDER / "fast" / f"{method}.yml"
+    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
+    expected = {**SETTINGS, **METHODS[method]}
+    if model.srl == "rae":
+        expected.update(srl_kwargs={}, warmup_updates=1000)
+    assert entry_of(path, task)["policy_kwargs"] == expected.pop("policy_kwargs")
+    assert {name: getattr(model, name) for name in expected} == expected
+    assert manager.env_kwargs == (ENV_KWARGS if "cartpole" in task else {"image_size": 48, "renderer": "fast"})
+    assert manager.n_timesteps * model.env.get_attr("action_repeat")[0] == 100_000  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("path", [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS])
+def test_each_file_trains(path: str, tmp_path: Path) -> None:
+    """50 steps in two real environments; those of the evaluation show the same pixels."""
+    burst = min(entry_of(FOLDER / path, ANY_OTHER)["warmup_updates"], 3)
+    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=30, warmup_updates=burst, buffer_size=200)
+    model, manager = set_up(
+        FOLDER / path, "dmc_pixels/cartpole-swingup-v0", tmp_path, n_timesteps=50, n_envs=2, **small
+    )
+    manager.learn(model)
+    assert model.num_timesteps == 50
+    # The burst, then an update per agent step.
+    assert model._n_updates == burst + 20
+    assert model.logger.name_to_value["train/srl_loss"] is not None
+    evaluation = manager.create_envs(1, eval_env=True, no_log=True)
+    assert evaluation.observation_space == model.observation_space
+    assert evaluation.get_attr("renderer") == ["fast" if "fast/" in path else "dmc"]
+    evaluation.close()

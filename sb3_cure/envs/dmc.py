@@ -166,3 +166,7 @@ def make_dmc_env(
     env = ActionRepeat(NormalizeActions(env), action_repeat)
     env = DMCPixels(env, image_size, grayscale, camera_id, renderer)
     return StackFrames(env, frame_stack)
+
+
+# With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) when it is asked for "human".
+make_dmc_env.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]

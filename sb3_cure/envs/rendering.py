@@ -19,6 +19,13 @@ def _missing(cause: object) -> GLUnavailableError:
     )
 
 
+def is_headless() -> bool:
+    """
+    :return: Whether there is no display to open a window on
+    """
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if there is no display and ``MUJOCO_GL`` is not set.
@@ -28,8 +35,7 @@ def load_gl() -> None:
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
-    headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if headless:
+    if is_headless():
         os.environ.setdefault("MUJOCO_GL", "egl")
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -42,7 +48,7 @@ def load_gl() -> None:
     if backend in (None, "off"):
         raise _missing("no rendering backend")
     # dm_control prefers GLFW when it is imported without MUJOCO_GL, even here, where that aborts the process.
-    if backend == "glfw" and headless:
+    if backend == "glfw" and is_headless():
         raise GLUnavailableError(
             "dm_control was imported with its GLFW backend, which needs a display, and there is none; set "
             "MUJOCO_GL=egl before starting Python."
