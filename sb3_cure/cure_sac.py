@@ -751,6 +751,7 @@ class CuReSAC(SAC):
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str = "pretrain",
+        reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfCuReSAC:
         """Pretrain the representation without task reward (paper, "Effect of Pretraining").
@@ -765,6 +766,7 @@ class CuReSAC(SAC):
         :param callback: SB3 callback(s)
         :param log_interval: Episodes between two dumps of the logger
         :param tb_log_name: Name of the run in TensorBoard
+        :param reset_num_timesteps: False: go on with the pretraining in which a loaded checkpoint was taken
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         :raises ValueError: if there is no SRL head, or the collector is unknown or has nothing to learn from
@@ -789,7 +791,7 @@ class CuReSAC(SAC):
             self._setup_curious_temperature()
         self._create_agents()
         try:
-            self._learn(total_timesteps, callback, log_interval, tb_log_name, True, progress_bar)
+            self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
             self._end_pretraining()
         return self

@@ -7,25 +7,21 @@ Writes ``learning_curve.csv/png``, ``reconstructions.png``, ``srl_error.csv/png`
 """
 
 import argparse
-import csv
 import json
-import platform
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stable_baselines3
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import even_negatives, run_episodes
 from sb3_cure.experiments import plots
+from sb3_cure.experiments.files import describe_run, write_csv
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.experiments.video import write_video
 
@@ -63,32 +59,6 @@ class TimeLimit(BaseCallback):
 
     def _on_step(self) -> bool:
         return time.monotonic() < self.deadline
-
-
-def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """
-    :param path: File to write
-    :param rows: Rows with the same keys, which become the header
-    """
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0].keys())
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def describe_run() -> dict[str, Any]:
-    """
-    :return: Versions and machine, to be kept beside results
-    """
-    return {
-        "versions": {
-            "sb3_cure": sb3_cure.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": th.__version__,
-            "python": platform.python_version(),
-        },
-        "machine": f"{platform.machine()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
-    }
 
 
 class RecordCurve(EvalBothCallback):
@@ -160,22 +130,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     random_return, final_return = float(np.mean(returns["random"])), float(np.mean(returns["task"]))
 
     title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({SETTINGS['srl']}), seed {options.seed}"
-    write_csv(options.out / "learning_curve.csv", curve.rows)
+    write_csv(options.out / "learning_curve.csv", list(curve.rows[0]), curve.rows)
     plots.learning_curve(options.out / "learning_curve.png", curve.rows, random_return, title)
-    write_csv(
-        options.out / "srl_error.csv",
-        [
-            {
-                "policy": actor,
-                "min": errors[actor].min(),
-                "mean": errors[actor].mean(),
-                "max": errors[actor].max(),
-                "return_mean": np.mean(returns[actor]),
-                "return_std": np.std(returns[actor]),
-            }
-            for actor in errors
-        ],
-    )
+    table = [
+        {
+            "policy": actor,
+            "min": errors[actor].min(),
+            "mean": errors[actor].mean(),
+            "max": errors[actor].max(),
+            "return_mean": np.mean(returns[actor]),
+            "return_std": np.std(returns[actor]),
+        }
+        for actor in errors
+    ]
+    write_csv(options.out / "srl_error.csv", list(table[0]), table)
     plots.srl_error_bars(options.out / "srl_error.png", errors, "SRL error that each policy sees")
     strip = reconstruct_with_probe(model, env.get_wrapper_attr("frame_stack"))
     if strip is not None:

@@ -21,7 +21,8 @@ import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.evaluation import run_episodes
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve, describe_run, write_csv
+from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve
+from sb3_cure.experiments.files import describe_run, write_csv
 
 MODES = ("sequential", "joint")
 HEADS: dict[str, dict[str, Any]] = {
@@ -101,7 +102,7 @@ def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
     )
     model.learn(steps, callback=curve)
     path.with_suffix(".json").write_text(json.dumps({"seed": seed, **describe_run()}, indent=2) + "\n")
-    write_csv(path, curve.rows)
+    write_csv(path, list(curve.rows[0]), curve.rows)
 
 
 def read_cells(folder: Path) -> dict[tuple[str, str], dict[int, Rows]]:

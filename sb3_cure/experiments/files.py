@@ -1,0 +1,99 @@
+"""Files of results: written whole or not at all, and what every result says about where it comes from."""
+
+import csv
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import stable_baselines3
+import torch as th
+
+import sb3_cure
+
+Row = dict[str, Any]
+
+
+def describe_run() -> dict[str, Any]:
+    """
+    :return: Versions, machine and commit, to be kept beside results
+    """
+    threads = th.get_num_threads()
+    return {
+        "versions": {
+            "sb3_cure": sb3_cure.__version__,
+            "stable_baselines3": stable_baselines3.__version__,
+            "torch": th.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": f"{platform.machine()}, {threads} threads, {th.backends.cpu.get_cpu_capability()}",
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """Of the checkout that the package lies in, marked where it has changes; None for an installed package."""
+    root = Path(sb3_cure.__file__).parent.parent
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def read_rows(path: Path) -> list[Row]:
+    """
+    :param path: A CSV file
+    :return: Its rows; numbers are numbers, missing values ``""``
+    """
+    with path.open(newline="") as file:
+        return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def write_text(path: Path, text: str) -> None:
+    """All of it or nothing: written beside, then renamed.
+
+    :param path: File to write
+    :param text: Its content
+    """
+    beside = path.with_name(f".{path.name}.new")
+    with beside.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """
+    :param path: File to write, whole or not at all
+    :param content: Its content
+    """
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
+    """
+    :param path: File to write, whole or not at all
+    :param columns: The header, and the order of the values
+    :param rows: Mappings that have all columns
+    """
+    lines = [columns, *([row[column] for column in columns] for row in rows)]
+    beside = path.with_name(f".{path.name}.new")
+    with beside.open("w", newline="") as file:
+        csv.writer(file).writerows(lines)
+    beside.replace(path)

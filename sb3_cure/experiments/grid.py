@@ -1,0 +1,294 @@
+"""Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
+
+import inspect
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from sb3_cure.cure_sac import CuReSAC
+
+KINDS = ("curves", "visitation", "pretraining")
+COLLECTORS = ("curious", "random")
+_GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "methods", "baseline"}
+_METHOD_KEYS = {"config", "overrides", "pretrain", "train"}
+# Of a zoo entry: what is no argument of CuReSAC. `n_timesteps` is rl-zoo's; here the grid's budget says how long.
+_ENTRY_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
+_ARGUMENTS = (set(inspect.signature(CuReSAC).parameters) | set(inspect.signature(CuReSAC.__mro__[1]).parameters)) - {
+    "env",
+    "kwargs",
+    "seed",
+}
+
+
+class GridError(ValueError):
+    """A grid file or a choice from it that cannot be run; the message is for its author."""
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """A phase of representation learning without task reward, before training.
+
+    :param collector: ``"curious"`` or ``"random"``, see ``CuReSAC.pretrain``
+    :param budget: Environment steps
+    """
+
+    collector: str
+    budget: int
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run.
+
+    :param experiment: Name of the grid
+    :param kind: One of ``KINDS``
+    :param task: Gymnasium id
+    :param method: Name of the arm
+    :param seed: Seed of weights, warm-up, environment; the arms of a seed share them
+    :param budget: Environment steps of training; 0 for pretraining alone
+    :param eval_every: Environment steps between two evaluations
+    :param eval_episodes: Episodes of an evaluation
+    :param n_envs: Environments side by side
+    :param env_kwargs: Arguments of ``gymnasium.make``
+    :param arguments: Arguments of ``CuReSAC`` but for environment and seed
+    :param pretrain: The phase before training, if any
+    """
+
+    experiment: str
+    kind: str
+    task: str
+    method: str
+    seed: int
+    budget: int
+    eval_every: int
+    eval_episodes: int
+    n_envs: int
+    env_kwargs: dict[str, Any]
+    arguments: dict[str, Any]
+    pretrain: Pretraining | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies below the folder of results."""
+        return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
+
+    def config(self) -> dict[str, Any]:
+        """What its ``config.json`` holds."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """All cells of an experiment.
+
+    :param experiment: Its name, the folder of its results
+    :param kind: One of ``KINDS``
+    :param baseline: The arm with which the others are compared
+    :param cells: Seed by seed, so that whole comparisons are finished early
+    :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
+    """
+
+    experiment: str
+    kind: str
+    baseline: str
+    cells: tuple[Cell, ...]
+    description: dict[str, Any]
+
+
+def short_name(task: str) -> str:
+    """
+    :param task: Gymnasium id
+    :return: The id without namespace and version: a folder's name
+    """
+    return re.sub(r"-v\d+$", "", task.split("/")[-1])
+
+
+def load_grid(
+    path: str | Path,
+    *,
+    seeds: int | Sequence[int] | None = None,
+    tasks: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    budget: int | None = None,
+) -> Grid:
+    """Read a grid and the zoo files it names.
+
+    :param path: YAML file
+    :param seeds: Instead of the file's: how many (from 0), or which
+    :param tasks: Only these: ids, or ids without namespace and version
+    :param methods: Only these arms
+    :param budget: Environment steps, instead of the file's
+    :return: The grid
+    :raises GridError: with one sentence about what is wrong
+    """
+    path = Path(path)
+    content = _read_yaml(path)
+    _check_keys(content, _GRID_KEYS, {"experiment", "kind", "budget", "tasks", "methods"}, f"{path}")
+    if content["kind"] not in KINDS:
+        raise GridError(f"kind in {path} is {content['kind']!r}, but it must be one of {', '.join(KINDS)}: change it.")
+    _check_name("experiment", content["experiment"], path)
+    budget = _whole_number("budget", content["budget"] if budget is None else budget, path, least=0)
+    evaluation = _mapping("evaluation", content.get("evaluation", {}), path)
+    _check_keys(evaluation, {"every", "episodes"}, set(), f"evaluation in {path}")
+    every = _whole_number("evaluation.every", evaluation.get("every", 10_000), path, least=1)
+    episodes = _whole_number("evaluation.episodes", evaluation.get("episodes", 10), path, least=1)
+    all_seeds = _seeds(content.get("seeds", 1), path)
+    chosen_seeds = all_seeds if seeds is None else _seeds(seeds, path)
+    all_tasks = _tasks(content["tasks"], path)
+    chosen_tasks = _choose(tasks, all_tasks, "task", path)
+    arms = _mapping("methods", content["methods"], path)
+    for arm in arms:
+        _check_name("a method", arm, path)
+    chosen_arms = _choose(methods, {name: name for name in arms}, "method", path)
+    baseline = content.get("baseline", next(iter(arms), ""))
+    if baseline not in arms:
+        raise GridError(f"baseline in {path} is {baseline!r}, but the methods are {', '.join(arms)}: name one of them.")
+
+    resolved = {
+        (task, arm): _resolve(path, task, arm, _mapping(f"methods.{arm}", arms[arm], path))
+        for task in chosen_tasks
+        for arm in chosen_arms
+    }
+    cells = tuple(
+        Cell(
+            experiment=content["experiment"],
+            kind=content["kind"],
+            task=task,
+            method=arm,
+            seed=seed,
+            eval_every=every,
+            eval_episodes=episodes,
+            budget=budget if resolved[task, arm]["train"] else 0,
+            **{key: value for key, value in resolved[task, arm].items() if key != "train"},
+        )
+        for seed in chosen_seeds
+        for task in chosen_tasks
+        for arm in chosen_arms
+    )
+    description = {
+        "experiment": content["experiment"],
+        "kind": content["kind"],
+        "budget": budget,
+        "seeds": sorted({*all_seeds, *chosen_seeds}),
+        "tasks": list(dict.fromkeys(all_tasks.values())),
+        "methods": arms,
+        "baseline": baseline,
+        "evaluation": {"every": every, "episodes": episodes},
+    }
+    return Grid(content["experiment"], content["kind"], baseline, cells, description)
+
+
+def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[str, Any]:
+    """What an arm means on a task: the zoo file's entry with the grid's overrides."""
+    where = f"methods.{arm} in {path}"
+    _check_keys(method, _METHOD_KEYS, {"config"}, where)
+    config_path = path.parent / str(method["config"])
+    entries = _read_yaml(config_path)
+    if task not in entries and "default" not in entries:
+        raise GridError(f"{config_path} has neither {task!r} nor 'default', but {where} needs one: add one of them.")
+    entry = _mapping(task, entries.get(task, entries.get("default")), config_path)
+    entry = {**entry, **_mapping("overrides", method.get("overrides", {}), path)}
+    unknown = sorted(set(entry) - _ENTRY_KEYS - _ARGUMENTS)
+    if unknown:
+        raise GridError(
+            f"{unknown[0]!r} in {config_path} or the overrides of {where} is no argument of CuReSAC: correct or "
+            "remove it (grids know n_envs and env_kwargs besides, but no other key of rl-zoo)."
+        )
+    arguments = {key: value for key, value in entry.items() if key not in _ENTRY_KEYS}
+    for key, value in arguments.items():
+        if key.endswith("_kwargs") and not isinstance(value, dict):
+            raise GridError(
+                f"{key} in {config_path} is {value!r}, but grids evaluate no strings: write a YAML mapping."
+            )
+    pretrain = None
+    if "pretrain" in method:
+        phase = _mapping("pretrain", method["pretrain"], path)
+        _check_keys(phase, {"collector", "budget"}, {"collector", "budget"}, f"pretrain of {where}")
+        if phase["collector"] not in COLLECTORS:
+            raise GridError(
+                f"pretrain.collector of {where} is {phase['collector']!r}, but it must be 'curious' or 'random': "
+                "choose one of them."
+            )
+        pretrain = Pretraining(phase["collector"], _whole_number("pretrain.budget", phase["budget"], path, least=1))
+    trains = method.get("train", True)
+    if not isinstance(trains, bool):
+        raise GridError(f"train of {where} is {trains!r}, but it must be true or false: change it.")
+    return {
+        "n_envs": _whole_number("n_envs", entry.get("n_envs", 1), config_path, least=1),
+        "env_kwargs": _mapping("env_kwargs", entry.get("env_kwargs", {}), config_path),
+        "arguments": {"policy": "CnnPolicy", **arguments},
+        "pretrain": pretrain,
+        "train": trains,
+    }
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise GridError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise GridError(f"{path} is no YAML ({' '.join(str(error).split())}): correct it.") from None
+    return _mapping("the content", content, path)
+
+
+def _mapping(name: str, value: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise GridError(f"{name} in {path} is {value!r}, but it must be a mapping (key: value): change it.")
+    return dict(value)
+
+
+def _check_keys(mapping: dict[str, Any], known: set[str], needed: set[str], where: str) -> None:
+    for key in mapping:
+        if key not in known:
+            raise GridError(f"{key!r} in {where} is unknown, but the keys are {', '.join(sorted(known))}: correct it.")
+    for key in sorted(needed - set(mapping)):
+        raise GridError(f"{where} has no {key!r}, which it needs: add it.")
+
+
+def _check_name(key: str, value: Any, path: Path) -> None:
+    if not isinstance(value, str) or not re.fullmatch(r"[\w.-]*\w[\w.-]*", value):
+        raise GridError(
+            f"{key} in {path} is {value!r}, but it names a folder: use letters, digits, '-', '_' and '.' only."
+        )
+
+
+def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or value < least:
+        raise GridError(f"{key} in {path} is {value!r}, but it must be a whole number, {least} or more: change it.")
+    return int(value)
+
+
+def _seeds(value: Any, path: Path) -> list[int]:
+    numbers = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
+    valid = isinstance(numbers, Sequence) and not isinstance(numbers, str) and len(numbers) > 0
+    if not valid or not all(isinstance(number, int) and number >= 0 for number in numbers):
+        raise GridError(f"seeds in {path} is {value!r}, but it must be how many (1 or more) or a list of seeds.")
+    return list(dict.fromkeys(numbers))
+
+
+def _tasks(value: Any, path: Path) -> dict[str, str]:
+    """By both their names."""
+    if not isinstance(value, list) or not value:
+        raise GridError(f"tasks in {path} is {value!r}, but it must be a list of Gymnasium ids: write some.")
+    for task in value:
+        if task not in gym.registry:
+            raise GridError(
+                f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
+                "dmc_pixels/<domain>-<task>-v0)."
+            )
+    return {**{short_name(task): task for task in value}, **{task: task for task in value}}
+
+
+def _choose(names: Sequence[str] | None, known: dict[str, str], what: str, path: Path) -> list[str]:
+    """In the file's order; known: by each of its names."""
+    for name in names or ():
+        if name not in known:
+            raise GridError(f"{what} {name!r} is not in {path}, which has {', '.join(known)}: choose among these.")
+    chosen = known.values() if names is None else {known[name] for name in names}
+    return [name for name in dict.fromkeys(known.values()) if name in set(chosen)]

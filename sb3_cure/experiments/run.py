@@ -1,0 +1,298 @@
+"""Run a grid: in this process, or on Ray (this machine or a cluster)."""
+
+import argparse
+import json
+import re
+import threading
+import time
+import traceback
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from sb3_cure.allocator import tune_allocator
+from sb3_cure.experiments.cells import DONE, run_cell
+from sb3_cure.experiments.files import write_json, write_text
+from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
+from sb3_cure.experiments.visitation import measure_common_heads
+
+ENGINES = ("local", "ray")
+#: The file that tells why a cell failed; gone when it succeeds
+ERROR = "error.txt"
+
+
+def run_grid(
+    grid: Grid,
+    results: str | Path,
+    *,
+    engine: str = "local",
+    checkpoint_minutes: float = 10.0,
+    address: str | None = None,
+    cpus_per_cell: float = 1,
+    gpus_per_cell: float = 0,
+    retries: int = 3,
+) -> list[Cell]:
+    """Run the cells that are not done; started again after any interruption, it goes on.
+
+    :param grid: The grid
+    :param results: Folder of all results; with several machines one that they share
+    :param engine: ``"local"``: one cell after the other in this process; ``"ray"``: side by side in worker processes
+    :param checkpoint_minutes: At most so many minutes of a cell are lost by an interruption
+    :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
+    :param cpus_per_cell: Ray: cores per cell, also its threads
+    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card
+    :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
+    :return: The cells that failed; each has its traceback in ``error.txt``
+    """
+    results = Path(results).resolve()
+    _keep_grid(grid, results / grid.experiment)
+    left = [cell for cell in grid.cells if not (results / cell.folder / DONE).exists()]
+    with _live_progress(grid.cells, results):
+        if engine == "ray":
+            resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
+            failed = _run_with_ray(left, results, checkpoint_minutes, address, resources)
+        else:
+            failed = [cell for cell in left if not _run_and_tell(cell, results, checkpoint_minutes)]
+    if grid.kind == "visitation":
+        for sentence in measure_common_heads(grid, results):
+            print(f"No common heads for {sentence}.")
+    return failed
+
+
+def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float) -> bool:
+    """Whether the cell could be run; a failure must not stop the others."""
+    error = results / cell.folder / ERROR
+    try:
+        run_cell(cell, results, checkpoint_minutes)
+    except Exception:
+        error.parent.mkdir(parents=True, exist_ok=True)
+        write_text(error, traceback.format_exc())
+        return False
+    error.unlink(missing_ok=True)
+    return True
+
+
+def _run_with_ray(
+    cells: Sequence[Cell], results: Path, checkpoint_minutes: float, address: str | None, resources: dict[str, Any]
+) -> list[Cell]:
+    try:
+        import ray
+    except ImportError:
+        raise GridError('engine="ray" needs Ray, which is not installed: pip install "sb3-cure[cluster]".') from None
+    own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
+    ray.init(address=address, log_to_driver=False, **own)
+    try:
+        run = ray.remote(**resources)(_run_and_tell)
+        pending = {run.remote(cell, results, checkpoint_minutes): cell for cell in cells}
+        failed = []
+        while pending:
+            for reference in ray.wait(list(pending), timeout=5)[0]:
+                cell = pending.pop(reference)
+                try:
+                    succeeded = ray.get(reference)
+                except ray.exceptions.RayError as error:
+                    # The worker has died more often than `retries`: nobody else could have told.
+                    write_text(results / cell.folder / ERROR, f"{error}\n")
+                    succeeded = False
+                if not succeeded:
+                    failed.append(cell)
+        return failed
+    finally:
+        ray.shutdown()
+
+
+def _keep_grid(grid: Grid, folder: Path) -> None:
+    """Write ``grid.json``; what an earlier call ran besides stays part of the experiment."""
+    path = folder / "grid.json"
+    description = dict(grid.description)
+    if path.exists():
+        before = json.loads(path.read_text())
+        description["seeds"] = sorted({*before["seeds"], *description["seeds"]})
+        description["tasks"] = list(dict.fromkeys([*before["tasks"], *description["tasks"]]))
+        description["methods"] = {**before["methods"], **description["methods"]}
+        if before["kind"] != grid.kind:
+            raise GridError(
+                f"{path} is of kind {before['kind']!r}, but this grid is of kind {grid.kind!r}: choose another --out, "
+                "or another name of the experiment."
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(path, description)
+
+
+# -------------------------------------------------------------------- progress
+
+
+@contextmanager
+def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
+    """Show how far all cells are, as their files tell, whichever process or machine runs them."""
+    console = Console()
+    stopped = threading.Event()
+
+    def refresh(live: Live) -> None:
+        while not stopped.wait(1.0):
+            live.update(progress_table(cells, results))
+
+    with Live(progress_table(cells, results), console=console, auto_refresh=console.is_terminal) as live:
+        thread = threading.Thread(target=refresh, args=(live,), daemon=True)
+        if console.is_terminal:
+            thread.start()
+        try:
+            yield
+        finally:
+            stopped.set()
+            if thread.is_alive():
+                thread.join()
+            live.update(progress_table(cells, results), refresh=True)
+
+
+def progress_table(cells: Sequence[Cell], results: Path) -> Table:
+    """
+    :param cells: The cells of a grid
+    :param results: Folder of all results
+    :return: What is done, how fast it goes, when it will be finished
+    """
+    table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
+    n_done, left, speed = 0, 0.0, 0.0
+    for cell in cells:
+        state, progress = read_progress(cell, results)
+        n_done += state == "done"
+        total = cell.budget + (cell.pretrain.budget if cell.pretrain else 0)
+        done = progress.get("environment_steps", 0)
+        if cell.pretrain and progress.get("phase") == "train":
+            done += cell.pretrain.budget
+        rate = done / progress["seconds"] if progress.get("seconds") else 0.0
+        if state != "done":
+            left += total - done
+        if state == "running":
+            speed += rate
+        if state in ("running", "interrupted", "failed"):
+            best = progress.get("best_return")
+            table.add_row(
+                *(cell.folder.parts[1], cell.method, str(cell.seed), state, f"{done:,} of {total:,}"),
+                *(
+                    f"{rate:.1f}",
+                    _duration((total - done) / rate) if rate else "",
+                    "" if best is None else f"{best:.0f}",
+                ),
+            )
+    eta = f", about {_duration(left / speed)} left" if speed else ""
+    table.caption = f"{n_done} of {len(cells)} cells done, {speed:.1f} environment steps/s{eta}"
+    return table
+
+
+def read_progress(cell: Cell, results: Path) -> tuple[str, dict[str, Any]]:
+    """
+    :param cell: A cell
+    :param results: Folder of all results
+    :return: ``"done"``, ``"failed"``, ``"running"``, ``"interrupted"`` or ``"waiting"``, and its ``progress.json``
+    """
+    folder = results / cell.folder
+    try:
+        progress = json.loads((folder / "progress.json").read_text())
+    except (OSError, ValueError):
+        progress = {}
+    if (folder / DONE).exists():
+        return "done", progress
+    if (folder / ERROR).exists():
+        return "failed", progress
+    if not progress:
+        return "waiting", progress
+    # Evaluations and bursts of updates are silent.
+    return ("running" if time.time() - progress["time"] < 600 else "interrupted"), progress
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
+
+
+# ---------------------------------------------------------------- command line
+
+
+def _steps(text: str) -> int:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps: write for example 100000, 100k or 1M")
+    return round(float(match[1]) * {"": 1, "k": 1_000, "M": 1_000_000}[match[2]])
+
+
+def _seed_choice(text: str) -> int | list[int]:
+    try:
+        numbers = [int(part) for part in text.split(",") if part]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} names no seeds: write how many (5), or which (0,3,4)") from None
+    return numbers if "," in text else numbers[0]
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """``sb3-cure experiment``.
+
+    :param arguments: Command line, ``sys.argv`` by default
+    :return: 0 if all cells are done, else 1
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-cure experiment",
+        description="Run a grid of experiments; what is done is not run again, what was interrupted goes on.",
+    )
+    parser.add_argument("grid", type=Path, help="YAML file, for example zoo_configs/experiments/curves.yml")
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder of results (default: results)")
+    parser.add_argument("--seeds", type=_seed_choice, help="how many (5), or which (0,3,4; one alone: 3,)")
+    parser.add_argument("--tasks", type=_names, help="some of the grid's tasks: cartpole-swingup,finger-spin")
+    parser.add_argument("--methods", type=_names, help="some of the grid's methods")
+    parser.add_argument("--budget", type=_steps, help="environment steps of training, for example 100k")
+    parser.add_argument("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
+    parser.add_argument("--address", help="of a Ray cluster (auto: the one this machine is part of)")
+    parser.add_argument("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
+    parser.add_argument("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell, such as 0.25")
+    parser.add_argument("--retries", type=int, default=3, help="Ray: new starts of a cell whose worker died")
+    parser.add_argument("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
+    parser.add_argument("--dry-run", action="store_true", help="list the cells and their states, run nothing")
+    options = parser.parse_args(arguments)
+    try:
+        grid = load_grid(
+            options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
+        )
+        if options.dry_run:
+            for cell in grid.cells:
+                print(f"{cell.folder}: {read_progress(cell, options.out)[0]}")
+            return 0
+        if options.engine == "local" and (options.address or options.gpus_per_cell):
+            raise GridError("--address and --gpus-per-cell are of Ray: add --engine ray.")
+        tune_allocator()
+        failed = run_grid(
+            grid,
+            options.out,
+            engine=options.engine,
+            checkpoint_minutes=options.checkpoint_minutes,
+            address=options.address,
+            cpus_per_cell=options.cpus_per_cell,
+            gpus_per_cell=options.gpus_per_cell,
+            retries=options.retries,
+        )
+    except GridError as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        print("Stopped; the same command goes on from the last checkpoints.")
+        return 130
+    for sentence in _failures(failed, options.out):
+        print(sentence)
+    return 1 if failed else 0
+
+
+def _failures(failed: Iterable[Cell], results: Path) -> Iterator[str]:
+    for cell in failed:
+        path = results / cell.folder / ERROR
+        yield f"{cell.folder} failed: {path.read_text().strip().splitlines()[-1]} ({path})"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
