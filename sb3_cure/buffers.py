@@ -225,12 +225,26 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :return: Batch on ``device``
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
-        if np.any((self.pos - 1 - batch_inds) % self.buffer_size >= self._n_valid):
+        return self.transitions(batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),)), env)
+
+    def transitions(
+        self, rows: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> ReplayBufferSamples:
+        """
+        The given transitions, to look at what is stored.
+
+        :param rows: Row positions, as of ``_get_samples``, [n]
+        :param env_inds: Environment of each, [n]
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: Batch on ``device``
+        :raises IndexError: If a row is empty, or its frames have been overwritten
+        """
+        if np.any((self.pos - 1 - rows) % self.buffer_size >= self._n_valid):
             raise IndexError(
                 f"Some of the rows asked for hold no transition: of {self.buffer_size} rows only the {self._n_valid} "
                 f"before pos={self.pos} are valid; draw rows with sample()."
             )
-        inds = batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        inds = rows, env_inds
         # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of numpy
         slots = th.from_numpy(self.frame_slots[inds].swapaxes(0, 1).ravel())
         obs, next_obs = th.from_numpy(self.frames).index_select(0, slots).view(2, -1, *self.obs_shape).numpy()
@@ -300,6 +314,38 @@ class FrameStackReplayBuffer(ReplayBuffer):
         elif len(stored) > 0:
             self.frames = self._file_for_frames()
             self.frames[: len(stored)] = stored
+
+
+def transitions(
+    buffer: ReplayBuffer, rows: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
+) -> ReplayBufferSamples:
+    """Given transitions of any replay buffer of arrays, where ``sample`` draws them and their environments.
+
+    :param buffer: SB3's ``ReplayBuffer`` or a ``FrameStackReplayBuffer``
+    :param rows: Row positions, [n]
+    :param env_inds: Environment of each, [n]
+    :param env: VecEnv to normalize the observations and rewards with
+    :return: Batch on the buffer's device
+    :raises ValueError: If the buffer holds dictionaries
+    """
+    if isinstance(buffer, FrameStackReplayBuffer):
+        return buffer.transitions(rows, env_inds, env)
+    if not isinstance(buffer.observations, np.ndarray):
+        raise ValueError(
+            f"the replay buffer is a {type(buffer).__name__}, whose observations are dictionaries, but only images and "
+            "vectors can be looked at: train on one of these."
+        )
+    inds = rows, env_inds
+    next_inds = ((rows + 1) % buffer.buffer_size, env_inds)
+    next_obs = buffer.observations[next_inds] if buffer.optimize_memory_usage else buffer.next_observations[inds]
+    data = (
+        buffer._normalize_obs(buffer.observations[inds], env),
+        buffer.actions[inds],
+        buffer._normalize_obs(next_obs, env),
+        (buffer.dones[inds] * (1 - buffer.timeouts[inds])).reshape(-1, 1),
+        buffer._normalize_reward(buffer.rewards[inds].reshape(-1, 1), env),
+    )
+    return ReplayBufferSamples(*(buffer.to_torch(array) for array in data))  # type: ignore[arg-type]
 
 
 def _grown(array: np.ndarray, length: int) -> np.ndarray:

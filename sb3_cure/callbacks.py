@@ -1,13 +1,70 @@
-"""Callbacks for ``learn``."""
+"""Callbacks for ``learn``: evaluation, videos and pictures. All but the SRL errors in them serve any SB3 algorithm."""
+
+import contextlib
+import importlib
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.evaluation import run_episodes, trained_actors
+from sb3_cure.buffers import transitions
+from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
+from sb3_cure.envs.physics import check_coordinates, telling_coordinates
+from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
+from sb3_cure.metrics import newest_frames
 
 
-class EvalBothCallback(BaseCallback):
+class PeriodicCallback(BaseCallback):
+    """Does something every so many agent steps: subclass it and implement ``on_period``.
+
+    The random streams of NumPy and PyTorch are set aside meanwhile: watching a training does not change it.
+
+    :param every: Agent steps between two calls (of all environments together)
+    :param verbose: Verbosity level
+    :raises ValueError: if ``every`` is below 1
+    """
+
+    def __init__(self, every: int, verbose: int = 0):
+        super().__init__(verbose)
+        if every < 1:
+            raise ValueError(f"{type(self).__name__} got every={every}, but it counts agent steps: give a number >= 1.")
+        self.every = every
+        self._last_period = 0
+
+    def _on_training_start(self) -> None:
+        self._last_period = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps - self._last_period >= self.every:
+            self._last_period = self.num_timesteps
+            with _untouched_randomness(self.model.device):
+                self.on_period()
+        return True
+
+    def on_period(self) -> None:
+        """What to do; ``self.model``, ``self.num_timesteps`` and ``self.logger`` are there, as in any callback."""
+        raise NotImplementedError(f"{type(self).__name__} must implement on_period()")
+
+
+@contextlib.contextmanager
+def _untouched_randomness(device: th.device) -> Iterator[None]:
+    numpy_state = np.random.get_state()
+    with th.random.fork_rng([device] if device.type == "cuda" else []):
+        try:
+            yield
+        finally:
+            np.random.set_state(numpy_state)
+
+
+class EvalBothCallback(PeriodicCallback):
     """Evaluate the task policy and the curious policy in separate rollouts.
 
     Logs, for each of them, ``eval/<actor>_reward`` (mean return) and ``eval/<actor>_srl_error`` (mean noise-free SRL
@@ -31,29 +88,23 @@ class EvalBothCallback(BaseCallback):
         seed: int | None = None,
         verbose: int = 0,
     ):
-        super().__init__(verbose)
         if eval_freq < 1 or n_episodes < 1:
             raise ValueError(
                 f"EvalBothCallback got eval_freq={eval_freq} and n_episodes={n_episodes}, but each must be at least 1: "
                 "give numbers >= 1."
             )
+        super().__init__(eval_freq, verbose)
         self.eval_env = eval_env
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
         self.deterministic = deterministic
         self.seed = seed
-        self._last_eval = 0
         #: One row per evaluation: agent steps and the logged values
         self.history: list[dict[str, float]] = []
 
-    def _on_training_start(self) -> None:
-        self._last_eval = self.num_timesteps
-
-    def _on_step(self) -> bool:
-        if self.num_timesteps - self._last_eval >= self.eval_freq:
-            self._last_eval = self.num_timesteps
-            self.evaluate()
-        return True
+    def on_period(self) -> None:
+        """Evaluate."""
+        self.evaluate()
 
     def evaluate(self) -> dict[str, float]:
         """Evaluate now.
@@ -84,3 +135,337 @@ class EvalBothCallback(BaseCallback):
         if self.verbose >= 1:
             print(", ".join(f"{key} {value:.4g}" for key, value in row.items()))
         return row
+
+
+class _PictureCallback(PeriodicCallback):
+    """Writes files into a folder, which is made when the first one is written.
+
+    :param folder: Where to write
+    :param every: Agent steps between two files
+    :param room: The module of ``sb3_cure.experiments`` that draws, which needs the packages of ``sb3-cure[demo]``
+    :param verbose: 1 prints the name of each file
+    """
+
+    def __init__(self, folder: str | Path, every: int, room: str, verbose: int):
+        super().__init__(every, verbose)
+        self.folder = Path(folder)
+        self._import_room(room)
+
+    def _import_room(self, room: str) -> Any:
+        """Drawing packages are imported only for drawing; that one is missing is said before training starts."""
+        try:
+            return importlib.import_module(f"sb3_cure.experiments.{room}")
+        except ModuleNotFoundError as missing:
+            raise ImportError(
+                f"{type(self).__name__} needs the package {missing.name}, which is not installed: run "
+                "`pip install 'sb3-cure[demo]'`."
+            ) from missing
+
+    def _path(self, name: str) -> Path:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / name
+        if self.verbose >= 1:
+            print(f"{type(self).__name__}: {path}")
+        return path
+
+    def _check_actors(self, actors: Sequence[str] | None) -> list[str]:
+        """The actors asked for, or all that are trained, when the model is known."""
+        trained = trained_actors(self.model)  # type: ignore[arg-type]
+        wrong = [actor for actor in actors or trained if actor not in (*trained, "random")]
+        if wrong:
+            raise ValueError(
+                f"{type(self).__name__} got actors={actors!r}, but of {', '.join(map(repr, ACTORS))} this model has "
+                f"{', '.join(map(repr, (*trained, 'random')))}: choose of these."
+            )
+        return list(actors or trained)
+
+
+def _check_env(user: str, eval_env: gym.Env) -> None:
+    if isinstance(eval_env, VecEnv) or not isinstance(eval_env, gym.Env):
+        raise ValueError(
+            f"{user} got eval_env={eval_env!r}, but it watches one environment at a time: give one gymnasium.Env with "
+            "the observations of training."
+        )
+
+
+class PolicyVideoCallback(_PictureCallback):
+    """Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
+
+    Below the camera's picture stand the return so far and, where the model has an SRL head, the SRL error of the
+    observation as a number and as a curve. Works with every SB3 algorithm.
+
+    :param eval_env: One (not vectorised) environment made with ``render_mode="rgb_array"``, not the training one
+    :param folder: Where to write
+    :param every: Agent steps between two videos
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; by default the policies that the model trains
+    :param deterministic: Whether policies act by their mean
+    :param seed: Seed of every reset: all videos then start from the same state
+    :param fps: Pictures per second, one per agent step; by default as the environment tells, else 30
+    :param verbose: 1 prints the name of each video
+    :raises ValueError: if an argument is out of range, or the environment does not render RGB frames
+    :raises ImportError: if imageio is not installed
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env,
+        folder: str | Path,
+        every: int = 5000,
+        actors: Sequence[str] | None = None,
+        deterministic: bool = True,
+        seed: int | None = None,
+        fps: int | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__(folder, every, "video", verbose)
+        _check_env("PolicyVideoCallback", eval_env)
+        if eval_env.render_mode != "rgb_array":
+            raise ValueError(
+                f"PolicyVideoCallback got an environment with render_mode={eval_env.render_mode!r}, which gives no "
+                "frames: make it with render_mode='rgb_array'."
+            )
+        if fps is not None and fps < 1:
+            raise ValueError(f"PolicyVideoCallback got fps={fps}, but a video needs at least 1: give a number >= 1.")
+        self.eval_env = eval_env
+        self.actors = actors
+        self.deterministic = deterministic
+        self.seed = seed
+        self.fps = fps or max(round(eval_env.metadata.get("render_fps") or 30), 1)
+
+    def _init_callback(self) -> None:
+        self._check_actors(self.actors)
+
+    def on_period(self) -> None:
+        """Film an episode of each policy."""
+        video = self._import_room("video")
+        env, steps = self.eval_env, self.num_timesteps
+        repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
+        for actor in self._check_actors(self.actors):
+            (episode,) = run_episodes(
+                self.model,  # type: ignore[arg-type]
+                env,
+                1,
+                actor,
+                deterministic=self.deterministic,
+                seed=self.seed,
+                render=True,
+            )
+            path = self._path(f"{actor}_policy_{steps}_steps.mp4")
+            video.write_video(path, episode, self.fps, repeat, f"{actor} policy after {steps:,} agent steps")
+
+
+class ReconstructionCallback(_PictureCallback):
+    """Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations.
+
+    For heads that do not draw (contrastive ones, say) a decoder is fitted to the latents for each row, anew so that
+    rows can be compared; the agent does not learn from it. The file is rewritten with each row.
+
+    :param folder: Where to write
+    :param every: Agent steps between two rows
+    :param observations: Images to reconstruct, uint8 [n, C, H, W]; the first row is then that of the untrained model.
+        By default ``columns`` from the replay buffer, spread over what it holds when the first row is drawn
+    :param columns: How many observations to take
+    :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment tells
+    :param probe_updates: Updates of the decoder for heads that do not draw; 0: say once that the head does not draw
+    :param max_rows: Where there are more times, rows are left out evenly
+    :param verbose: 1 prints the file's name
+    :raises ValueError: if an argument is out of range, or the model does not learn from images with an encoder of
+        ``CuReSAC``
+    :raises ImportError: if matplotlib is not installed
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        every: int = 5000,
+        observations: np.ndarray | None = None,
+        columns: int = 8,
+        frame_stack: int | None = None,
+        probe_updates: int = 500,
+        max_rows: int = 12,
+        verbose: int = 0,
+    ):
+        super().__init__(folder, every, "plots", verbose)
+        if columns < 1 or probe_updates < 0 or max_rows < 2:
+            raise ValueError(
+                f"ReconstructionCallback got columns={columns}, probe_updates={probe_updates} and max_rows={max_rows}, "
+                "but they must be at least 1, 0 and 2: change them."
+            )
+        self.observations = observations
+        self.columns = columns
+        self.frame_stack = frame_stack
+        self.probe_updates = probe_updates
+        self.max_rows = max_rows
+        #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
+        self.rows: list[tuple[int, np.ndarray]] = []
+        self._said = False
+
+    def _init_callback(self) -> None:
+        space = self.model.observation_space
+        if getattr(self.model.policy, "encoder", None) is None or not is_image_space(space):
+            raise ValueError(
+                f"ReconstructionCallback got a {type(self.model).__name__} that learns from {space}, but it draws "
+                "images from the latents of CuReSAC's encoder: use it with CuReSAC('CnnPolicy', ...)."
+            )
+        if self.observations is not None and self.observations.shape[1:] != space.shape:
+            raise ValueError(
+                f"ReconstructionCallback got observations of shape {self.observations.shape}, but the model learns "
+                f"from {space.shape}: give them as [n, *{space.shape}]."
+            )
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        if self.observations is not None and not self.rows:
+            with _untouched_randomness(self.model.device):
+                self.on_period()
+
+    def on_period(self) -> None:
+        """Add a row."""
+        model: Any = self.model
+        model.policy.set_training_mode(False)
+        if self.observations is None:
+            self.observations = _spread_over(model.replay_buffer, self.columns)
+        observed = th.as_tensor(self.observations, device=model.device)
+        with th.no_grad():
+            drawn = None if model.policy.srl is None else model.policy.srl.reconstruct(model.policy.encode(observed))
+        title = "Reconstructions over training"
+        if drawn is None:
+            if self.probe_updates == 0:
+                self._say_once_that_nothing_is_drawn()
+                return
+            if model.replay_buffer.size() == 0:  # nothing to fit a decoder to before the first steps
+                return
+            probe = self._import_room("probe")
+            decoder = probe.fit_probe(model, self.probe_updates)
+            observed, drawn = probe.draw_with_probe(model, decoder, observed)
+            title = "What a decoder fitted afterwards draws from the latents"
+        attribute = self.training_env.get_attr("frame_stack") if self.training_env.has_attr("frame_stack") else [1]
+        frame_stack = self.frame_stack or attribute[0]
+        self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))
+        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
+        self._import_room("plots").reconstructions_over_training(
+            self._path("reconstructions.png"),
+            newest_frames(observed, frame_stack).cpu().numpy(),
+            [self.rows[index] for index in shown],
+            title,
+        )
+
+    def _say_once_that_nothing_is_drawn(self) -> None:
+        if not self._said:
+            self._said = True
+            warnings.warn(
+                f"ReconstructionCallback draws nothing: the head {type(self.model.policy.srl).__name__} does not "
+                "reconstruct and probe_updates is 0; give probe_updates=500 to fit a decoder to the latents.",
+                stacklevel=2,
+            )
+
+
+def _spread_over(buffer: ReplayBuffer, n: int) -> np.ndarray:
+    """Observations of the replay buffer, spread over the time that it spans, oldest first, [n, *shape]."""
+    ages = np.linspace(buffer.size() - 1, 0, n).round().astype(int)
+    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+    return transitions(buffer, rows, np.zeros(n, int)).observations.cpu().numpy()
+
+
+class CuriosityMapCallback(_PictureCallback):
+    """Map where each policy goes and what SRL error it meets there: ``curiosity_map_<steps>_steps.png``.
+
+    Each policy acts alone for some episodes; the map is drawn over two coordinates of the environment's true state,
+    which the agent does not see. Without an SRL head only visits are drawn. CURL's error is measured against an even
+    mix of what the policies see (``sb3_cure.evaluation.even_negatives``).
+
+    :param eval_env: One (not vectorised) environment, not the training one
+    :param folder: Where to write
+    :param every: Agent steps between two maps
+    :param coordinates: Names of the two coordinates; by default two that suit the domain, or the first two
+    :param state: Function of the environment that returns its true state, [d]; by default that of dm_control:
+        positions and velocities of the joints, see ``sb3_cure.envs.physics_state``
+    :param names: Names of what ``state`` returns, [d], to be given with it
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; by default the policies that the model trains
+    :param n_episodes: Episodes per policy
+    :param deterministic: Whether policies act by their mean
+    :param seed: Seed of every map's first reset: all maps then start from the same states
+    :param bins: Bins along each axis
+    :param verbose: 1 prints the name of each map
+    :raises ValueError: if an argument is out of range, a name unknown, or the environment's state is
+    :raises ImportError: if matplotlib is not installed
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env,
+        folder: str | Path,
+        every: int = 5000,
+        coordinates: tuple[str, str] | None = None,
+        state: Callable[[gym.Env], np.ndarray] | None = None,
+        names: Sequence[str] | None = None,
+        actors: Sequence[str] | None = None,
+        n_episodes: int = 5,
+        deterministic: bool = True,
+        seed: int | None = None,
+        bins: int = 24,
+        verbose: int = 0,
+    ):
+        super().__init__(folder, every, "plots", verbose)
+        _check_env("CuriosityMapCallback", eval_env)
+        if n_episodes < 1 or bins < 1:
+            raise ValueError(
+                f"CuriosityMapCallback got n_episodes={n_episodes} and bins={bins}, but each must be at least 1: give "
+                "numbers >= 1."
+            )
+        if (state is None) != (names is None):
+            given, missing = ("names", "state") if state is None else ("state", "names")
+            raise ValueError(
+                f"CuriosityMapCallback got {given} without {missing}, but a state of your own needs both: a function "
+                "of the environment and the names of what it returns."
+            )
+        self.state = state or physics_state
+        self.names = list(physics_state_names(eval_env) if names is None else names)
+        self.units = physics_state_units(eval_env) if names is None else None
+        self.coordinates = coordinates or telling_coordinates(self.names)
+        check_coordinates(self.coordinates, self.names)
+        self.eval_env = eval_env
+        self.actors = actors
+        self.n_episodes = n_episodes
+        self.deterministic = deterministic
+        self.seed = seed
+        self.bins = bins
+        #: By policy, the states of the last map, [n, d], and their SRL errors, [n]
+        self.visits: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _init_callback(self) -> None:
+        self._check_actors(self.actors)
+
+    def on_period(self) -> None:
+        """Roll out each policy and draw."""
+        model: Any = self.model
+        self.visits = {}
+        with evenly_measured(model, self.eval_env, self.seed):
+            for actor in self._check_actors(self.actors):
+                episodes = run_episodes(
+                    model,
+                    self.eval_env,
+                    self.n_episodes,
+                    actor,
+                    deterministic=self.deterministic,
+                    seed=self.seed,
+                    states=self.state,
+                )
+                pairs = [(episode.states, episode.srl_errors) for episode in episodes]
+                states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+                self.visits[actor] = states, errors
+        if states.shape[1:] != (len(self.names),):
+            raise ValueError(
+                f"CuriosityMapCallback got {len(self.names)} names for states of shape {states.shape[1:]}: state must "
+                "return a vector, and names have one name for each of its values."
+            )
+        steps = self.num_timesteps
+        self._import_room("plots").curiosity_map(
+            self._path(f"curiosity_map_{steps}_steps.png"),
+            self.visits,
+            self.names,
+            f"Where policies go after {steps:,} agent steps",
+            coordinates=self.coordinates,
+            units=self.units,
+            bins=self.bins,
+        )

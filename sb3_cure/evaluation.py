@@ -1,13 +1,16 @@
 """Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_cure.buffers import transitions
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
@@ -86,13 +89,44 @@ def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Non
     head.set_bank(th.as_tensor(np.concatenate(frames)[: len(head.bank)]))  # type: ignore[arg-type]
 
 
-def _actor(model: CuReSAC, env: gym.Env, actor: str, deterministic: bool) -> Callable[[np.ndarray], np.ndarray]:
+@contextlib.contextmanager
+def evenly_measured(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Iterator[None]:
+    """Measure with ``even_negatives`` for a while, and leave the head as it was.
+
+    :param model: A model, also of SB3's own algorithms
+    :param env: One (not vectorised) environment
+    :param seed: Seed of the resets and of random actions
+    """
+    head = getattr(model.policy, "srl", None)
+    if not isinstance(head, CURL) or int(head.bank_filled) == 0:  # type: ignore[arg-type]
+        yield
+        return
+    usual = head.bank[: int(head.bank_filled)].clone()  # type: ignore[index, arg-type]
+    even_negatives(model, env, seed)
+    try:
+        yield
+    finally:
+        head.set_bank(usual)
+
+
+def _actor(
+    model: CuReSAC, env: gym.Env, actor: str, deterministic: bool
+) -> Callable[[np.ndarray, Any, bool], tuple[np.ndarray, Any]]:
+    """Action and memory (of recurrent policies) from an observation, the memory before, and whether it is the first."""
     if actor not in ACTORS:
         raise ValueError(f"actor is {actor!r}, but it must be one of {', '.join(map(repr, ACTORS))}: choose one.")
     if actor == "random":
-        return lambda observation: env.action_space.sample()
+        return lambda observation, memory, first: (env.action_space.sample(), None)
     predict = model.predict_curious if actor == "curious" else model.predict
-    return lambda observation: predict(observation, deterministic=deterministic)[0]
+    return lambda observation, memory, first: predict(
+        _as_trained(model, observation), memory, np.array([first]), deterministic
+    )
+
+
+def _as_trained(model: CuReSAC, observations: np.ndarray) -> np.ndarray:
+    """Observations normalised as in training, if a ``VecNormalize`` did so."""
+    normalizer = model.get_vec_normalize_env()
+    return observations if normalizer is None else normalizer.normalize_obs(observations)  # type: ignore[return-value]
 
 
 def run_episodes(
@@ -126,11 +160,12 @@ def run_episodes(
         env.action_space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
-        observations, actions, rewards, dones, frames = [observation], [], [], [], []
-        true_states = []
-        done = False
+        observations, rewards, dones, frames = [observation], [], [], []
+        actions: list[np.ndarray] = []
+        true_states: list[np.ndarray] = []
+        done, memory = False, None
         while not done:
-            action = choose(observation)
+            action, memory = choose(observation, memory, not actions)
             if state_of:
                 true_states.append(np.array(state_of(env)))  # a copy
             observation, reward, terminated, truncated, _ = env.step(action)
@@ -144,7 +179,7 @@ def run_episodes(
         seen = np.stack(observations)
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "srl", None) is not None:
-            errors = srl_errors(model, _as_batch(model, seen, actions, rewards, dones))
+            errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))
         episode = Episode(np.array(rewards), errors, seen[:-1], frames)  # type: ignore[arg-type]
         if true_states:
             episode.states = np.stack(true_states)
@@ -165,3 +200,79 @@ def _as_batch(
         dones=th.as_tensor(dones, **column).unsqueeze(1),  # type: ignore[arg-type]
         rewards=th.as_tensor(rewards, **column).unsqueeze(1),  # type: ignore[arg-type]
     )
+
+
+class Uncomfortable(NamedTuple):
+    """Where the agent's representation errs the most.
+
+    :param observations: The observations, the worst first, [k, *shape]
+    :param errors: Their SRL errors, [k]
+    :param ages: How many agent steps ago they were stored, [k]
+    :param mean_error: Mean SRL error of the whole replay buffer
+    """
+
+    observations: np.ndarray
+    errors: np.ndarray
+    ages: np.ndarray
+    mean_error: float
+
+
+def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int = 128) -> Uncomfortable:
+    """The observations of the replay buffer with the highest noise-free SRL error.
+
+    Reads the whole buffer, a chunk at a time. Two observations of one environment are at least ``gap`` steps apart:
+    else the answer would be one moment k times.
+
+    :param model: A model with an SRL head and a replay buffer
+    :param k: How many observations; fewer where the buffer does not hold so many that are far enough apart
+    :param gap: Least distance in time, in steps of one environment; 1 allows neighbours
+    :param chunk: How many observations are in memory at a time
+    :return: The observations, worst first, with their errors
+    :raises ValueError: if an argument is below 1, or the model has no SRL head or nothing in its replay buffer
+    """
+    if k < 1 or gap < 1 or chunk < 1:
+        raise ValueError(f"k is {k}, gap {gap} and chunk {chunk}, but each must be at least 1: give numbers >= 1.")
+    if getattr(model.policy, "srl", None) is None:
+        raise ValueError("the model has no SRL head, so no SRL error: train it with srl='rae' or 'curl', for example.")
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None or buffer.size() == 0:
+        raise ValueError("the model has nothing in its replay buffer: train it, or call load_replay_buffer first.")
+    # Newest first: transition i is `ages[i]` rows older than the newest one.
+    # SB3's memory-saving variant has overwritten the observation of its oldest row.
+    n_rows = buffer.size() - int(buffer.optimize_memory_usage and buffer.full)
+    ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
+    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+
+    errors = np.zeros(len(rows), np.float32)
+    for start in range(0, len(rows), chunk):
+        part = slice(start, start + chunk)
+        batch = transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env())
+        errors[part] = srl_errors(model, batch)
+    chosen: list[int] = []
+    for candidate in np.argsort(-errors, kind="stable"):
+        same = [other for other in chosen if env_inds[other] == env_inds[candidate]]
+        if all(abs(ages[other] - ages[candidate]) >= gap for other in same):
+            chosen.append(int(candidate))
+        if len(chosen) == k:
+            break
+    index = np.array(chosen)
+    observations = transitions(buffer, rows[index], env_inds[index]).observations.cpu().numpy()
+    return Uncomfortable(observations, errors[index], ages[index] * buffer.n_envs, float(errors.mean()))
+
+
+def binned_errors(
+    states: np.ndarray, errors: np.ndarray, edges: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Visits and mean SRL error on a grid over two coordinates of the state.
+
+    :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
+    :param errors: SRL error of each visited state, [n], or empty
+    :param edges: Edges of the bins of both coordinates, increasing, [a + 1] and [b + 1]
+    :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN where there is none
+    """
+    inside = [np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1)]
+    visits = np.histogram2d(*inside, bins=edges)[0]  # type: ignore[call-overload]
+    if len(errors) == 0:
+        return visits, np.full_like(visits, np.nan)
+    sums = np.histogram2d(*inside, bins=edges, weights=errors)[0]  # type: ignore[call-overload]
+    return visits, np.divide(sums, visits, out=np.full_like(sums, np.nan), where=visits > 0)

@@ -82,8 +82,17 @@ def image_strip(observed: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.n
     :param frame_stack: Frames per image
     :return: uint8 image (C', 2 * H, B * W) with C' = 1 or 3
     """
-    channels = observed.shape[1] // frame_stack
+    rows = [th.cat(list(newest_frames(images, frame_stack)), dim=2) for images in (observed, drawn)]
+    return th.cat(rows, dim=1).cpu().numpy()
+
+
+def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
+    """
+    :param images: Stacks of frames, oldest first, 0-255, [B, C, H, W]
+    :param frame_stack: Frames per stack
+    :return: The newest frame of each, grey or in colour, uint8 [B, C', H, W] with C' = 1 or 3
+    """
+    channels = images.shape[1] // frame_stack
     if channels not in (1, 3):
         channels = 1
-    rows = [th.cat(list(images[:, -channels:].to(th.uint8)), dim=2) for images in (observed, drawn)]
-    return th.cat(rows, dim=1).cpu().numpy()
+    return images[:, -channels:].to(th.uint8)

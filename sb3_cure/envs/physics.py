@@ -1,5 +1,6 @@
 """The true state of a DeepMind Control environment, which agents that see pixels never get: for maps and statistics."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -15,14 +16,16 @@ _POSITIONS = [_PLACE + _QUATERNION, _QUATERNION, [("", _METRES)], [("", _RADIANS
 _VELOCITIES = [_PLACE + _ROTATION, _ROTATION, [("", _METRES)], [("", _RADIANS)]]
 _HINGE = 3
 
-# Two coordinates that show what a task is about, for every environment that has both; else the first two.
-_TELLING = [
-    ("hinge_1", "hinge_1_velocity"),  # cartpole: angle of the pole (0: upright)
-    ("proximal", "hinge_velocity"),  # finger: angle of the finger, spin of the body that it pushes
-    ("ball_x", "ball_z"),  # ball_in_cup, and the balls of manipulator
-    ("joint_0", "joint_1"),  # swimmer, lqr
-    ("rootz", "rooty"),  # walker, hopper, cheetah: height (from the start's) and pitch of the torso
-]
+# Two coordinates that show what a task is about, for every environment that has both (else the first two), and what
+# they are.
+_TELLING = {
+    ("hinge_1", "hinge_1_velocity"): ("pole angle (0: upright)", "pole velocity"),  # cartpole
+    ("proximal", "hinge_velocity"): ("finger angle (proximal)", "body's hinge velocity"),  # finger
+    ("ball_x", "ball_z"): ("ball x", "ball z"),  # ball_in_cup, and the balls of manipulator
+    ("shoulder", "wrist"): ("shoulder angle", "wrist angle"),  # reacher
+    ("joint_0", "joint_1"): ("joint 0", "joint 1"),  # swimmer, lqr
+    ("rootz", "rooty"): ("torso height (from the start's)", "torso pitch"),  # walker, hopper, cheetah
+}
 
 
 def _physics(env: gym.Env) -> Any:
@@ -83,8 +86,31 @@ def physics_state(env: gym.Env) -> np.ndarray:
 
 def telling_coordinates(names: list[str]) -> tuple[str, str]:
     """
-    :param names: Names as of ``physics_state_names``, at least two
+    :param names: Names of the state's coordinates, as of ``physics_state_names``
     :return: The two of them that show best what the agent does, for maps: of cartpole the pole's angle and its
         velocity, of finger the finger's angle and the body's velocity, of reacher both angles, ...
+    :raises ValueError: if there are fewer than two
     """
+    if len(names) < 2:
+        raise ValueError(f"the state has the coordinates {names}, but a map needs two: give at least two names.")
     return next((pair for pair in _TELLING if set(pair) <= set(names)), (names[0], names[1]))
+
+
+def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
+    """
+    :param coordinates: Two coordinates of the state, by name
+    :return: What to call them on the axes of a map
+    """
+    return _TELLING.get(coordinates) or (coordinates[0].replace("_", " "), coordinates[1].replace("_", " "))
+
+
+def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
+    """
+    :param coordinates: Two coordinates of the state, by name
+    :param names: Names of all coordinates
+    :raises ValueError: if they are not two of these
+    """
+    if len(coordinates) != 2 or not set(coordinates) <= set(names):
+        raise ValueError(
+            f"coordinates are {tuple(coordinates)!r}, but a map needs two of the state's: choose of {', '.join(names)}."
+        )

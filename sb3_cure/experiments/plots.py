@@ -2,13 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import IO
 
-import matplotlib
-
-matplotlib.use("Agg")  # Files only: works without a screen.
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import EngFormatter
+
+from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
+from sb3_cure.evaluation import Uncomfortable, binned_errors
 
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
 
@@ -70,6 +75,156 @@ def reconstruction_grid(path: Path, strip: np.ndarray, title: str) -> None:
     plt.close(figure)
 
 
+def reconstructions_over_training(
+    path: Path, observed: np.ndarray, rows: Sequence[tuple[int, np.ndarray]], title: str
+) -> None:
+    """The same observations as they are drawn at several times of training, one row each, below the observations.
+
+    :param path: File to write
+    :param observed: One frame of each observation, uint8 [n, C, H, W] with C = 1 or 3
+    :param rows: Agent steps, and what is drawn then of the same shape
+    :param title: Title of the figure
+    """
+    labels = ["observed", *(f"{steps:,}" for steps, _ in rows)]
+    pictures = [observed, *(drawn for _, drawn in rows)]
+    n_rows, columns = len(pictures), len(observed)
+    height = 1.1 * n_rows * observed.shape[2] / observed.shape[3]
+    dense = ConstrainedLayoutEngine(h_pad=0.01, hspace=0)
+    figure = Figure(figsize=(1.1 * columns + 1.8, height + 0.8), layout=dense)
+    axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
+    for place, label, images in zip(axes, labels, pictures, strict=True):
+        strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
+        place.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest", aspect="equal")
+        place.set_xticks([])
+        place.set_yticks([strip.shape[0] / 2], [label])
+        if place is not axes[0]:
+            error = np.square((images.astype(np.float32) - observed) / 255).mean()
+            place.annotate(f"MSE {error:.4f}", (1.01, 0.5), xycoords="axes fraction", va="center", fontsize=9)
+    figure.supylabel("agent steps of training", fontsize=10)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=120)
+
+
+def uncomfortable_frames(
+    path: Path, found: Uncomfortable, frame_stack: int, title: str, drawn: np.ndarray | None = None
+) -> None:
+    """The observations with the highest SRL error, worst first, each with its error and age.
+
+    :param path: File to write
+    :param found: What ``sb3_cure.evaluation.most_uncomfortable`` found, of images
+    :param frame_stack: Frames per observation, of which the newest is shown
+    :param title: Title of the figure
+    :param drawn: Their reconstructions, shown beside them, uint8 like ``found.observations``, or None
+    """
+    channels = found.observations.shape[1] // frame_stack
+    pairs = [found.observations] if drawn is None else [found.observations, drawn]
+    n_frames = len(found.errors)
+    columns = min(n_frames, 8 if drawn is None else 4)
+    n_rows = -(-n_frames // columns)
+    figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5), layout="constrained")
+    grid = figure.subplots(n_rows, columns, squeeze=False).flat
+    for place in grid:
+        place.set_axis_off()
+    for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
+        image = np.concatenate([np.moveaxis(images[index, -channels:], 0, -1) for images in pairs], axis=1)
+        grid[index].imshow(_picture(image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
+    note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
+    note += f", and how many times the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
+    figure.suptitle(f"{title}\n{note}", fontsize=10)
+    figure.savefig(path, dpi=120)
+
+
+def curiosity_map(
+    path: Path,
+    visits: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    names: Sequence[str],
+    title: str,
+    coordinates: tuple[str, str] | None = None,
+    units: Sequence[str] | None = None,
+    bins: int = 24,
+) -> None:
+    """Where each policy goes and what SRL error it meets there, over two coordinates of the true state.
+
+    One row per policy: on the left the number of steps in each bin, on the right their mean SRL error (left out if no
+    policy has errors). Axes and colours are the same for all policies.
+
+    :param path: File to write
+    :param visits: By policy, the states of all steps, [n, d], and their SRL errors, [n] or empty
+    :param names: Names of the coordinates of a state, [d]
+    :param title: Title of the figure
+    :param coordinates: Names of the two to show; by default ``telling_coordinates``
+    :param units: Units of the coordinates, [d]; angles ("rad") are shown from -pi to pi
+    :param bins: Bins along each axis
+    :raises ValueError: if ``coordinates`` are not two of the names
+    """
+    coordinates = coordinates or telling_coordinates(list(names))
+    check_coordinates(coordinates, names)
+    columns = [list(names).index(name) for name in coordinates]
+    both = [None if units is None else units[column] for column in columns]
+    places = {actor: states[:, columns] for actor, (states, _) in visits.items()}
+    seen = np.concatenate(list(places.values()))
+    x_edges, y_edges = (np.linspace(*_span(seen[:, axis], both[axis]), bins + 1) for axis in (0, 1))
+    edges = x_edges, y_edges
+    binned = {actor: binned_errors(places[actor], errors, edges) for actor, (_, errors) in visits.items()}
+
+    means = np.concatenate([mean[np.isfinite(mean)] for _, mean in binned.values()])
+    kinds = ["steps in bin"] + (["mean SRL error"] if len(means) else [])
+    most = max(2, max(counts.max() for counts, _ in binned.values()))
+    norms: list[Normalize] = [LogNorm(1, most)]
+    if len(means):
+        norms.append(PowerNorm(0.5, means.min(), means.max()))  # most errors are far below the highest
+    figure = Figure(figsize=(4.6 * len(kinds), 3.6 * len(visits) + 0.4), layout="constrained")
+    grid = figure.subplots(len(visits), len(kinds), squeeze=False, sharex=True, sharey=True)
+    meshes = []
+    for row, (actor, (counts, mean)) in zip(grid, binned.items(), strict=True):
+        for place, values, norm, map_name in zip(row, (counts, mean), norms, ("viridis", "plasma"), strict=False):
+            shown = np.ma.masked_where(counts == 0, values).T
+            meshes.append(place.pcolormesh(*edges, shown, norm=norm, cmap=map_name))
+            place.set_facecolor("0.92")
+            place.set_title(f"{actor} policy", color=COLORS[actor])
+            _name_axes(place, coordinates, both, edges)
+    for kind, column, mesh in zip(kinds, grid.T, meshes, strict=False):  # the meshes of the first row
+        bar = figure.colorbar(mesh, ax=list(column), label=kind, aspect=20 * len(column), pad=0.02)
+        if kind == kinds[0]:
+            ticks = _counts_up_to(most)
+            bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
+            bar.ax.minorticks_off()
+    n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
+    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", fontsize=11)
+    figure.savefig(path, dpi=120)
+
+
+def _picture(image: np.ndarray) -> np.ndarray:
+    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
+    return image[..., 0] if image.shape[-1] == 1 else image
+
+
+def _counts_up_to(highest: float) -> list[int]:
+    """1, 2, 5, 10, 20, ... for the colours of counts."""
+    return [count * 10**power for power in range(9) for count in (1, 2, 5) if count * 10**power <= highest]
+
+
+def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
+    """Ends of an axis: the full circle for angles, else from the least to the greatest value."""
+    low, high = float(values.min()), float(values.max())
+    if unit == "rad" and -np.pi <= low and high <= np.pi:
+        return -np.pi, np.pi
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _name_axes(
+    axes: Axes, coordinates: tuple[str, str], units: Sequence[str | None], edges: Sequence[np.ndarray]
+) -> None:
+    """Labels with units; angles have ticks at multiples of pi / 2."""
+    labels = coordinate_labels(coordinates)
+    for axis, label, unit, ends in zip((axes.xaxis, axes.yaxis), labels, units, edges, strict=True):
+        axis.set_label_text(f"{label} [{unit}]" if unit else label)
+        axis.set_tick_params(labelbottom=True, labelleft=True)
+        if ends[-1] == np.pi:
+            axis.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], ["-π", "-π/2", "0", "π/2", "π"])
+
+
 def update_modes(
     path: Path,
     cells: Mapping[tuple[str, str], Mapping[int, Sequence[Mapping[str, float]]]],
@@ -100,3 +255,211 @@ def update_modes(
     grid[0, 0].legend()
     figure.savefig(path, dpi=120)
     plt.close(figure)
+
+
+# Figures of reports
+
+
+def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
+    """
+    :param methods: Arms of an experiment
+    :param baseline: The one that the others are compared with: grey
+    :return: A colour for each; after nine of them they repeat
+    """
+    others = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
+    names = [method for method in methods if method != baseline]
+    return {baseline: "#555555", **{name: others[index % len(others)] for index, name in enumerate(names)}}
+
+
+def learning_curves(
+    path: Path | IO[bytes],
+    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool = False,
+) -> None:
+    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
+
+    :param path: File to write
+    :param curves: By task and arm: environment steps [n] and values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    """
+    figure, panels = _panels(len(curves), height=2.9)
+    for axes, (task, arms) in zip(panels, curves.items(), strict=True):
+        for arm, (steps, values) in arms.items():
+            mean = values.mean(axis=0)
+            axes.plot(steps, mean, color=colors[arm], linewidth=1.8, label=_plain(arm))
+            if len(values) > 1:
+                std = values.std(axis=0, ddof=1)
+                low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
+                axes.fill_between(steps, low, mean + std, color=colors[arm], alpha=0.18, linewidth=0)
+        axes.set(title=_plain(task), xlabel="environment steps", ylabel=ylabel)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if logarithmic:
+            axes.set_yscale("log")
+        _tidy(axes)
+    _shared_legend(figure, panels)
+    figure.savefig(path, dpi=150)
+
+
+def paired_differences(
+    path: Path | IO[bytes],
+    rows: Sequence[tuple[str, str, np.ndarray, tuple[float, float | None, float | None]]],
+    colors: Mapping[str, str],
+    xlabel: str,
+) -> None:
+    """Differences from the baseline: one line each, with every pair of seeds as a dot.
+
+    :param path: File to write
+    :param rows: Arm, label of the line, differences by pair, and their mean with its interval
+    :param colors: By arm
+    :param xlabel: What the differences are of
+    """
+    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    axes.axvline(0, color="#333333", linewidth=1)
+    for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
+        axes.plot(pairs, np.full(len(pairs), place), "o", color=colors[arm], alpha=0.35, markersize=4, zorder=3)
+        if low is not None and high is not None:
+            axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
+        axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
+    axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlabel(xlabel)
+    _tidy(axes)
+    # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
+    reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
+    left, right = axes.get_xlim()
+    axes.set_xlim(max(left, -reach), min(right, reach))
+    figure.savefig(path, dpi=150)
+
+
+def aggregate_scores(
+    path: Path | IO[bytes],
+    iqm: Mapping[str, tuple[float, float, float]],
+    taus: np.ndarray,
+    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    colors: Mapping[str, str],
+) -> None:
+    """Interquartile means (left) and performance profiles (right) with their intervals.
+
+    :param path: File to write
+    :param iqm: By arm: value, low, high
+    :param taus: Scores at which the profiles are read, [n]
+    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
+    :param colors: By arm
+    """
+    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
+        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
+        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
+    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
+    left.invert_yaxis()
+    left.set(xlabel="interquartile mean of the final score", title="IQM")
+    for arm, (share, lower, upper) in profiles.items():
+        right.step(taus, share, where="post", color=colors[arm], linewidth=1.8, label=_plain(arm))
+        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
+    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
+    for axes in (left, right):
+        _tidy(axes)
+    figure.savefig(path, dpi=150)
+
+
+def visitation_bars(
+    path: Path | IO[bytes],
+    panels: Mapping[str, Sequence[tuple[str, str, float, float, float]]],
+) -> None:
+    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
+
+    :param path: File to write
+    :param panels: By title: arm, actor, minimum, mean and maximum of each bar
+    """
+    bars = {
+        title: [(arm, actor, mean, (low, high), np.zeros(0)) for arm, actor, low, mean, high in rows]
+        for title, rows in panels.items()
+    }
+    _actor_bars(path, bars, "SRL error per step (mean, min, max)", logarithmic=True)
+
+
+def coverage_bars(
+    path: Path | IO[bytes], panels: Mapping[str, Sequence[tuple[str, str, np.ndarray]]], ylabel: str
+) -> None:
+    """How much of the true state space each policy visits: mean over seeds, and each seed as a dot.
+
+    :param path: File to write
+    :param panels: By title: arm, actor, and the measure by seed, of each bar
+    :param ylabel: What is measured
+    """
+    bars = {
+        title: [(arm, actor, float(values.mean()), None, values) for arm, actor, values in rows]
+        for title, rows in panels.items()
+    }
+    _actor_bars(path, bars, ylabel)
+
+
+def _actor_bars(
+    path: Path | IO[bytes],
+    panels: Mapping[str, Sequence[tuple[str, str, float, tuple[float, float] | None, np.ndarray]]],
+    ylabel: str,
+    logarithmic: bool = False,
+) -> None:
+    """Bars in groups of arms, coloured by actor: arm, actor, height, ends of the error bar, dots."""
+    figure, places = _panels(len(panels), height=3.0)
+    for axes, (title, rows) in zip(places, panels.items(), strict=True):
+        arms = list(dict.fromkeys(arm for arm, *_ in rows))
+        ticks, position = [], 0.0
+        for arm in arms:
+            group = [row for row in rows if row[0] == arm]
+            ticks.append(position + (len(group) - 1) / 2)
+            for _, actor, height, ends, dots in group:
+                color = COLORS.get(actor, "#2ca02c")
+                axes.bar(position, height, 0.85, color=color, alpha=0.8, label=_plain(actor))
+                if ends is not None:
+                    spread = [[max(height - ends[0], 0)], [max(ends[1] - height, 0)]]
+                    axes.errorbar(position, height, yerr=spread, color="#222222", capsize=4, linewidth=1)
+                axes.plot(np.full(len(dots), position), dots, "o", color="#222222", markersize=3)
+                position += 1
+            position += 0.7
+        axes.set_xticks(ticks, [_plain(arm) for arm in arms], fontsize=8.5)
+        if len(arms) > 2:
+            axes.tick_params(axis="x", rotation=15)
+        axes.set(title=_plain(title), ylabel=ylabel)
+        if logarithmic and any(height > 0 for _, _, height, *_ in rows):
+            axes.set_yscale("log")
+        _tidy(axes)
+    _shared_legend(figure, places)
+    figure.savefig(path, dpi=150)
+
+
+def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with so many axes, at most three in a row, as wide as a page."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    width = {1: 6.5, 2: 9.0, 3: 11.0}[columns]
+    figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, grid[:count]
+
+
+def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """What any panel shows, once, below all of them."""
+    shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if shown:
+        columns = min(len(shown), 6)
+        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, frameon=False)
+
+
+def _tidy(axes: Axes) -> None:
+    axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _plain(text: str) -> str:
+    """Names are no formulas: matplotlib reads between dollar signs, and hides what begins with an underscore."""
+    return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")

@@ -32,11 +32,24 @@ def reconstruct_with_probe(
     strip = reconstruction_strip(policy, shown, frame_stack, columns)
     if strip is not None:
         return strip
+    decoder = fit_probe(model, updates, batch_size)
+    return image_strip(*draw_with_probe(model, decoder, shown.observations), frame_stack)
+
+
+def fit_probe(model: CuReSAC, updates: int = 1000, batch_size: int = 64) -> nn.Module:
+    """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
+
+    :param model: A trained model with images as observations and a filled replay buffer
+    :param updates: Updates of the decoder
+    :param batch_size: Observations per update
+    :return: The decoder: latents -> images in [-0.5, 0.5]
+    """
+    policy, buffer = model.policy, model.replay_buffer
     shape = policy.encoder_space.shape or ()
     decoder: nn.Module = PixelDecoder(policy.encoder.features_dim, shape).to(model.device)
     optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
     for _ in range(updates):
-        observations = buffer.sample(batch_size).observations
+        observations = buffer.sample(batch_size).observations  # type: ignore[union-attr]
         with th.no_grad():
             images = policy.center(observations)
             latents = policy.encoder(images)
@@ -44,7 +57,17 @@ def reconstruct_with_probe(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    with th.no_grad():
-        images = policy.center(shown.observations)
-        drawn = (decoder(policy.encoder(images)) + 0.5).clamp(0, 1)
-    return image_strip(images * 255, drawn * 255, frame_stack)
+    return decoder
+
+
+@th.no_grad()
+def draw_with_probe(model: CuReSAC, decoder: nn.Module, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    :param model: The model whose latents are drawn
+    :param decoder: Its decoder, of ``fit_probe``
+    :param observations: Observations as stored, 0-255, [B, C, H, W]
+    :return: What the encoder sees of them (a crop, say) and what is drawn from its latents, both 0-255, [B, C, h, w]
+    """
+    images = model.policy.center(observations)
+    drawn = (decoder(model.policy.encoder(images)) + 0.5).clamp(0, 1)
+    return images * 255, drawn * 255

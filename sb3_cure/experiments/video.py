@@ -1,47 +1,75 @@
 """Videos of a policy with its SRL error drawn in."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from sb3_cure.evaluation import Episode
 
-PANEL_HEIGHT = 64
+MIN_WIDTH = 256
+RED, GREY = "#d62728", "#bbbbbb"
 
 
-def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1) -> None:
+def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, title: str = "") -> None:
     """One episode as MP4: the camera's picture above, the SRL error up to now below.
 
     :param path: File to write, ``*.mp4``
-    :param episode: Episode with ``frames`` (rendered with ``render=True``)
+    :param episode: Episode with ``frames`` (rendered with ``render=True``); without ``srl_errors`` none are drawn
     :param fps: Pictures per second, one per agent step
     :param action_repeat: Environment steps per agent step, for the caption
+    :param title: What is seen, put before the caption
+    """
+    # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
+    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
+        for picture in annotated_frames(episode, action_repeat, title):
+            writer.append_data(picture)  # type: ignore[attr-defined]
+
+
+def annotated_frames(episode: Episode, action_repeat: int = 1, title: str = "") -> Iterator[np.ndarray]:
+    """The pictures of ``write_video``.
+
+    :param episode: As there
+    :param action_repeat: As there
+    :param title: As there
+    :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
     returns = episode.rewards.cumsum()
     top = float(episode.srl_errors.max()) if len(episode.srl_errors) else 0.0
-    with imageio.get_writer(path, fps=fps, macro_block_size=16) as writer:
-        for step, frame in enumerate(episode.frames):
-            caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
-            writer.append_data(  # type: ignore[attr-defined]
-                _with_panel(frame, episode.srl_errors[: step + 1], len(episode.frames), top, caption)
-            )
+    for step, frame in enumerate(episode.frames):
+        caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
+        lines = [title, caption] if title else [caption]
+        errors = episode.srl_errors[: step + 1]
+        yield _with_panel(frame, lines, errors, len(episode.frames), top)
 
 
-def _with_panel(frame: np.ndarray, errors: np.ndarray, length: int, top: float, caption: str) -> np.ndarray:
+def _with_panel(frame: np.ndarray, lines: list[str], errors: np.ndarray, length: int, top: float) -> np.ndarray:
+    """The frame above a panel with text and, if there are errors, the newest one as a number and all as a curve."""
+    factor = -(-MIN_WIDTH // frame.shape[1])
+    frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
     height, width = frame.shape[:2]
-    picture = Image.new("RGB", (width, height + PANEL_HEIGHT), "white")
+    unit = width // 64  # sizes follow the picture's
+    font = ImageFont.load_default(3 * unit)
+    line_height, curve_height = 4 * unit, 10 * unit if len(errors) else 0
+    if len(errors):
+        lines = [*lines, f"SRL error {errors[-1]:.5f} (highest {top:.5f})"]
+    size = (width + width % 2, height + line_height * len(lines) + curve_height + 2 * unit)
+    picture = Image.new("RGB", (size[0], size[1] + size[1] % 2), "white")
     picture.paste(Image.fromarray(frame))
     draw = ImageDraw.Draw(picture)
-    draw.text((4, height + 2), caption, fill="black")
-    if len(errors) and top > 0:
-        draw.text((4, height + 14), f"SRL error {errors[-1]:.5f}", fill="#d62728")
-        plot_top, plot_height = height + 30, PANEL_HEIGHT - 34
+    for index, line in enumerate(lines):
+        color = RED if len(errors) and line is lines[-1] else "black"
+        draw.text((unit, height + index * line_height + unit // 2), line, fill=color, font=font)
+    if len(errors):
+        left, right, bottom = unit, width - unit, picture.height - unit
+        draw.line([(left, bottom), (right, bottom)], fill=GREY)
         points = [
-            (4 + (width - 8) * index / max(length - 1, 1), plot_top + plot_height * (1 - error / top))
-            for index, error in enumerate(errors)
+            (left + (right - left) * index / max(length - 1, 1), bottom - curve_height * error / top if top else bottom)
+            for index, error in enumerate(errors.tolist())
         ]
-        if len(points) > 1:
-            draw.line(points, fill="#d62728", width=2)
+        draw.line(points, fill=RED, width=max(unit // 2, 1))
+        x, y = points[-1]
+        draw.ellipse((x - unit / 2, y - unit / 2, x + unit / 2, y + unit / 2), fill=RED)
     return np.asarray(picture)
