@@ -1,0 +1,531 @@
+"""One HTML file about all experiments in a folder, with the tables as Markdown beside it.
+
+    sb3-cure report results
+
+Writes ``report.html`` (self-contained: pictures and videos are inside, no script, nothing is loaded from elsewhere) and
+``summary.md`` into the folder, and ``table.md`` with the plots into the folder of each experiment, to be committed.
+"""
+
+import argparse
+import base64
+import io
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+import sb3_cure
+from sb3_cure.experiments import plots, statistics, tables
+from sb3_cure.experiments.statistics import Experiment, ResultsError
+from sb3_cure.experiments.tables import Table, interval_text, markdown_text, number_text, of_tasks, plural, ratio_text
+
+THRESHOLDS = (250.0, 500.0, 750.0)
+#: Optional files of a cell: caption
+MEDIA = {
+    "policy.mp4": "the task policy, with its SRL error",
+    "reconstructions.png": "reconstructions over training",
+    "uncomfortable.png": "what the agent finds uncomfortable: frames of the replay buffer with the highest SRL error",
+    "curiosity_map.png": "SRL error and visits over the true state",
+}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plot.
+
+    :param name: Name of its file, without extension
+    :param caption: What it shows, also for those who cannot see it
+    :param png: The file
+    """
+
+    name: str
+    caption: str
+    png: bytes
+
+    def html(self) -> str:
+        return _picture_html(self.png, self.caption)
+
+
+@dataclass(frozen=True)
+class Section:
+    """An experiment in the report: text and parts in reading order."""
+
+    experiment: Experiment
+    headlines: Sequence[str]
+    parts: Sequence[Table | Figure | str]
+
+
+# Figures
+
+
+def _figure(name: str, caption: str, draw: Callable[..., None], *arguments: Any) -> Figure:
+    file = io.BytesIO()
+    draw(file, *arguments)
+    return Figure(name, caption, file.getvalue())
+
+
+def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
+    """
+    :param experiment: An experiment
+    :param colors: By arm
+    :return: Return, SRL loss and SRL error of the curious policy over training, where there is anything to draw
+    """
+    columns = {
+        "return_mean": ("learning_curves", "episode return", "Return of the task policy", False),
+        "srl_loss": ("srl_loss", "SRL loss", "SRL loss in training", True),
+        "curious_srl_error": ("curious_srl_error", "SRL error", "SRL error that the curious policy meets", True),
+    }
+    for column, (name, label, caption, logarithmic) in columns.items():
+        curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
+        for task in experiment.tasks:
+            for method in experiment.methods:
+                cells = list(experiment.done(task, method).values())
+                steps, values = statistics.stack_curves(cells, column)
+                if len(steps) > 1:
+                    curves.setdefault(task, {})[method] = (steps, values)
+        if curves:
+            caption = f"{caption} over environment steps: mean over seeds ± standard deviation ({', '.join(curves)})."
+            yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
+
+
+def difference_figure(
+    experiment: Experiment, rows: Sequence[statistics.PairedDifference], colors: Mapping[str, str]
+) -> Figure:
+    """
+    :param experiment: An experiment
+    :param rows: Its paired differences in area
+    :param colors: By arm
+    :return: The differences with their t intervals
+    """
+    lines = [
+        (
+            row.method,
+            f"{row.method}, {of_tasks(row)}",
+            np.concatenate(list(row.differences.values())),
+            (row.t.value, row.t.low, row.t.high),
+        )
+        for row in rows
+    ]
+    return _figure(
+        "paired_difference",
+        f"Area under the curve minus that of {experiment.baseline}: mean (diamond) with 95 % t interval (line; it may "
+        "leave the picture), and each pair of seeds (dots).",
+        plots.paired_differences,
+        lines,
+        colors,
+        "difference in area under the curve (return)",
+    )
+
+
+# Sections
+
+
+def describe(experiment: Experiment, thresholds: Sequence[float]) -> Section:
+    """
+    :param experiment: An experiment
+    :param thresholds: Returns, for the steps to reach them
+    :return: Its part of the report
+    :raises ResultsError: if a file of it cannot be read
+    """
+    colors = plots.arm_colors(experiment.methods, experiment.baseline)
+    if not any(cell.done for cell in experiment.cells.values()):
+        return Section(experiment, ["Not run: no cell is done."], [tables.status_table(experiment)])
+    headlines, parts = _visitation(experiment) if experiment.kind == "visitation" else ([], [])
+    more_headlines, more_parts = _curves(experiment, colors, thresholds)
+    conditions: list[Table | Figure | str] = [tables.status_table(experiment), tables.conditions_table(experiment)]
+    return Section(experiment, [*headlines, *more_headlines], [*parts, *more_parts, *conditions])
+
+
+def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure | str]]:
+    coverage, errors = statistics.state_coverage(experiment), statistics.summarise_errors(experiment)
+    headlines: list[str] = []
+    parts: list[Table | Figure | str] = []
+    for row in coverage:
+        if row.actor == "curious":
+            headlines.append(
+                f"{row.method} on {row.task}: the curious policy occupies {ratio_text(row.ratio)} times as many cells "
+                f"of the true state space as the random one ({plural(row.ratio.n, 'seed')})."
+            )
+    for error in errors:
+        if error.actor == "curious" and error.head in ("own", "common"):
+            headlines.append(
+                f"{error.method} on {error.task}, {error.head} head: the curious policy meets "
+                f"{ratio_text(error.ratio)} times the SRL error of the random one ({plural(error.ratio.n, 'seed')})."
+            )
+    if coverage:
+        panels = {
+            task: [(row.method, row.actor, row.occupied) for row in coverage if row.task == task]
+            for task in dict.fromkeys(row.task for row in coverage)
+        }
+        parts.append(
+            _figure(
+                "coverage",
+                "Occupied cells of a grid over the true physics state, by policy: mean over seeds, each seed a dot.",
+                plots.coverage_bars,
+                panels,
+                "occupied cells of the true state space",
+            )
+        )
+        parts.append(tables.coverage_table(coverage))
+    for head in dict.fromkeys(row.head for row in errors if row.head in ("own", "common")):
+        bars = {
+            task: [
+                (row.method, row.actor, row.error_min, row.error_mean, row.error_max)
+                for row in errors
+                if (row.task, row.head) == (task, head)
+            ]
+            for task in dict.fromkeys(row.task for row in errors if row.head == head)
+        }
+        parts.append(
+            _figure(
+                f"visitation_{head}",
+                f"SRL error per step under the {head} head, by policy: mean, with minimum and maximum as error bars.",
+                plots.visitation_bars,
+                bars,
+            )
+        )
+    if errors:
+        parts.append(tables.error_table(experiment, errors))
+    return headlines, parts
+
+
+def _curves(
+    experiment: Experiment, colors: Mapping[str, str], thresholds: Sequence[float]
+) -> tuple[list[str], list[Table | Figure | str]]:
+    parts: list[Table | Figure | str] = list(curve_figures(experiment, colors))
+    has_curves = any(
+        len(statistics.summarise_arm(experiment, task, method).seeds)
+        for task in experiment.tasks
+        for method in experiment.methods
+    )
+    if not has_curves:
+        return [], parts
+    headlines = []
+    differences = statistics.paired_differences(experiment)
+    several = {row.method for row in differences if row.task is None}
+    for row in differences:
+        if row.task is None or row.method not in several:
+            where = f"{plural(row.t.n, 'paired seed')} on {of_tasks(row)}"
+            headlines.append(
+                f"{row.method} minus {experiment.baseline}: area under the curve {number_text(row.t.value, 1)} "
+                f"{interval_text(row.t, 1)}, {where}: {row.t.verdict}."
+            )
+    if not differences:
+        headlines.append(
+            f"No arm has a seed in common with the baseline {experiment.baseline}: nothing to compare yet."
+        )
+    if experiment.kind == "pretraining":
+        parts.insert(0, tables.pretraining_table(experiment))
+    parts.append(tables.curves_table(experiment, thresholds))
+    if differences:
+        parts.append(difference_figure(experiment, differences, colors))
+        parts.append(tables.difference_table(experiment, differences))
+        finals = statistics.paired_differences(experiment, "finals")
+        parts.append(tables.difference_table(experiment, finals, "final return"))
+    try:
+        found = statistics.aggregate(experiment)
+    except ResultsError as error:
+        parts.append(f"No aggregates: {error}")
+        return headlines, parts
+    if found is None:
+        parts.append("No aggregates over tasks: they need two seeds or more that every arm has done.")
+        return headlines, parts
+    iqm = {method: (each.value, each.low or 0.0, each.high or 0.0) for method, each in found.iqm.items()}
+    parts.append(
+        _figure(
+            "aggregates",
+            "Interquartile mean of the final score (left) and performance profile (right) with 95 % intervals, by arm.",
+            plots.aggregate_scores,
+            iqm,
+            found.taus,
+            found.profiles,
+            colors,
+        )
+    )
+    parts.append(tables.aggregate_table(experiment, found))
+    return headlines, parts
+
+
+# HTML
+
+STYLE = """
+:root { --ink: #1c2430; --soft: #5b6675; --line: #dfe3e8; --wash: #f6f7f9; --accent: #1f5fa8; }
+* { box-sizing: border-box; }
+body { margin: 0; color: var(--ink); background: white; }
+body { font: 15px/1.55 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
+main, header > div { max-width: 1160px; margin: 0 auto; padding: 0 28px; }
+header { background: var(--ink); color: white; padding: 28px 0 22px; margin-bottom: 22px; }
+header h1 { margin: 0 0 4px; font-size: 26px; font-weight: 650; }
+header p { margin: 0; color: #c4ccd6; }
+h2 { font-size: 21px; margin: 44px 0 6px; padding-top: 14px; border-top: 2px solid var(--ink); }
+h1, h2, h3 { overflow-wrap: anywhere; }
+h3 { font-size: 16px; margin: 30px 0 8px; }
+nav ul { display: flex; flex-wrap: wrap; gap: 4px 22px; padding: 0; margin: 0; list-style: none; }
+a { color: var(--accent); }
+.facts, .note, figcaption { color: var(--soft); font-size: 13px; }
+.facts { margin: 0 0 12px; }
+.note { max-width: 920px; margin: 6px 0 0; }
+.headline { background: var(--wash); border-left: 4px solid var(--accent); margin: 14px 0; padding: 10px 18px; }
+.headline p { margin: 3px 0; overflow-wrap: anywhere; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
+th { text-align: left; font-weight: 600; color: var(--soft); vertical-align: bottom; }
+th { border-bottom: 1.5px solid var(--ink); }
+th, td { padding: 4px 14px 4px 0; }
+td { border-bottom: 1px solid var(--line); vertical-align: top; overflow-wrap: anywhere; max-width: 340px; }
+.number { text-align: right; white-space: nowrap; }
+.bad { color: #a61b1b; font-weight: 600; }
+.good { color: #17692f; font-weight: 600; }
+.absent { color: #8a5a00; font-style: italic; }
+figure { margin: 18px 0; }
+img, video { max-width: 100%; height: auto; display: block; }
+.media { display: grid; grid-template-columns: repeat(auto-fill, minmax(340px, 1fr)); gap: 16px 26px; }
+.media figure { margin: 6px 0; }
+.media video { width: 100%; max-width: 420px; background: #000; }
+details { margin: 10px 0; }
+summary { cursor: pointer; font-weight: 600; overflow-wrap: anywhere; }
+pre { background: var(--wash); padding: 10px 14px; font-size: 12px; overflow-x: auto; white-space: pre-wrap; }
+footer { color: var(--soft); font-size: 13px; margin: 50px 0 30px; }
+@media print { header { background: white; color: black; } header p { color: #444; } body { font-size: 11px; }
+  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } nav, video { display: none; } }
+"""
+# Whatever text from a results folder should manage to do, the page loads nothing and runs nothing.
+POLICY = (
+    "default-src 'none'; img-src data:; media-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+)
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _picture_html(png: bytes, caption: str) -> str:
+    with Image.open(io.BytesIO(png)) as image:
+        width, height = image.size
+    text, size = escape(caption), f'width="{width * 2 // 3}" height="{height * 2 // 3}"'
+    image_html = f'<img src="{_data("image/png", png)}" {size} alt="{text}">'
+    return f"<figure>{image_html}<figcaption>{text}</figcaption></figure>\n"
+
+
+def _media_html(path: Path, caption: str) -> str:
+    """A file of a cell, or a sentence about why it cannot be shown."""
+    try:
+        content = path.read_bytes()
+        if path.suffix == ".png":
+            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
+                image.verify()
+            return _picture_html(content, caption)
+    except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow's word for a broken PNG
+        return f'<p class="note">{escape(path.name)} cannot be shown: {escape(str(error))}</p>'
+    if content[4:8] != b"ftyp":
+        return f'<p class="note">{escape(path.name)} cannot be shown: it is no MP4.</p>'
+    text = escape(caption)
+    video = f'<video controls muted preload="metadata" aria-label="{text}" src="{_data("video/mp4", content)}"></video>'
+    return f"<figure>{video}<figcaption>{text}</figcaption></figure>\n"
+
+
+def media_html(experiment: Experiment, which: str) -> str:
+    """
+    :param experiment: An experiment
+    :param which: ``"all"`` seeds, the ``"first"`` one done of each arm, or ``"none"``
+    :return: Pictures and videos of the cells that have some
+    """
+    blocks = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            cells = list(experiment.done(task, method).values()) if which != "none" else []
+            for cell in cells[:1] if which == "first" else cells:
+                shown = [
+                    _media_html(cell.folder / name, MEDIA[name]) for name in MEDIA if (cell.folder / name).exists()
+                ]
+                if shown:
+                    name = escape(f"{task}, {method}, seed {cell.seed}")
+                    blocks.append(
+                        f'<details open><summary>{name}</summary><div class="media">{"".join(shown)}</div></details>\n'
+                    )
+    return f"<h3>Pictures and videos</h3>\n{''.join(blocks)}" if blocks else ""
+
+
+def _configs_html(experiment: Experiment) -> str:
+    """One configuration per task and arm: the seeds of an arm differ in nothing else."""
+    blocks = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            cells = experiment.done(task, method)
+            if cells:
+                config = {key: value for key, value in next(iter(cells.values())).config.items() if key != "seed"}
+                text = escape(json.dumps(config, indent=2, ensure_ascii=False))
+                name = escape(f"{task}, {method}")
+                blocks.append(f"<details><summary>{name}</summary><pre>{text}</pre></details>\n")
+    grid = escape(json.dumps(experiment.grid, indent=2, ensure_ascii=False))
+    blocks.insert(0, f"<details><summary>grid</summary><pre>{grid}</pre></details>\n")
+    return f"<h3>Configurations</h3>\n{''.join(blocks)}"
+
+
+def _facts(experiment: Experiment) -> str:
+    evaluation = experiment.grid.get("evaluation")
+    every = (
+        f", evaluated every {evaluation.get('every')} of them over {evaluation.get('episodes')} episodes"
+        if isinstance(evaluation, dict)
+        else ""
+    )
+    done = sum(cell.done for cell in experiment.cells.values())
+    return (
+        f"{experiment.kind}; {experiment.budget:,} environment steps{every}; {plural(len(experiment.tasks), 'task')}, "
+        f"{plural(len(experiment.methods), 'arm')}, seeds {', '.join(map(str, experiment.seeds))}; "
+        f"{done} of {len(experiment.cells)} cells done; baseline {experiment.baseline}"
+    )
+
+
+def render_html(sections: Sequence[Section], comparisons: Table | None, media: str, title: str) -> str:
+    """
+    :param sections: The experiments
+    :param comparisons: Table of published numbers, if there is anything to compare
+    :param media: See ``media_html``
+    :param title: Name of the folder
+    :return: The page
+    """
+    links = "".join(
+        f'<li><a href="#e{index}">{escape(section.experiment.name)}</a></li>' for index, section in enumerate(sections)
+    )
+    body = []
+    for index, section in enumerate(sections):
+        body.append(f'<section><h2 id="e{index}">{escape(section.experiment.name)}</h2>\n')
+        body.append(f'<p class="facts">{escape(_facts(section.experiment))}</p>\n')
+        if section.headlines:
+            lines = "".join(f"<p>{escape(line)}</p>" for line in section.headlines)
+            body.append(f'<div class="headline">{lines}</div>\n')
+        body += [
+            f'<p class="note">{escape(part)}</p>\n' if isinstance(part, str) else part.html() for part in section.parts
+        ]
+        body += [media_html(section.experiment, media), _configs_html(section.experiment), "</section>\n"]
+    if comparisons is not None:
+        links += '<li><a href="#published">Beside published returns</a></li>'
+        body.append(f'<section id="published">{comparisons.html().replace("h3>", "h2>")}</section>\n')
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{escape(POLICY)}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{escape(title)}: experiments of sb3_cure</title>
+<style>{STYLE}</style>
+</head>
+<body>
+<header><div><h1>{escape(title)}</h1>
+<p>{plural(len(sections), "experiment")}, sb3_cure {escape(sb3_cure.__version__)}, written {now}</p></div></header>
+<main>
+<nav aria-label="Experiments"><ul>{links}</ul></nav>
+{"".join(body)}<footer>Intervals are 95 %. Seeds are paired between the arms of an experiment.</footer>
+</main>
+</body>
+</html>
+"""
+
+
+# Markdown
+
+
+def render_markdown(section: Section, level: int = 1, plots_beside: bool = False) -> str:
+    """
+    :param section: An experiment
+    :param level: Of its heading
+    :param plots_beside: Whether the plots lie beside the text, and are shown
+    :return: Its headlines and tables
+    """
+    title, facts = markdown_text(section.experiment.name), markdown_text(_facts(section.experiment))
+    lines = [f"{'#' * level} {title}", "", facts, ""]
+    lines += [f"- {markdown_text(line)}" for line in section.headlines]
+    for part in section.parts:
+        if isinstance(part, Table):
+            lines += ["", part.markdown()]
+        elif isinstance(part, str):
+            lines += ["", markdown_text(part)]
+        elif plots_beside:
+            lines += ["", f"![{markdown_text(part.caption)}]({part.name}.png)"]
+    return "\n".join(lines) + "\n"
+
+
+def write_report(
+    results: Path, out: Path, thresholds: Sequence[float] = THRESHOLDS, media: str = "first"
+) -> list[Path]:
+    """Write the report of a folder.
+
+    :param results: Folder of results
+    :param out: HTML file
+    :param thresholds: Returns, for the steps to reach them
+    :param media: Of which seeds: ``"first"``, ``"all"`` or ``"none"``
+    :return: What was written
+    :raises ResultsError: with one sentence that names the file and what is wrong
+    """
+    experiments = statistics.read_results(results)
+    sections = [describe(experiment, thresholds) for experiment in experiments]
+    comparisons = statistics.compare_with_published(experiments)
+    table = tables.published_table(comparisons) if comparisons else None
+    files: dict[Path, bytes] = {out: render_html(sections, table, media, results.resolve().name).encode()}
+    title = markdown_text(results.resolve().name)
+    summary = [f"# {title}\n", *(render_markdown(section, level=2) for section in sections)]
+    summary += [table.markdown() + "\n"] if table else []
+    files[out.with_name("summary.md")] = "\n".join(summary).encode()
+    for section in sections:
+        files[section.experiment.folder / "table.md"] = render_markdown(section, plots_beside=True).encode()
+        for part in section.parts:
+            if isinstance(part, Figure):
+                files[section.experiment.folder / f"{part.name}.png"] = part.png
+    for path, content in files.items():
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise ResultsError(f"{path} cannot be written ({error.strerror}): choose another --out.") from None
+    return list(files)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command ``sb3-cure report``.
+
+    :param argv: Command line, ``sys.argv`` by default
+    :return: 0, or 1 if the results cannot be read
+    """
+    parser = argparse.ArgumentParser(
+        prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path, help="folder that `sb3-cure experiment` wrote, or one experiment in it")
+    parser.add_argument("--out", type=Path, help="HTML file (default: report.html in the folder)")
+    parser.add_argument(
+        "--thresholds", type=_thresholds, default=THRESHOLDS, help="returns whose steps are told (default: 250,500,750)"
+    )
+    parser.add_argument(
+        "--media", choices=("first", "all", "none"), default="first", help="videos and pictures of which seeds"
+    )
+    options = parser.parse_args(argv)
+    try:
+        written = write_report(
+            options.results, options.out or options.results / "report.html", options.thresholds, options.media
+        )
+    except ResultsError as error:
+        print(f"sb3-cure report: {error}", file=sys.stderr)
+        return 1
+    size = written[0].stat().st_size / 2**20
+    print(f"{written[0]} ({size:.1f} MB), and {len(written) - 1} tables and plots beside it and in the experiments")
+    return 0
+
+
+def _thresholds(text: str) -> list[float]:
+    try:
+        return [float(number) for number in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of returns such as 250,500,750") from None
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

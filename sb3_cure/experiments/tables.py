@@ -1,0 +1,401 @@
+"""Tables of reports: statistics in words and numbers, as HTML or Markdown. Names come from files and are escaped."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from sb3_cure.experiments import published, statistics
+from sb3_cure.experiments.statistics import Estimate, Experiment
+
+NONE = "\N{EN DASH}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table in either language.
+
+    :param title: Heading
+    :param columns: Header; those that begin with ``>`` hold numbers and are aligned to the right
+    :param rows: Plain text
+    :param note: What to know when reading it
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def markdown(self) -> str:
+        names = [markdown_text(column.removeprefix(">")) for column in self.columns]
+        rules = ["---:" if column.startswith(">") else "---" for column in self.columns]
+        lines = [f"| {' | '.join(names)} |", f"|{'|'.join(rules)}|"]
+        lines += [f"| {' | '.join(map(markdown_text, row))} |" for row in self.rows]
+        note = ["", markdown_text(self.note)] if self.note else []
+        return "\n".join([f"### {markdown_text(self.title)}", "", *lines, *note])
+
+    def html(self) -> str:
+        kinds = [' class="number"' if column.startswith(">") else "" for column in self.columns]
+        names = [escape(column.removeprefix(">")) for column in self.columns]
+        head = "".join(f'<th scope="col"{kind}>{name}</th>' for kind, name in zip(kinds, names, strict=True))
+        body = "".join(
+            "<tr>" + "".join(_table_cell(kind, text) for kind, text in zip(kinds, row, strict=True)) + "</tr>\n"
+            for row in self.rows
+        )
+        note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
+        return (
+            f"<h3>{escape(self.title)}</h3>\n<div class='wide'><table>\n<thead><tr>{head}</tr></thead>\n"
+            f"<tbody>\n{body}</tbody></table></div>\n{note}\n"
+        )
+
+
+# Words and numbers
+
+
+def markdown_text(text: str) -> str:
+    """
+    :param text: Plain text
+    :return: The same in Markdown: nothing of it ends a cell of a table, or becomes HTML, a link or a picture
+    """
+    text = re.sub(r"([\\`*_{}\[\]|!#~])", r"\\\1", " ".join(text.split()))
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _table_cell(kind: str, text: str) -> str:
+    marks = {"suspected bug": "bad", "worse": "bad", "better": "good", statistics.NOT_RUN: "absent", "failed": "bad"}
+    mark = next((name for word, name in marks.items() if text.startswith(word)), "")
+    content = escape(text)
+    return f"<td{kind}>{f'<span class={mark!r}>{content}</span>' if mark else content}</td>"
+
+
+def number_text(value: float, digits: int = 0) -> str:
+    """
+    :param value: A number
+    :param digits: Behind the point
+    :return: With a true minus sign; a dash for what is not finite
+    """
+    if not math.isfinite(value):
+        return NONE
+    return f"{round(value, digits) + 0.0:,.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _error(value: float) -> str:
+    return f"{value:.2e}" if math.isfinite(value) else NONE
+
+
+def _mean_std(values: np.ndarray) -> str:
+    if not len(values):
+        return statistics.NOT_RUN
+    std = f" ± {number_text(float(values.std(ddof=1)))}" if len(values) > 1 else ""
+    return f"{number_text(float(values.mean()))}{std}"
+
+
+def interval_text(estimate: Estimate, digits: int = 0) -> str:
+    """
+    :param estimate: A number
+    :param digits: Behind the point
+    :return: Its interval, or why there is none
+    """
+    if estimate.low is None or estimate.high is None:
+        return "one seed: no interval" if estimate.n else NONE
+    return f"[{number_text(estimate.low, digits)}, {number_text(estimate.high, digits)}]"
+
+
+def _published(value: published.MeanStd | None) -> str:
+    if value is None:
+        return NONE
+    return number_text(value.mean) + (f" ± {number_text(value.std)}" if value.std is not None else "")
+
+
+def plural(count: int, noun: str) -> str:
+    """
+    :param count: How many
+    :param noun: In the singular
+    :return: ``"1 seed"``, ``"2 seeds"``
+    """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _list(values: Sequence[Any]) -> str:
+    return ", ".join(dict.fromkeys(str(value) for value in values if value not in (None, ""))) or NONE
+
+
+def _duration(seconds: Sequence[float]) -> str:
+    if not seconds:
+        return NONE
+    mean = float(np.mean(seconds))
+    return f"{mean / 3600:.1f} h" if mean >= 3600 else f"{mean / 60:.1f} min" if mean >= 60 else f"{mean:.0f} s"
+
+
+# Tables
+
+
+def status_table(experiment: Experiment) -> Table:
+    """
+    :param experiment: An experiment
+    :return: Which cells are done
+    """
+    rows = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            by_status: dict[str, list[int]] = {}
+            for (at, arm, seed), cell in experiment.cells.items():
+                if (at, arm) == (task, method):
+                    by_status.setdefault(cell.status, []).append(seed)
+            texts = [f"{status} (seed {', '.join(map(str, sorted(seeds)))})" for status, seeds in by_status.items()]
+            only = next(iter(by_status)) if len(by_status) == 1 else None
+            rows.append([task, method, only if only == statistics.NOT_RUN else "; ".join(texts) or statistics.NOT_RUN])
+    return Table("Cells", ["task", "arm", "state"], rows, "Only cells that are done enter anything below.")
+
+
+def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
+    """
+    :param experiment: An experiment
+    :param thresholds: Returns, for the steps to reach them
+    :return: Area under the curve, final return, spread over seeds, steps to thresholds
+    """
+    columns = ["task", "arm", ">seeds", ">area under curve", ">final return", ">IQR, final", ">IQR, curve"]
+    columns += [f">steps to {number_text(limit)}" for limit in thresholds]
+    rows = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            arm = statistics.summarise_arm(experiment, task, method, thresholds)
+            row = [task, method, str(len(arm.seeds)), _mean_std(arm.areas), _mean_std(arm.finals)]
+            row += [number_text(statistics.interquartile_range(arm.finals)), number_text(arm.curve_iqr)]
+            rows.append(row + [_reached(arm.reached[limit]) for limit in thresholds])
+    return Table(
+        "Learning curves",
+        columns,
+        rows,
+        "Mean ± standard deviation (n - 1) over seeds. Area under the curve: mean return over the environment steps of "
+        "training. IQR: interquartile range over seeds, of the final return and averaged over the curve. Steps: median "
+        "over the seeds that reach the return at an evaluation, and how many do.",
+    )
+
+
+def _reached(steps: np.ndarray) -> str:
+    if not len(steps):
+        return NONE
+    there = steps[np.isfinite(steps)]
+    return f"{number_text(float(np.median(there)))} ({len(there)} of {len(steps)})" if len(there) else "not reached"
+
+
+def difference_table(
+    experiment: Experiment, rows: Sequence[statistics.PairedDifference], measure: str = "area under the curve"
+) -> Table:
+    """
+    :param experiment: An experiment
+    :param rows: Its paired differences
+    :param measure: Of what
+    :return: The differences with both intervals
+    """
+    texts = [
+        [
+            row.method,
+            of_tasks(row),
+            f"{row.pairs}",
+            number_text(row.t.value, 1),
+            interval_text(row.t, 1),
+            interval_text(row.percentile, 1),
+            f"{row.wins} of {row.pairs}",
+            row.t.verdict,
+        ]
+        for row in rows
+    ]
+    return Table(
+        f"Paired difference from {experiment.baseline}: {measure}",
+        ["arm", "task", ">pairs", ">difference", ">95 % t", ">95 % percentile", ">pairs above", "verdict"],
+        texts,
+        "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation "
+        "starts. The t interval (which gives the verdict) draws each task's mean from Student's t around the mean of "
+        "its pairs and weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap "
+        "resamples seeds within tasks; with two to five of them it is too narrow (it covers the truth in about 50 to "
+        "85 % of cases), and is here for comparison. Verdicts are not corrected for the number of arms and tasks.",
+    )
+
+
+def of_tasks(row: statistics.PairedDifference) -> str:
+    """
+    :param row: A paired difference
+    :return: Of which task, or of how many
+    """
+    if row.task is not None:
+        return row.task
+    # Tasks with a single pair do not count where others have more (statistics.t_interval).
+    return plural(sum(len(values) > 1 for values in row.differences.values()) or len(row.differences), "task")
+
+
+def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Table:
+    """
+    :param experiment: An experiment
+    :param found: Its aggregates
+    :return: Interquartile means and probabilities of improvement
+    """
+    rows = [
+        [
+            method,
+            number_text(iqm.value, 3),
+            interval_text(iqm, 3),
+            number_text(found.improvement[method].value, 2) if method in found.improvement else NONE,
+            interval_text(found.improvement[method], 2) if method in found.improvement else NONE,
+        ]
+        for method, iqm in found.iqm.items()
+    ]
+    return Table(
+        "Aggregates over tasks (rliable)",
+        ["arm", ">IQM", ">95 %", f">P(arm > {experiment.baseline})", ">95 %"],
+        rows,
+        f"Scores: final return / {statistics.HIGHEST_RETURN:.0f}. {plural(len(found.tasks), 'task')} "
+        f"({', '.join(found.tasks)}), {found.seeds} seeds each: those that all arms have done. Stratified percentile "
+        "bootstrap over seeds: too narrow for few of them. The probability of improvement does not pair seeds.",
+    )
+
+
+def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSummary]) -> Table:
+    """
+    :param experiment: An experiment
+    :param summaries: What its policies meet
+    :return: SRL error by policy and head, beside the paper's
+    """
+    rows = []
+    for row in summaries:
+        theirs = published.SRL_ERROR.get(published.task_key(row.task), {}).get(row.actor)
+        shown = NONE if theirs is None or row.head != "own" else " / ".join(f"{value:.4f}" for value in theirs)
+        errors = [_error(value) for value in (row.error_min, row.error_mean, row.error_max)]
+        head = row.head.replace("_", " ")
+        rows.append([row.task, row.method, head, row.actor, str(row.seeds), *errors, ratio_text(row.ratio), shown])
+    columns = ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", ">mean / random's [95 %]", ">paper"]
+    return Table(
+        "SRL error per step",
+        columns,
+        rows,
+        "Heads: own, the arm's own; common, one fitted to an even mix of all policies' frames from other seeds; zero "
+        "and mean image, yardsticks that always predict the same. Errors are measured against the mean of the dither: "
+        f"an autoencoder's error is its excess over the dither floor already ({published.DITHER_FLOOR:.1e} of the "
+        "training loss), and the ratio that of the excesses: over the random actor's under the same head, "
+        "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
+        f"{published.PAPER}.",
+    )
+
+
+def ratio_text(estimate: Estimate) -> str:
+    """
+    :param estimate: A ratio
+    :return: It and its interval
+    """
+    if not math.isfinite(estimate.value):
+        return NONE
+    return f"{number_text(estimate.value, 2)} {interval_text(estimate, 2)}"
+
+
+def coverage_table(rows: Sequence[statistics.Coverage]) -> Table:
+    """
+    :param rows: Coverage by actor
+    :return: Occupied cells and entropy
+    """
+    grids = _list([f"{row.task}: {row.grid} intervals in each of {row.dimensions} dimensions" for row in rows])
+    columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells", ">/ random's [95 %]", ">entropy, bits"]
+    shown = []
+    for row in rows:
+        numbers = [str(len(row.occupied)), number_text(row.steps), _mean_std(row.occupied)]
+        entropy = number_text(float(row.entropy.mean()), 2)
+        shown.append([row.task, row.method, row.actor, *numbers, ratio_text(row.ratio), entropy])
+    return Table(
+        "Coverage of the true state space",
+        columns,
+        shown,
+        f"Positions and velocities of the simulator, of which the agents see only images. Grid: {grids}, between the "
+        "1st and 99th percentile over all actors of the task. Equally many states are counted of each actor and seed.",
+    )
+
+
+def pretraining_table(experiment: Experiment) -> Table:
+    """
+    :param experiment: An experiment of kind ``"pretraining"``
+    :return: Final returns beside the paper's
+    """
+    rows = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            finals = statistics.summarise_arm(experiment, task, method).finals
+            theirs = _papers_arm(method).get(published.task_key(task))
+            difference = NONE
+            if len(finals) and theirs is not None:
+                difference = number_text(float(finals.mean()) - theirs.mean)
+            rows.append([task, method, str(len(finals)), _mean_std(finals), _published(theirs), difference])
+    return Table(
+        "Final return after pretraining, beside the paper's",
+        ["task", "arm", ">seeds", ">ours", ">paper", ">difference"],
+        rows,
+        f"Paper: {published.PAPER}, Table I, after training of unstated length; ours after {experiment.budget:,} "
+        "environment steps, so that differences in level say little: compare the order of the arms.",
+    )
+
+
+def _papers_arm(method: str) -> Mapping[str, published.MeanStd]:
+    return published.PRETRAINING.get(method.lower().replace("-", "_"), {})
+
+
+def published_table(comparisons: Sequence[statistics.Comparison]) -> Table:
+    """
+    :param comparisons: Arms beside published numbers
+    :return: Ours, theirs, difference
+    """
+    rows = []
+    for row in comparisons:
+        ours = number_text(row.ours) + (f" ± {number_text(row.std)}" if math.isfinite(row.std) else "")
+        others = [
+            f"{name} {_published(value)}"
+            for name, tables in published.RETURNS.items()
+            if name != row.published_as and (value := tables[row.steps].get(published.task_key(row.task)))
+        ]
+        theirs, difference, ratio, judgement = NONE, NONE, NONE, "not published"
+        if row.theirs is not None:
+            theirs = f"{row.published_as} {_published(row.theirs)}"
+            difference, ratio = number_text(row.ours - row.theirs.mean), f"{row.ours / row.theirs.mean:.2f}"
+            judgement = "ok" if row.same_method else "adds curiosity: not judged"
+        if row.suspect:
+            judgement = f"suspected bug: below {statistics.SUSPECT_BELOW} x published"
+        run = [row.experiment, row.task, row.method, number_text(row.steps), str(row.seeds), ours]
+        rows.append([*run, theirs, difference, ratio, judgement, "; ".join(others) or NONE])
+    sources = "; ".join(f"{name}: {source}" for name, source in published.SOURCES.items())
+    columns = ["experiment", "task", "arm", ">steps", ">seeds", ">ours", ">theirs", ">difference", ">ratio"]
+    return Table(
+        "Beside published returns",
+        [*columns, "judgement", "other methods"],
+        rows,
+        f"At the same environment steps. {sources}. Independent reruns land 5 to 25 % lower than published; below "
+        f"{statistics.SUSPECT_BELOW} of the published mean a bug of ours is suspected until shown otherwise.",
+    )
+
+
+def conditions_table(experiment: Experiment) -> Table:
+    """
+    :param experiment: An experiment
+    :return: Under which conditions each curve was obtained
+    """
+    rows = []
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            cells = experiment.done(task, method)
+            if not cells:
+                continue
+            runs = [cell.run for cell in cells.values()]
+            steps = [int(cell.evaluations["environment_steps"][-1]) for cell in cells.values() if _has_rows(cell)]
+            versions = [run["versions"] for run in runs if isinstance(run.get("versions"), dict)]
+            packages = [", ".join(f"{name} {number}" for name, number in each.items()) for each in versions]
+            seconds = [run["seconds"] for run in runs if isinstance(run.get("seconds"), int | float)]
+            curve = [", ".join(map(str, cells)), _list([number_text(count) for count in steps]), _duration(seconds)]
+            machine = [_list([run.get(key) for run in runs]) for key in ("device", "precision", "machine")]
+            commit, attempts = (_list([run.get(key) for run in runs]) for key in ("commit", "attempts"))
+            rows.append([task, method, *curve, *machine, _list(packages), commit, attempts])
+    columns = ["task", "arm", "seeds", ">environment steps", ">wall-clock per seed", "device", "precision", "machine"]
+    return Table("Run conditions", [*columns, "versions", "commit", ">attempts"], rows)
+
+
+def _has_rows(cell: statistics.CellResult) -> bool:
+    return len(cell.evaluations.get("environment_steps", ())) > 0
