@@ -1,5 +1,6 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
+import copy
 import fcntl
 import json
 import shutil
@@ -113,11 +114,13 @@ class _CellRun:
         write_text(self.folder / DONE, "")
 
     def _make_env(self) -> Any:
-        return make_vec_env(self.cell.task, n_envs=self.cell.n_envs, env_kwargs=self.cell.env_kwargs)
+        # By a function: of an id SB3 asks for render_mode="rgb_array", which not every environment knows.
+        return make_vec_env(lambda: gym.make(self.cell.task, **self.cell.env_kwargs), n_envs=self.cell.n_envs)
 
     def _begin(self) -> CuReSAC:
         self.state["started"] = _now()
-        return CuReSAC(env=self._make_env(), seed=self.cell.seed, **self.cell.arguments)
+        # A copy, as SB3 writes into policy_kwargs
+        return CuReSAC(env=self._make_env(), seed=self.cell.seed, **copy.deepcopy(self.cell.arguments))
 
     # -------------------------------------------------------------- evaluation
 
@@ -301,7 +304,7 @@ def _keep_config(cell: Cell, folder: Path) -> None:
         different = sorted(key for key in {*begun, *config} if begun.get(key) != config.get(key))
         if different:
             raise GridError(
-                f"{folder} was begun with another {different[0]}: it is {begun.get(different[0])!r} there and "
+                f"{folder} was begun with other settings: {different[0]} is {begun.get(different[0])!r} there and "
                 f"{config.get(different[0])!r} now. Choose another --out, or remove that folder."
             )
     write_json(path, config)

@@ -141,7 +141,7 @@ def _fit_common_head(cell: Cell, observations: np.ndarray) -> CuReSAC:
         srl="rae",
         srl_kwargs=cell.arguments.get("srl_kwargs", {}) if cell.arguments.get("srl", "rae") == "rae" else {},
         curiosity=None,
-        policy_kwargs=cell.arguments.get("policy_kwargs"),
+        policy_kwargs=dict(cell.arguments.get("policy_kwargs", {})),
         buffer_size=1,
         seed=1000 + cell.seed,
     )
