@@ -1,16 +1,24 @@
 """Both policies are evaluated in rollouts of their own, with the noise-free SRL error of what they see."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from PIL import Image
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import even_negatives, run_episodes
+from sb3_cure.evaluation import even_negatives, evenly_measured, most_uncomfortable, run_episodes
+from sb3_cure.experiments import plots
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.metrics import reconstruction_strip
 
@@ -166,3 +174,122 @@ def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
         distances.append(np.abs(observed - drawn).mean())
     assert distances[1] < 0.5 * distances[0]
     assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
+
+
+def brute_force(model: Any, k: int, gap: int) -> list[tuple[int, int, float]]:
+    """Age, environment and error of the worst observations of a model's buffer, one observation at a time."""
+    buffer = model.replay_buffer
+    found = []
+    for age in range(buffer.size() - int(buffer.optimize_memory_usage and buffer.full)):
+        for env in range(buffer.n_envs):
+            row = (buffer.pos - 1 - age) % buffer.buffer_size
+            if isinstance(buffer, FrameStackReplayBuffer):
+                observation = np.concatenate(buffer.frames[buffer.frame_slots[row, env, 0]])
+            else:
+                observation = buffer.observations[row, env]
+            observation = th.as_tensor(observation)[None]
+            with th.no_grad():
+                drawn = model.policy.srl.decoder(model.policy.encode(observation))
+            target = model.policy.srl.target(observation, dither=False)
+            found.append((age, env, float((drawn - target).square().mean())))
+    found.sort(key=lambda each: -each[2])
+    chosen: list[tuple[int, int, float]] = []
+    for each in found:
+        if len(chosen) < k and not any(each[1] == other[1] and abs(each[0] - other[0]) < gap for other in chosen):
+            chosen.append(each)
+    return chosen
+
+
+@pytest.mark.parametrize(
+    ("n_envs", "kwargs"),
+    [
+        (1, dict(buffer_size=50)),
+        (2, dict(buffer_size=60)),
+        (2, dict(buffer_size=500, replay_buffer_class=ReplayBuffer)),
+        (
+            1,
+            dict(
+                buffer_size=40,
+                replay_buffer_class=ReplayBuffer,
+                optimize_memory_usage=True,
+                replay_buffer_kwargs=dict(handle_timeout_termination=False),
+            ),
+        ),
+    ],
+    ids=["full", "full, two environments", "SB3's, half full", "SB3's memory-saving, full"],
+)
+@pytest.mark.parametrize("gap", [1, 6])
+def test_most_uncomfortable_equals_brute_force(n_envs: int, kwargs: dict[str, Any], gap: int) -> None:
+    """The worst observations first, apart in time, whatever the chunks; looking draws no random numbers."""
+    model = tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * n_envs), **kwargs).learn(74)
+    expected = brute_force(model, 7, gap)
+    before = np.random.get_state()[1].copy(), th.get_rng_state()
+    for chunk in (11, 1000):
+        found = most_uncomfortable(model, 7, gap=gap, chunk=chunk)
+        np.testing.assert_allclose(found.errors, [error for _, _, error in expected], rtol=1e-4)
+        assert found.ages.tolist() == [age * n_envs for age, _, _ in expected]
+        assert found.observations.dtype == np.uint8
+        batch = ReplayBufferSamples(th.as_tensor(found.observations), *[None] * 4)
+        with th.no_grad():
+            errors = model.policy.srl.error(batch, model.policy.encode(batch.observations))
+        np.testing.assert_allclose(errors, found.errors, rtol=1e-4)
+    everything = brute_force(model, 10_000, 1)
+    assert found.mean_error == pytest.approx(np.mean([error for _, _, error in everything]), rel=1e-4)
+    assert len(most_uncomfortable(model, 10_000, gap=1).errors) == len(everything)
+    np.testing.assert_array_equal(before[0], np.random.get_state()[1])
+    assert th.equal(before[1], th.get_rng_state())
+
+
+def test_uncomfortable_frames_are_drawn(tmp_path: Path) -> None:
+    """With and without reconstructions, and where one row of frames is not full."""
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=2)).learn(60)
+    found = most_uncomfortable(model, 5, gap=2)
+    with th.no_grad():
+        drawn = model.policy.srl.reconstruct(model.policy.encode(th.as_tensor(found.observations))).numpy()
+    for name, images in (("alone.png", None), ("both.png", drawn)):
+        plots.uncomfortable_frames(tmp_path / name, found, 2, "title", images)
+        assert np.asarray(Image.open(tmp_path / name).convert("L")).std() > 5
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "message"),
+    [
+        (lambda: tiny_model("CnnPolicy", PixelBox()).learn(12), dict(k=0), "k is 0, gap 25 and chunk 128, but each"),
+        (lambda: tiny_model("CnnPolicy", PixelBox()), dict(), "nothing in its replay buffer: train it, or call load_"),
+        (lambda: SAC("MlpPolicy", VectorBox()), dict(), "no SRL head"),
+    ],
+)
+def test_nothing_uncomfortable_is_one_sentence(make: Any, arguments: dict[str, int], message: str) -> None:
+    """Wrong numbers, an empty buffer, a model without a head."""
+    with pytest.raises(ValueError, match=message):
+        most_uncomfortable(make(), **arguments)
+
+
+def test_even_measurement_leaves_the_head_as_it_was() -> None:
+    """Within, the negatives are even; afterwards, also after an error, they are the training's again."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12)).learn(20)
+    head = model.policy.srl
+    before = {key: value.clone() for key, value in head.state_dict().items()}
+    with pytest.raises(RuntimeError), evenly_measured(model, PixelBox(), seed=3):
+        assert not th.equal(head.bank, before["bank"])
+        raise RuntimeError
+    assert differences(head.state_dict(), before) == []
+    plain = SAC("MlpPolicy", VectorBox())
+    with evenly_measured(plain, VectorBox()):
+        pass
+
+
+def test_observations_are_normalised_as_in_training() -> None:
+    """Of a model trained in VecNormalize the policy acts on, and its error is that of, normalised observations."""
+    venv = VecNormalize(DummyVecEnv([VectorBox]))
+    model = tiny_model("MlpPolicy", venv, srl="rae").learn(40)
+    (episode,) = run_episodes(model, VectorBox(), 1, seed=5)
+    seen = venv.normalize_obs(episode.observations)
+    assert np.abs(seen - episode.observations).max() > 0.1
+    batch = ReplayBufferSamples(th.as_tensor(seen), *[None] * 4)
+    with th.no_grad():
+        errors = model.policy.srl.error(batch, model.policy.encode(batch.observations))
+    np.testing.assert_allclose(episode.srl_errors, errors, rtol=1e-4)
+    first = model.predict(seen[0], deterministic=True)[0]
+    moved = np.clip(episode.observations[0] + 0.3 * first, -1, 1)
+    np.testing.assert_allclose(episode.observations[1], moved, atol=1e-6)

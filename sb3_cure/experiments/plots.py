@@ -90,7 +90,7 @@ def reconstructions_over_training(
     n_rows, columns = len(pictures), len(observed)
     height = 1.1 * n_rows * observed.shape[2] / observed.shape[3]
     dense = ConstrainedLayoutEngine(h_pad=0.01, hspace=0)
-    figure = Figure(figsize=(1.1 * columns + 1.8, height + 0.8), layout=dense)
+    figure = Figure(figsize=(1.1 * columns + 1.8, height + 0.5), layout=dense)
     axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
     for place, label, images in zip(axes, labels, pictures, strict=True):
         strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
@@ -126,7 +126,9 @@ def uncomfortable_frames(
     for place in grid:
         place.set_axis_off()
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
-        image = np.concatenate([np.moveaxis(images[index, -channels:], 0, -1) for images in pairs], axis=1)
+        first, *second = (np.moveaxis(images[index, -channels:], 0, -1) for images in pairs)
+        gap = np.full((len(first), 1, channels), 255, np.uint8)
+        image = np.concatenate([first, *(part for each in second for part in (gap, each))], axis=1)
         grid[index].imshow(_picture(image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
@@ -321,7 +323,7 @@ def paired_differences(
     axes = figure.subplots()
     axes.axvline(0, color="#333333", linewidth=1)
     for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
-        axes.plot(pairs, np.full(len(pairs), place), "o", color=colors[arm], alpha=0.35, markersize=4, zorder=3)
+        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5, markersize=3.5)
         if low is not None and high is not None:
             axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
         axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
@@ -358,6 +360,9 @@ def aggregate_scores(
         left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
     left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
     left.invert_yaxis()
+    ends = [end for _, *ends in iqm.values() for end in ends]
+    pad = 0.06 * (max(ends) - min(ends)) or 0.05
+    left.set_xlim(min(ends) - pad, max(ends) + pad)
     left.set(xlabel="interquartile mean of the final score", title="IQM")
     for arm, (share, lower, upper) in profiles.items():
         right.step(taus, share, where="post", color=colors[arm], linewidth=1.8, label=_plain(arm))
@@ -371,17 +376,19 @@ def aggregate_scores(
 def visitation_bars(
     path: Path | IO[bytes],
     panels: Mapping[str, Sequence[tuple[str, str, float, float, float]]],
+    lines: Mapping[str, Mapping[str, float]],
 ) -> None:
     """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
     :param panels: By title: arm, actor, minimum, mean and maximum of each bar
+    :param lines: By title: values to compare with, by name
     """
     bars = {
         title: [(arm, actor, mean, (low, high), np.zeros(0)) for arm, actor, low, mean, high in rows]
         for title, rows in panels.items()
     }
-    _actor_bars(path, bars, "SRL error per step (mean, min, max)", logarithmic=True)
+    _actor_bars(path, bars, "SRL error per step (mean, min, max)", lines)
 
 
 def coverage_bars(
@@ -404,9 +411,12 @@ def _actor_bars(
     path: Path | IO[bytes],
     panels: Mapping[str, Sequence[tuple[str, str, float, tuple[float, float] | None, np.ndarray]]],
     ylabel: str,
-    logarithmic: bool = False,
+    lines: Mapping[str, Mapping[str, float]] | None = None,
 ) -> None:
-    """Bars in groups of arms, coloured by actor: arm, actor, height, ends of the error bar, dots."""
+    """Bars in groups of arms, coloured by actor: arm, actor, height, ends of the error bar, dots.
+
+    With lines across them to compare with, the axis is logarithmic.
+    """
     figure, places = _panels(len(panels), height=3.0)
     for axes, (title, rows) in zip(places, panels.items(), strict=True):
         arms = list(dict.fromkeys(arm for arm, *_ in rows))
@@ -427,7 +437,9 @@ def _actor_bars(
         if len(arms) > 2:
             axes.tick_params(axis="x", rotation=15)
         axes.set(title=_plain(title), ylabel=ylabel)
-        if logarithmic and any(height > 0 for _, _, height, *_ in rows):
+        for (label, value), style in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
+            axes.axhline(value, color="#333333", linewidth=1, linestyle=style, label=_plain(label))
+        if lines is not None and any(height > 0 for _, _, height, *_ in rows):
             axes.set_yscale("log")
         _tidy(axes)
     _shared_legend(figure, places)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import imageio.v2 as imageio
+import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: F401  (imageio looks for it late: at the first frame)
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 

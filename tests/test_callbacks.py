@@ -1,0 +1,384 @@
+"""Videos, reconstructions and maps show what they promise, of any SB3 algorithm, and do not change the training."""
+
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_cure import make_dmc_env
+from sb3_cure.callbacks import (
+    CuriosityMapCallback,
+    PeriodicCallback,
+    PolicyVideoCallback,
+    ReconstructionCallback,
+)
+from sb3_cure.evaluation import Episode, binned_errors, run_episodes
+from sb3_cure.experiments.video import annotated_frames
+from sb3_cure.srl import SRLHead, SRLOutput
+
+
+class Filmed(gym.Wrapper):
+    """Renders the dot's position as a light square on black, 64 x 48."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 12}
+    render_mode = "rgb_array"
+
+    def render(self) -> Any:
+        frame = np.zeros((48, 64, 3), np.uint8)
+        row, column = ((self.unwrapped.position + 1) / 2 * (40, 56)).astype(int)
+        frame[row : row + 8, column : column + 8] = 200
+        return frame
+
+
+class Silent(SRLHead):
+    """A head that learns and does not draw."""
+
+    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
+        error = latents.square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+def names(folder: Path) -> list[str]:
+    """What lies in a folder."""
+    return sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+
+
+def position(env: gym.Env) -> np.ndarray:
+    """The true state of the tiny environments."""
+    return env.unwrapped.position  # type: ignore[attr-defined]
+
+
+MAP: dict[str, Any] = dict(state=position, names=["x", "y"])
+
+
+def test_periods_are_counted_in_agent_steps() -> None:
+    """With three environments the steps go by threes; every learn() starts counting anew."""
+    seen: list[int] = []
+
+    class Note(PeriodicCallback):
+        def on_period(self) -> None:
+            seen.append(self.num_timesteps)
+
+    model = tiny_model("MlpPolicy", DummyVecEnv([VectorBox] * 3), srl=None, curiosity=None)
+    callback = Note(every=10)
+    model.learn(45, callback=callback)
+    assert seen == [12, 24, 36]
+    model.learn(12, callback=callback, reset_num_timesteps=False)
+    assert seen == [12, 24, 36, 57]
+    with pytest.raises(ValueError, match=r"Note got every=0, but it counts agent steps"):
+        Note(every=0)
+    with pytest.raises(NotImplementedError, match="PeriodicCallback must implement on_period"):
+        model.learn(5, callback=PeriodicCallback(every=1))
+
+
+def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
+    """All callbacks, with stochastic policies, a probe and CURL's negatives chosen anew: equal bits afterwards."""
+    models = []
+    for watched in (False, True):
+        callbacks: list[BaseCallback] = []
+        if watched:
+            env = Filmed(PixelBox())
+            callbacks = [
+                PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
+                ReconstructionCallback(tmp_path, 15, probe_updates=2),
+                CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
+            ]
+        model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12))
+        models.append(model.learn(40, callback=callbacks))
+    assert names(tmp_path) == sorted(
+        [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
+        + [f"curiosity_map_{steps}_steps.png" for steps in (15, 30)]
+        + ["reconstructions.png"]
+    )
+    assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
+
+
+@pytest.mark.parametrize(
+    ("make", "env"),
+    [
+        (lambda env: SAC("MlpPolicy", env, learning_starts=10, policy_kwargs=dict(net_arch=[8])), VectorBox),
+        (lambda env: PPO("MlpPolicy", env, n_steps=16, batch_size=16), VectorBox),
+        (lambda env: RecurrentPPO("MlpLstmPolicy", env, n_steps=16, batch_size=16), VectorBox),
+        (lambda env: PPO("CnnPolicy", env, n_steps=16, batch_size=16, n_epochs=1), PixelBox),
+    ],
+    ids=["SAC", "PPO", "RecurrentPPO", "PPO from pixels"],
+)
+def test_any_algorithm_can_be_filmed(
+    make: Callable[[Any], BaseAlgorithm], env: type[VectorBox], tmp_path: Path
+) -> None:
+    """An episode of 20 steps in 20 frames that change, with a caption and, without an SRL head, no error."""
+    callback = PolicyVideoCallback(Filmed(env()), tmp_path / "videos", every=20, seed=1)
+    make(env()).learn(30, callback=callback)
+    assert names(tmp_path / "videos") == ["task_policy_20_steps.mp4"]
+    with imageio.get_reader(tmp_path / "videos" / "task_policy_20_steps.mp4") as video:
+        assert video.get_meta_data()["fps"] == 12
+        frames = np.stack([np.asarray(frame) for frame in video])
+    assert frames.shape[0] == 20 and frames.shape[2] == 256
+    camera, caption = frames[:, :192].astype(int), frames[:, 192:].astype(int)
+    assert np.abs(camera[0] - camera[-1]).max() > 100
+    assert (caption < 80).any() and not is_red(caption).any()
+
+
+def is_red(pictures: np.ndarray) -> np.ndarray:
+    """Where pixels have about the colour of the error's curve."""
+    pictures = pictures.astype(int)
+    return (pictures[..., 0] > 150) & (pictures[..., 1] < 120) & (pictures[..., 2] < 120)
+
+
+def test_video_shows_both_policies_with_their_errors(tmp_path: Path) -> None:
+    """Decoded, each video shows the frames of that policy's episode; below, the curve grows from frame to frame."""
+    env = Filmed(PixelBox())
+    model = tiny_model("CnnPolicy", PixelBox())
+    model.learn(20, callback=PolicyVideoCallback(env, tmp_path, every=20, seed=4, fps=5))
+    # The update after the last step came after the film.
+    for actor in ("task", "curious"):
+        frames = np.stack(imageio.mimread(tmp_path / f"{actor}_policy_20_steps.mp4", memtest=False))
+        assert len(frames) == 20
+        (episode,) = run_episodes(model, env, 1, actor, seed=4, render=True)
+        first = episode.frames[0].repeat(4, axis=0).repeat(4, axis=1).astype(int)
+        assert np.abs(frames[0, :192] - first).mean() < 5
+        red = is_red(frames[:, 192:]).any(axis=1).sum(axis=1)  # columns of the panel with red in them
+        assert red[-1] > red[0]
+        assert not is_red(frames[:, :192]).any()
+
+
+def test_overlay_shows_the_error_and_leaves_the_picture_alone() -> None:
+    """Another error changes pixels of the panel from its step on, and none of the camera's picture."""
+    frames = [np.full((48, 64, 3), 10 * step, np.uint8) for step in range(6)]
+    errors = np.array([0.1, 0.2, 0.3, 0.2, 1.0, 0.4])
+    changed = errors.copy()
+    changed[3] = 0.9
+
+    def pictures(errors: np.ndarray) -> np.ndarray:
+        return np.stack(list(annotated_frames(Episode(np.ones(6), errors, np.zeros(6), frames), action_repeat=4)))
+
+    plain, other, without = pictures(errors), pictures(changed), pictures(np.zeros(0))
+    assert plain.shape[1] % 2 == 0 == plain.shape[2] % 2
+    for shown in (plain, other, without):
+        np.testing.assert_array_equal(shown[:, :192:4, ::4], np.stack(frames))
+    differs = (plain != other).any(axis=-1)
+    assert not differs[:3].any() and differs[3:, 192:].any(axis=(1, 2)).all()
+    assert is_red(plain[:, 192:]).any(axis=(1, 2)).all() and not is_red(without).any()
+    # The dot at the end of the curve, right of all that is red below the text, is the higher the higher the error is.
+    heights = []
+    for picture in plain:
+        rows, columns = np.nonzero(is_red(picture[226:]))
+        heights.append(-rows[columns == columns.max()].mean())
+    assert heights[1] == heights[3] and (np.diff(np.array(heights)[[0, 1, 2, 5, 4]]) > 0).all()
+
+
+def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Path) -> None:
+    """Each row is what the head draws then of the observations of the first row, newest frames only."""
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=2))
+    callback = ReconstructionCallback(tmp_path, every=15, columns=5)
+    model.learn(40, callback=callback)
+    assert [steps for steps, _ in callback.rows] == [15, 30]
+    chosen = callback.observations.copy()
+    assert len(chosen) == 5
+    stored = model.replay_buffer.transitions(np.arange(15), np.zeros(15, int)).observations.numpy()
+    assert all((observation == stored).all(axis=(1, 2, 3)).any() for observation in chosen)
+    height = np.asarray(Image.open(tmp_path / "reconstructions.png")).shape[0]
+    callback.on_period()
+    np.testing.assert_array_equal(callback.observations, chosen)
+    with th.no_grad():
+        drawn = model.policy.srl.reconstruct(model.policy.encode(th.as_tensor(chosen)))
+    np.testing.assert_array_equal(callback.rows[-1][1], drawn[:, 3:])
+    assert not np.array_equal(callback.rows[0][1], callback.rows[-1][1])
+    picture = np.asarray(Image.open(tmp_path / "reconstructions.png").convert("L"))
+    assert picture.shape[0] > height and picture.std() > 5
+
+
+def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_path: Path) -> None:
+    """The first row is the untrained model's; the picture stays as high as ``max_rows`` rows."""
+    env = PixelBox()
+    observations = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
+    callback = ReconstructionCallback(tmp_path, every=4, observations=observations, max_rows=3)
+    heights = []
+
+    class Measure(BaseCallback):
+        def _on_step(self) -> bool:
+            heights.append(Image.open(tmp_path / "reconstructions.png").size[1])
+            return True
+
+    tiny_model("CnnPolicy", env).learn(20, callback=[callback, Measure()])
+    assert [steps for steps, _ in callback.rows] == [0, 4, 8, 12, 16, 20]
+    assert heights[0] < heights[4] < heights[8] == heights[-1]
+
+
+def test_heads_that_do_not_draw_get_a_probe_or_one_sentence(tmp_path: Path) -> None:
+    """A decoder fitted to the latents draws; without it nothing is written, and that is said once."""
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl=Silent)
+    probed = ReconstructionCallback(tmp_path / "probe", every=15, probe_updates=60)
+    refused = ReconstructionCallback(tmp_path / "none", every=5, probe_updates=0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(31, callback=[probed, refused])
+    said = [str(warning.message) for warning in caught if "draws nothing" in str(warning.message)]
+    assert len(said) == 1 and "Silent does not reconstruct" in said[0]
+    assert names(tmp_path) == ["probe"] and names(tmp_path / "probe") == ["reconstructions.png"]
+    observed = probed.observations.astype(float)
+    untouched = np.abs(observed - 128).mean()  # what an untrained decoder is off by: it draws grey
+    assert np.abs(probed.rows[-1][1] - observed).mean() < 0.6 * untouched
+
+
+def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:
+    """What was visited is what the policies visit in the same episodes, with their errors."""
+    env = PixelBox()
+    model = tiny_model("CnnPolicy", PixelBox())
+    callback = CuriosityMapCallback(
+        env, tmp_path, every=20, n_episodes=2, seed=3, actors=("curious", "random"), bins=5, **MAP
+    )
+    model.learn(25, callback=callback)
+    assert names(tmp_path) == ["curiosity_map_20_steps.png"]
+    callback.on_period()
+    assert list(callback.visits) == ["curious", "random"]
+    for actor, (states, errors) in callback.visits.items():
+        episodes = list(run_episodes(model, PixelBox(), 2, actor, seed=3, states=position))
+        assert states.shape == (40, 2) and errors.shape == (40,)
+        np.testing.assert_array_equal(errors, np.concatenate([episode.srl_errors for episode in episodes]))
+        if actor == "curious":  # random actions come from each environment's own space
+            np.testing.assert_array_equal(states, np.concatenate([episode.states for episode in episodes]))
+    assert np.asarray(Image.open(tmp_path / "curiosity_map_25_steps.png").convert("L")).std() > 5
+
+
+def test_map_of_an_algorithm_without_errors(tmp_path: Path) -> None:
+    """SB3's PPO has visits and no errors: the picture has one column instead of two."""
+    callback = CuriosityMapCallback(VectorBox(), tmp_path, every=16, n_episodes=1, **MAP)
+    PPO("MlpPolicy", VectorBox(), n_steps=16, batch_size=16).learn(16, callback=callback)
+    both = CuriosityMapCallback(VectorBox(), tmp_path, every=20, n_episodes=1, actors=["task"], **MAP)
+    tiny_model("MlpPolicy", VectorBox(), srl="rae").learn(20, callback=both)
+    one, two = (Image.open(tmp_path / f"curiosity_map_{steps}_steps.png").size for steps in (16, 20))
+    assert one[1] == two[1] and one[0] == pytest.approx(two[0] / 2, rel=0.1)
+
+
+def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:
+    """Joints and suitable coordinates come from the physics; another pair can be named."""
+    env = make_dmc_env("cartpole", "swingup", image_size=36, renderer="fast", action_repeat=50)
+    model = tiny_model("CnnPolicy", env)
+    callback = CuriosityMapCallback(env, tmp_path, every=5, n_episodes=1)
+    assert callback.coordinates == ("hinge_1", "hinge_1_velocity") and callback.units[1] == "rad"
+    callback.init_callback(model)
+    callback.on_period()
+    assert callback.visits["task"][0].shape == (20, 4)
+    other = CuriosityMapCallback(env, tmp_path, every=5, coordinates=("slider", "hinge_1"))
+    assert other.coordinates == ("slider", "hinge_1")
+    with pytest.raises(ValueError, match=r"coordinates are \('pole', 'hinge_1'\).*choose of slider, hinge_1, slider_v"):
+        CuriosityMapCallback(env, tmp_path, coordinates=("pole", "hinge_1"))
+    env.close()
+
+
+@given(
+    states=arrays(np.float64, st.tuples(st.integers(1, 60), st.just(2)), elements=st.floats(-5, 5)),
+    bins=st.tuples(st.integers(1, 7), st.integers(1, 7)),
+    span=st.tuples(st.floats(-6, 0), st.floats(0.1, 6)),
+)
+@settings(max_examples=60, deadline=None)
+def test_bins_hold_every_step_once(states: np.ndarray, bins: tuple[int, int], span: tuple[float, float]) -> None:
+    """Visits add up to the steps, also of those outside of the grid; means times visits add up to all errors."""
+    edges = np.linspace(*span, bins[0] + 1), np.linspace(*span, bins[1] + 1)
+    errors = np.arange(1.0, len(states) + 1)
+    visits, means = binned_errors(states, errors, edges)
+    assert visits.shape == means.shape == bins
+    assert visits.sum() == len(states)
+    np.testing.assert_array_equal(np.isnan(means), visits == 0)
+    assert np.nansum(means * visits) == pytest.approx(errors.sum())
+    inside = [np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1)]
+    cells = [
+        np.minimum(np.searchsorted(edges[axis], inside[axis], side="right") - 1, bins[axis] - 1) for axis in (0, 1)
+    ]
+    brute = np.zeros(bins)
+    for cell in zip(*cells, strict=True):
+        brute[cell] += 1
+    np.testing.assert_array_equal(visits, brute)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda env, path: PolicyVideoCallback(env, path, every=0), "every=0, but it counts agent steps"),
+        (lambda env, path: PolicyVideoCallback(env, path, fps=0), "fps=0, but a video needs at least 1"),
+        (lambda env, path: PolicyVideoCallback(env.env, path), "render_mode=None, which gives no frames: make it with"),
+        (lambda env, path: PolicyVideoCallback(DummyVecEnv([lambda: env]), path), "watches one environment at a time"),
+        (lambda env, path: CuriosityMapCallback(env, path), "has no physics of dm_control"),
+        (lambda env, path: CuriosityMapCallback(env, path, state=position), "got state without names"),
+        (lambda env, path: CuriosityMapCallback(env, path, names=["x", "y"]), "got names without state"),
+        (lambda env, path: CuriosityMapCallback(env, path, state=position, names=["x"]), "a map needs two"),
+        (lambda env, path: CuriosityMapCallback(env, path, bins=0, **MAP), "bins=0, but each must be at least 1"),
+        (lambda env, path: CuriosityMapCallback(env, path, coordinates=("x", "z"), **MAP), "choose of x, y"),
+        (lambda env, path: ReconstructionCallback(path, columns=0), "columns=0"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(make: Callable[..., BaseCallback], message: str, tmp_path: Path) -> None:
+    """Before training starts, and nothing is written."""
+    with pytest.raises(ValueError, match=message):
+        make(Filmed(VectorBox()), tmp_path / "pictures")
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda env, path: PolicyVideoCallback(env, path, actors=["curious"]),
+            "this model has 'task', 'random': choose",
+        ),
+        (lambda env, path: CuriosityMapCallback(env, path, actors=["best"], **MAP), r"actors=\['best'\]"),
+        (lambda env, path: ReconstructionCallback(path), "learns from Box.*draws images.*use it with CuReSAC"),
+    ],
+)
+def test_callbacks_that_do_not_fit_the_model_say_so(
+    make: Callable[..., BaseCallback], message: str, tmp_path: Path
+) -> None:
+    """When ``learn`` is called, before its first step."""
+    model = SAC("MlpPolicy", VectorBox())
+    with pytest.raises(ValueError, match=message):
+        model.learn(5, callback=make(Filmed(VectorBox()), tmp_path))
+    assert model.num_timesteps == 0
+
+
+def test_states_and_observations_must_fit(tmp_path: Path) -> None:
+    """Too few names, and observations of another shape."""
+    named = CuriosityMapCallback(VectorBox(), tmp_path, 5, state=position, names=["x", "y", "z"], n_episodes=1)
+    with pytest.raises(ValueError, match=r"got 3 names for states of shape \(2,\)"):
+        SAC("MlpPolicy", VectorBox()).learn(5, callback=named)
+    shown = ReconstructionCallback(tmp_path, observations=np.zeros((2, 3, 8, 8), np.uint8))
+    with pytest.raises(
+        ValueError, match=r"observations of shape \(2, 3, 8, 8\), but the model learns from \(6, 36, 36"
+    ):
+        tiny_model("CnnPolicy", PixelBox()).learn(5, callback=shown)
+
+
+@pytest.mark.parametrize(
+    ("room", "package", "make"),
+    [
+        ("plots", "matplotlib", lambda path: ReconstructionCallback(path)),
+        ("video", "imageio", lambda path: PolicyVideoCallback(Filmed(VectorBox()), path)),
+    ],
+)
+def test_missing_package_is_one_sentence(
+    room: str, package: str, make: Callable[[Path], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names the package and what to install."""
+    monkeypatch.delitem(sys.modules, f"sb3_cure.experiments.{room}", raising=False)
+    for name in [name for name in sys.modules if name == package or name.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"needs the package {package}.*`pip install 'sb3-cure\[demo\]'`"):
+        make(tmp_path)
