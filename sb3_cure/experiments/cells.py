@@ -21,7 +21,7 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import Cell, GridError
-from sb3_cure.experiments.media import draw_cell
+from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
 
 #: Evaluations start from the same states in all cells
@@ -101,7 +101,8 @@ class _CellRun:
         left = self.agent_steps(cell.budget) - self.model.num_timesteps
         if cell.budget > 0 and left > 0:
             fresh = self.model.num_timesteps == 0
-            self.model.learn(left, callback=_Watch(self), reset_num_timesteps=fresh)
+            pictures = watch_reconstructions(cell, self.action_repeat, self.folder)
+            self.model.learn(left, callback=[_Watch(self), *pictures], reset_num_timesteps=fresh)
         # Not among the results until everything else is: the state from here on can be made anew.
         self.model.save(self.folder / "model.zip")
         if cell.kind == "visitation":
