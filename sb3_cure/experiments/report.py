@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 import sb3_cure
-from sb3_cure.experiments import plots, statistics, tables
+from sb3_cure.experiments import plots, published, statistics, tables
 from sb3_cure.experiments.statistics import Experiment, ResultsError
 from sb3_cure.experiments.tables import Table, interval_text, markdown_text, number_text, of_tasks, plural, ratio_text
 
@@ -145,55 +145,69 @@ def describe(experiment: Experiment, thresholds: Sequence[float]) -> Section:
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure | str]]:
     coverage, errors = statistics.state_coverage(experiment), statistics.summarise_errors(experiment)
-    headlines: list[str] = []
     parts: list[Table | Figure | str] = []
-    for row in coverage:
-        if row.actor == "curious":
-            headlines.append(
-                f"{row.method} on {row.task}: the curious policy occupies {ratio_text(row.ratio)} times as many cells "
-                f"of the true state space as the random one ({plural(row.ratio.n, 'seed')})."
-            )
-    for error in errors:
-        if error.actor == "curious" and error.head in ("own", "common"):
-            headlines.append(
-                f"{error.method} on {error.task}, {error.head} head: the curious policy meets "
-                f"{ratio_text(error.ratio)} times the SRL error of the random one ({plural(error.ratio.n, 'seed')})."
-            )
     if coverage:
         panels = {
             task: [(row.method, row.actor, row.occupied) for row in coverage if row.task == task]
             for task in dict.fromkeys(row.task for row in coverage)
         }
+        caption = "Occupied cells of a grid over the true physics state, by policy: mean over seeds, each seed a dot."
         parts.append(
-            _figure(
-                "coverage",
-                "Occupied cells of a grid over the true physics state, by policy: mean over seeds, each seed a dot.",
-                plots.coverage_bars,
-                panels,
-                "occupied cells of the true state space",
-            )
+            _figure("coverage", caption, plots.coverage_bars, panels, "occupied cells of the true state space")
         )
         parts.append(tables.coverage_table(coverage))
-    for head in dict.fromkeys(row.head for row in errors if row.head in ("own", "common")):
+    for head in [head for head in statistics.HEADS if any(row.head == head for row in errors)]:
+        judged = [row for row in errors if row.head == head]
         bars = {
             task: [
                 (row.method, row.actor, row.error_min, row.error_mean, row.error_max)
-                for row in errors
-                if (row.task, row.head) == (task, head)
+                for row in judged
+                if row.task == task
             ]
-            for task in dict.fromkeys(row.task for row in errors if row.head == head)
+            for task in dict.fromkeys(row.task for row in judged)
         }
-        parts.append(
-            _figure(
-                f"visitation_{head}",
-                f"SRL error per step under the {head} head, by policy: mean, with minimum and maximum as error bars.",
-                plots.visitation_bars,
-                bars,
-            )
+        lines = {task: _yardsticks(task, errors) for task in bars}
+        caption = (
+            f"SRL error per step under the {head} head, by policy: mean, with minimum and maximum as error bars. "
+            "Lines: the mean error of always predicting zero, or the mean image, and the paper's value for curiosity."
         )
+        parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
     if errors:
         parts.append(tables.error_table(experiment, errors))
-    return headlines, parts
+    return list(_visitation_headlines(experiment, coverage, errors)), parts
+
+
+def _yardsticks(task: str, errors: Sequence[statistics.ErrorSummary]) -> dict[str, float]:
+    lines = {}
+    for head, label in (("zero", "always zero"), ("mean_image", "mean image")):
+        values = [row.error_mean for row in errors if (row.task, row.head) == (task, head)]
+        if values:
+            lines[label] = float(np.mean(values))
+    theirs = published.SRL_ERROR.get(published.task_key(task))
+    return {**lines, "paper's cure": theirs["curious"].mean} if theirs else lines
+
+
+def _visitation_headlines(
+    experiment: Experiment, coverage: Sequence[statistics.Coverage], errors: Sequence[statistics.ErrorSummary]
+) -> Iterator[str]:
+    """One sentence per arm and task that has a curious policy."""
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            key = (task, method, "curious")
+            found = [
+                f"{ratio_text(row.ratio)} times as many cells of the true state space"
+                for row in coverage
+                if (row.task, row.method, row.actor) == key
+            ]
+            found += [
+                f"{ratio_text(row.ratio)} times the SRL error under the {row.head} head"
+                for row in errors
+                if (row.task, row.method, row.actor) == key and row.head in statistics.HEADS
+            ]
+            if found:
+                seeds = plural(len(experiment.done(task, method)), "seed")
+                compared = ", ".join(found)
+                yield f"{method} on {task}, {seeds}: compared to the random policy, the curious one meets {compared}."
 
 
 def _curves(
@@ -205,7 +219,7 @@ def _curves(
         for task in experiment.tasks
         for method in experiment.methods
     )
-    if not has_curves:
+    if not has_curves or experiment.kind == "visitation":
         return [], parts
     headlines = []
     differences = statistics.paired_differences(experiment)
@@ -213,9 +227,10 @@ def _curves(
     for row in differences:
         if row.task is None or row.method not in several:
             where = f"{plural(row.t.n, 'paired seed')} on {of_tasks(row)}"
+            shown = f" {interval_text(row.t, 1)}" if row.t.low is not None else ""
             headlines.append(
-                f"{row.method} minus {experiment.baseline}: area under the curve {number_text(row.t.value, 1)} "
-                f"{interval_text(row.t, 1)}, {where}: {row.t.verdict}."
+                f"{row.method} minus {experiment.baseline}: area under the curve {number_text(row.t.value, 1)}"
+                f"{shown}, {where}: {row.t.verdict}."
             )
     if not differences:
         headlines.append(
@@ -228,7 +243,7 @@ def _curves(
         parts.append(difference_figure(experiment, differences, colors))
         parts.append(tables.difference_table(experiment, differences))
         finals = statistics.paired_differences(experiment, "finals")
-        parts.append(tables.difference_table(experiment, finals, "final return"))
+        parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
     try:
         found = statistics.aggregate(experiment)
     except ResultsError as error:
@@ -279,17 +294,18 @@ table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabula
 th { text-align: left; font-weight: 600; color: var(--soft); vertical-align: bottom; }
 th { border-bottom: 1.5px solid var(--ink); }
 th, td { padding: 4px 14px 4px 0; }
-td { border-bottom: 1px solid var(--line); vertical-align: top; overflow-wrap: anywhere; max-width: 340px; }
+td { border-bottom: 1px solid var(--line); vertical-align: top; overflow-wrap: break-word; max-width: 340px; }
 .number { text-align: right; white-space: nowrap; }
 .bad { color: #a61b1b; font-weight: 600; }
 .good { color: #17692f; font-weight: 600; }
 .absent { color: #8a5a00; font-style: italic; }
 figure { margin: 18px 0; }
 img, video { max-width: 100%; height: auto; display: block; }
-.media { display: grid; grid-template-columns: repeat(auto-fill, minmax(340px, 1fr)); gap: 16px 26px; }
+.media { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(480px, 100%), 1fr)); gap: 16px 26px; }
 .media figure { margin: 6px 0; }
-.media video { width: 100%; max-width: 420px; background: #000; }
+.media video { width: 100%; max-width: 480px; background: #000; }
 details { margin: 10px 0; }
+details details { margin-left: 20px; }
 summary { cursor: pointer; font-weight: 600; overflow-wrap: anywhere; }
 pre { background: var(--wash); padding: 10px 14px; font-size: 12px; overflow-x: auto; white-space: pre-wrap; }
 footer { color: var(--soft); font-size: 13px; margin: 50px 0 30px; }
@@ -347,9 +363,9 @@ def media_html(experiment: Experiment, which: str) -> str:
                 ]
                 if shown:
                     name = escape(f"{task}, {method}, seed {cell.seed}")
-                    blocks.append(
-                        f'<details open><summary>{name}</summary><div class="media">{"".join(shown)}</div></details>\n'
-                    )
+                    is_open = " open" if task == experiment.tasks[0] else ""
+                    content = f'<div class="media">{"".join(shown)}</div>'
+                    blocks.append(f"<details{is_open}><summary>{name}</summary>{content}</details>\n")
     return f"<h3>Pictures and videos</h3>\n{''.join(blocks)}" if blocks else ""
 
 
@@ -366,7 +382,7 @@ def _configs_html(experiment: Experiment) -> str:
                 blocks.append(f"<details><summary>{name}</summary><pre>{text}</pre></details>\n")
     grid = escape(json.dumps(experiment.grid, indent=2, ensure_ascii=False))
     blocks.insert(0, f"<details><summary>grid</summary><pre>{grid}</pre></details>\n")
-    return f"<h3>Configurations</h3>\n{''.join(blocks)}"
+    return f"<details><summary>Configurations</summary>\n{''.join(blocks)}</details>\n"
 
 
 def _facts(experiment: Experiment) -> str:

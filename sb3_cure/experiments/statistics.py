@@ -22,7 +22,9 @@ from scipy import integrate, stats
 
 from sb3_cure.experiments import published
 
-DONE, UNFINISHED, NOT_RUN = "done", "unfinished", "not run"
+DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+#: Heads by which policies are compared; others are yardsticks
+HEADS = ("own", "common")
 #: The highest return of an episode in the DeepMind Control suite: scores of rliable are returns divided by it.
 HIGHEST_RETURN = 1000.0
 #: Below this part of a published mean, a return is suspected to be a bug of ours.
@@ -58,8 +60,8 @@ class CellResult:
     :param method: Name of the arm
     :param seed: Seed
     :param folder: Where its files lie
-    :param status: ``"done"``, ``"unfinished"``, ``"not run"``, or which other budget it was run with; only cells that
-        are done have what follows, and enter statistics
+    :param status: ``"done"``, ``"unfinished"``, ``"failed"``, ``"not run"``, or which other budget it was run with;
+        only cells that are done have what follows, and enter statistics
     :param config: ``config.json``
     :param run: ``run.json``
     :param evaluations: Columns of ``eval.csv`` (missing values are nan); empty if there is none
@@ -161,6 +163,16 @@ class Experiment:
             if (at, arm) == (task, method) and cell.done
         }
 
+    def state(self, task: str, method: str) -> dict[str, list[int]]:
+        """
+        :return: Seeds of an arm on a task by the status of their cells; those of the grid are "not run" at least
+        """
+        seeds: dict[str, list[int]] = {}
+        for (at, arm, seed), cell in sorted(self.cells.items(), key=lambda item: item[0][2]):
+            if (at, arm) == (task, method):
+                seeds.setdefault(cell.status, []).append(seed)
+        return seeds
+
 
 # Reading
 
@@ -214,7 +226,7 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int) -> 
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
-        return CellResult(task, method, seed, folder, UNFINISHED)
+        return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
     config, run = _read_json(folder / "config.json"), _read_json(folder / "run.json")
     if (config.get("method", method), config.get("seed", seed)) != (method, seed):
         raise ResultsError(

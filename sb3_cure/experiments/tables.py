@@ -13,6 +13,13 @@ from sb3_cure.experiments import published, statistics
 from sb3_cure.experiments.statistics import Estimate, Experiment
 
 NONE = "\N{EN DASH}"
+DIFFERENCES = (
+    "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation starts. "
+    "The t interval (which gives the verdict) draws each task's mean from Student's t around the mean of its pairs and "
+    "weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap resamples seeds within "
+    "tasks; with two to five of them it is too narrow (it covers the truth in about 50 to 85 % of cases), and is here "
+    "for comparison. Verdicts are not corrected for the number of arms and tasks."
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,8 @@ def markdown_text(text: str) -> str:
 
 
 def _table_cell(kind: str, text: str) -> str:
-    marks = {"suspected bug": "bad", "worse": "bad", "better": "good", statistics.NOT_RUN: "absent", "failed": "bad"}
+    marks = {"suspected bug": "bad", "worse": "bad", "better": "good"}
+    marks |= {statistics.FAILED: "bad", statistics.NOT_RUN: "absent", statistics.UNFINISHED: "absent"}
     mark = next((name for word, name in marks.items() if text.startswith(word)), "")
     content = escape(text)
     return f"<td{kind}>{f'<span class={mark!r}>{content}</span>' if mark else content}</td>"
@@ -89,7 +97,7 @@ def _error(value: float) -> str:
 
 def _mean_std(values: np.ndarray) -> str:
     if not len(values):
-        return statistics.NOT_RUN
+        return ""
     std = f" ± {number_text(float(values.std(ddof=1)))}" if len(values) > 1 else ""
     return f"{number_text(float(values.mean()))}{std}"
 
@@ -139,17 +147,16 @@ def status_table(experiment: Experiment) -> Table:
     :param experiment: An experiment
     :return: Which cells are done
     """
-    rows = []
-    for task in experiment.tasks:
-        for method in experiment.methods:
-            by_status: dict[str, list[int]] = {}
-            for (at, arm, seed), cell in experiment.cells.items():
-                if (at, arm) == (task, method):
-                    by_status.setdefault(cell.status, []).append(seed)
-            texts = [f"{status} (seed {', '.join(map(str, sorted(seeds)))})" for status, seeds in by_status.items()]
-            only = next(iter(by_status)) if len(by_status) == 1 else None
-            rows.append([task, method, only if only == statistics.NOT_RUN else "; ".join(texts) or statistics.NOT_RUN])
-    return Table("Cells", ["task", "arm", "state"], rows, "Only cells that are done enter anything below.")
+    rows = [[task, *(_state(experiment, task, method) for method in experiment.methods)] for task in experiment.tasks]
+    note = "Numbers are seeds. Only cells that are done enter statistics and plots."
+    return Table("Cells", ["task", *experiment.methods], rows, note)
+
+
+def _state(experiment: Experiment, task: str, method: str) -> str:
+    state = experiment.state(task, method)
+    if set(state) <= {statistics.NOT_RUN}:
+        return statistics.NOT_RUN
+    return "; ".join(f"{status}: {', '.join(map(str, seeds))}" for status, seeds in state.items())
 
 
 def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
@@ -164,7 +171,8 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     for task in experiment.tasks:
         for method in experiment.methods:
             arm = statistics.summarise_arm(experiment, task, method, thresholds)
-            row = [task, method, str(len(arm.seeds)), _mean_std(arm.areas), _mean_std(arm.finals)]
+            row = [task, method, str(len(arm.seeds))]
+            row += [_mean_std(values) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
             row += [number_text(statistics.interquartile_range(arm.finals)), number_text(arm.curve_iqr)]
             rows.append(row + [_reached(arm.reached[limit]) for limit in thresholds])
     return Table(
@@ -185,12 +193,16 @@ def _reached(steps: np.ndarray) -> str:
 
 
 def difference_table(
-    experiment: Experiment, rows: Sequence[statistics.PairedDifference], measure: str = "area under the curve"
+    experiment: Experiment,
+    rows: Sequence[statistics.PairedDifference],
+    measure: str = "area under the curve",
+    note: str = DIFFERENCES,
 ) -> Table:
     """
     :param experiment: An experiment
     :param rows: Its paired differences
     :param measure: Of what
+    :param note: What to know about them
     :return: The differences with both intervals
     """
     texts = [
@@ -210,11 +222,7 @@ def difference_table(
         f"Paired difference from {experiment.baseline}: {measure}",
         ["arm", "task", ">pairs", ">difference", ">95 % t", ">95 % percentile", ">pairs above", "verdict"],
         texts,
-        "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation "
-        "starts. The t interval (which gives the verdict) draws each task's mean from Student's t around the mean of "
-        "its pairs and weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap "
-        "resamples seeds within tasks; with two to five of them it is too narrow (it covers the truth in about 50 to "
-        "85 % of cases), and is here for comparison. Verdicts are not corrected for the number of arms and tasks.",
+        note,
     )
 
 
@@ -326,7 +334,8 @@ def pretraining_table(experiment: Experiment) -> Table:
             difference = NONE
             if len(finals) and theirs is not None:
                 difference = number_text(float(finals.mean()) - theirs.mean)
-            rows.append([task, method, str(len(finals)), _mean_std(finals), _published(theirs), difference])
+            ours = _mean_std(finals) or _state(experiment, task, method)
+            rows.append([task, method, str(len(finals)), ours, _published(theirs), difference])
     return Table(
         "Final return after pretraining, beside the paper's",
         ["task", "arm", ">seeds", ">ours", ">paper", ">difference"],

@@ -1,0 +1,293 @@
+"""The report of results: right numbers, nothing from elsewhere, nothing broken in a browser."""
+
+import html
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from PIL import Image
+from results_for_tests import CURE, RAE, write_cell, write_grid
+
+from sb3_cure.experiments import report
+
+TASK = "cartpole-swingup"
+HOSTILE = '<img src=x onerror=alert(1)>|$x$ "quoted" [a](b)'
+PROBE = """<script>
+addEventListener("load", async () => {
+  const videos = [...document.querySelectorAll("video")];
+  const known = video => new Promise(done => {
+    if (video.readyState > 0) done();
+    video.onloadedmetadata = video.onerror = done;
+    setTimeout(done, 5000);
+  });
+  await Promise.all(videos.map(known));
+  const sizes = {images: [...document.images].map(i => i.naturalWidth), videos: videos.map(v => v.videoWidth)};
+  document.documentElement.dataset.probe = JSON.stringify(sizes);
+});
+</script>"""
+
+
+def curve(*values: float) -> dict[int, float]:
+    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
+
+
+def write_curves(folder: Path) -> None:
+    """Areas 50, 100 and 100, 200; the second task is not run but for an unfinished cell and a failed one."""
+    write_grid(folder, tasks=["dmc_pixels/cartpole-swingup-v0", "dmc_pixels/reacher-easy-v0"])
+    for seed in (0, 1):
+        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
+        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)
+    write_cell(folder, "reacher-easy", "sac_ae", 0, curve(0, 987_654), done=False)
+    failed = write_cell(folder, "reacher-easy", "sac_ae", 1, curve(0, 987_654), done=False)
+    (failed / "error.txt").write_text("Traceback")
+
+
+def write_visitation(folder: Path) -> None:
+    """Three seeds in which the curious policy meets four times the random one's error, in states spread twice as wide."""
+    write_grid(folder, kind="visitation", seeds=3, methods={"cure_only": {}}, baseline="cure_only")
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        rows = [
+            (actor, head, 0, error / 2, error, 2 * error, 10)
+            for head, scale in (("own", 1e-3), ("common", 2e-3), ("zero", 0.05), ("mean_image", 2e-3))
+            for actor, error in (("random", scale), ("curious", 4 * scale if head in ("own", "common") else scale))
+        ]
+        states = {"random": rng.normal(0, 1, (200, 4)), "curious": rng.normal(0, 2, (200, 4))}
+        write_cell(folder, TASK, "cure_only", seed, {}, arguments=CURE, visitation=rows, states=states)
+
+
+def write_pretraining(folder: Path) -> None:
+    """One seed of two arms; the paper reports 833 and 846."""
+    arms = {"vanilla": 300, "cure_pretraining": 350}
+    write_grid(folder, kind="pretraining", seeds=1, methods={**arms, "random_pretraining": 0}, baseline="vanilla")
+    for arm, final in arms.items():
+        write_cell(folder, TASK, arm, 0, curve(0, final), arguments=RAE)
+
+
+def write_media(cell: Path) -> None:
+    for name in ("reconstructions", "uncomfortable", "curiosity_map"):
+        Image.new("RGB", (60, 40), "teal").save(cell / f"{name}.png")
+    with imageio.get_writer(cell / "policy.mp4", fps=5) as writer:
+        for shade in range(5):
+            writer.append_data(np.full((64, 64, 3), 40 * shade, np.uint8))  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Experiments of all kinds and their report."""
+    folder = tmp_path_factory.mktemp("all") / "results"
+    write_curves(folder / "curves")
+    write_media(folder / "curves" / TASK / "sac_ae" / "seed0")
+    write_visitation(folder / "visitation")
+    write_pretraining(folder / "pretraining")
+    write_grid(folder / "later")
+    assert report.main([str(folder)]) == 0
+    return folder
+
+
+def rows_of(path: Path, heading: str) -> list[list[str]]:
+    """Header and rows of a table in a Markdown file."""
+    table = path.read_text().split(f"### {heading}", 1)[1].split("\n\n")[1]
+    header, _, *rows = [[text.strip() for text in line.split(" | ")] for line in table.splitlines()]
+    return [[text.strip("| ").replace("\\", "") for text in row] for row in (header, *rows)]
+
+
+def test_tables_of_curves(results: Path) -> None:
+    _, baseline, cure, unfinished, not_run = rows_of(results / "curves" / "table.md", "Learning curves")
+    # Means of 50 and 100, 100 and 200; sample standard deviations; quartiles of two values are half their distance.
+    assert baseline[2:7] == ["2", "75 ± 35", "150 ± 71", "50", "25"]
+    assert cure[2:7] == ["2", "150 ± 71", "300 ± 141", "100", "50"]
+    assert baseline[7:] == ["not reached"] * 3
+    assert cure[7:] == ["100,000 (1 of 2)", "not reached", "not reached"]
+    assert unfinished[2:5] == ["0", "unfinished: 0; failed: 1", "unfinished: 0; failed: 1"]
+    assert not_run[2:5] == ["0", "not run", "not run"]
+    (difference,) = rows_of(results / "curves" / "table.md", "Paired difference from sac\\_ae: area")[1:]
+    minus = "\N{MINUS SIGN}"
+    assert difference[:4] == ["cure_sac_ae", TASK, "2", "75.0"]
+    assert difference[4:] == [f"[{minus}242.7, 392.7]", "[50.0, 100.0]", "2 of 2", "inconclusive"]
+    headline = "cure\\_sac\\_ae minus sac\\_ae: area under the curve 75.0"
+    assert headline in (results / "curves" / "table.md").read_text()
+
+
+def test_unfinished_cells_enter_nothing(results: Path) -> None:
+    for path in (results / "report.html", results / "summary.md"):
+        assert "987" not in re.sub(r"data:[^\"]*", "", path.read_text())
+
+
+def test_comparison_with_published_numbers(results: Path) -> None:
+    rows = rows_of(results / "summary.md", "Beside published returns")[1:]
+    by_arm = {(row[0], row[2]): row[3:10] for row in rows}
+    suspected, minus = "suspected bug: below 0.75 x published", "\N{MINUS SIGN}"
+    expected = ["100,000", "2", "150 ± 71", "SAC-AE 311 ± 11", f"{minus}161", "0.48", suspected]
+    assert by_arm["curves", "sac_ae"] == expected
+    assert by_arm["curves", "cure_sac_ae"][-1] == "adds curiosity: not judged"
+    assert by_arm["pretraining", "vanilla"] == ["100,000", "1", "300", "SAC-AE 311 ± 11", f"{minus}11", "0.96", "ok"]
+
+
+def test_pretraining_beside_the_paper(results: Path) -> None:
+    rows = rows_of(results / "pretraining" / "table.md", "Final return after pretraining")[1:]
+    minus = "\N{MINUS SIGN}"
+    assert rows == [
+        [TASK, "vanilla", "1", "300", "833 ± 27", f"{minus}533"],
+        [TASK, "cure_pretraining", "1", "350", "846 ± 25", f"{minus}496"],
+        [TASK, "random_pretraining", "0", "not run", "784 ± 12", "\N{EN DASH}"],
+    ]
+    assert "one seed: no interval" in (results / "pretraining" / "table.md").read_text()
+
+
+def test_visitation_tables(results: Path) -> None:
+    rows = rows_of(results / "visitation" / "table.md", "SRL error per step")[1:]
+    by_key = {(row[2], row[3]): row[4:] for row in rows}
+    paper = "0.0531 / 0.0540 / 0.0548"
+    assert by_key["own", "curious"] == ["3", "2.00e-03", "4.00e-03", "8.00e-03", "4.00 [4.00, 4.00]", paper]
+    assert by_key["mean image", "curious"][4] == "1.00 [1.00, 1.00]"
+    random, curious = rows_of(results / "visitation" / "table.md", "Coverage of the true state space")[1:]
+    assert (random[2], curious[2], random[4], curious[4]) == ("random", "curious", "200", "200")
+    assert float(curious[6].split()[0]) > 1.1 and float(curious[7]) > float(random[7])
+    assert "4.00 \\[4.00, 4.00\\] times the SRL error under the own head" in (results / "summary.md").read_text()
+
+
+def test_conditions_and_plots(results: Path) -> None:
+    _, row, *_ = rows_of(results / "curves" / "table.md", "Run conditions")
+    assert row[2:9] == [
+        "0, 1",
+        "100,000",
+        "1.0 h",
+        "cpu",
+        "bf16",
+        "x86_64, 2 threads, AVX512",
+        "sb3_cure 0.1.0, torch 2.13.0",
+    ]
+    assert row[9:] == ["abc1234", "1"]
+    for name in ("curves/learning_curves", "curves/paired_difference", "curves/aggregates", "visitation/coverage"):
+        with Image.open(results / f"{name}.png") as image:
+            assert min(image.size) > 100
+
+
+def test_page_holds_everything_itself(results: Path) -> None:
+    page = (results / "report.html").read_text()
+    sources = re.findall(r'(?:src|href|poster|srcset|action)\s*=\s*["\']?([^"\'\s>]*)', page)
+    assert len(sources) > 10
+    assert {source.split(":")[0] for source in sources if not source.startswith("#")} == {"data"}
+    assert not re.search(r"<script|@import|url\(", page)
+    images = re.findall(r"<img [^>]*>", page)
+    assert images and all(re.search(r'alt="[^"]+"', image) for image in images)
+    assert "No aggregates over tasks" in page and "Not run: no cell is done." in page
+    config = {"action_repeat": 8, "arguments": RAE}
+    assert all(
+        html.escape(json.dumps(value)[1:-1]) in re.sub(r"\s+", " ", page) for value in (config["action_repeat"], "rae")
+    )
+
+
+def test_names_are_text_only(tmp_path: Path) -> None:
+    """Whatever stands in the files stays text: in HTML, in Markdown, and in matplotlib, which has formulas."""
+    arm = HOSTILE.replace("(b)", "")
+    folder = tmp_path / "curves"
+    write_grid(folder, experiment=HOSTILE, methods={"sac_ae": {}, arm: {}}, evaluation={"every": HOSTILE})
+    for seed in (0, 1):
+        write_cell(folder, TASK, "sac_ae", seed, curve(0, 1))
+        write_cell(folder, TASK, arm, seed, curve(0, 2), arguments={"srl": HOSTILE})
+    run = folder / TASK / arm / "seed0" / "run.json"
+    run.write_text(
+        json.dumps({"versions": {HOSTILE: HOSTILE}, "machine": HOSTILE, "commit": [HOSTILE], "seconds": "x"})
+    )
+    (folder / TASK / arm / "seed0" / "reconstructions.png").write_bytes(b"no picture")
+    (folder / TASK / arm / "seed0" / "policy.mp4").write_bytes(b"no video")
+    report.write_report(folder, tmp_path / "out" / "page.html")
+    page = (tmp_path / "out" / "page.html").read_text()
+    assert "<img src=x" not in page and html.escape(HOSTILE) in page
+    assert "reconstructions.png cannot be shown" in page and "policy.mp4 cannot be shown" in page
+    for path in (tmp_path / "out" / "summary.md", folder / "table.md"):
+        text = path.read_text()
+        assert "<" not in text and not re.search(r"(?<!\\)\]\(b\)", text)
+        lines = [line for line in text.splitlines() if line.startswith("|")]
+        header = next(line for line in lines if "area under curve" in line)
+        rows = [line for line in lines if line.startswith(f"| {TASK} | ") and "not reached" in line]
+        assert len(rows) == 2
+        assert {len(re.findall(r"(?<!\\)\|", line)) for line in [header, *rows]} == {11}
+
+
+def test_which_media(results: Path, tmp_path: Path) -> None:
+    """Of the first seed by default; all or none on demand."""
+    write_media(results / "curves" / TASK / "sac_ae" / "seed1")
+    counts = {}
+    for which in ("none", "first", "all"):
+        report.write_report(results, tmp_path / "page.html", media=which)
+        counts[which] = (tmp_path / "page.html").read_text().count("<video")
+    shutil.rmtree(results / "curves" / TASK / "sac_ae" / "seed1" / "policy.mp4", ignore_errors=True)
+    assert counts == {"none": 0, "first": 1, "all": 2}
+
+
+def test_errors_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert report.main([str(tmp_path / "nowhere")]) == 1
+    write_curves(tmp_path / "curves")
+    (tmp_path / "curves" / TASK / "sac_ae" / "seed0" / "eval.csv").write_text("nonsense")
+    assert report.main([str(tmp_path)]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert "nowhere is no folder" in first and "eval.csv has no column 'environment_steps'" in second
+    with pytest.raises(SystemExit):
+        report.main([str(tmp_path), "--thresholds", "many"])
+
+
+def test_report_without_rliable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rest is there, and one sentence says what to install."""
+    monkeypatch.setitem(__import__("sys").modules, "rliable", None)
+    write_curves(tmp_path / "curves")
+    report.write_report(tmp_path, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "No aggregates: rliable cannot be imported" in page and "Paired difference from sac_ae" in page
+
+
+# In a browser
+
+
+@pytest.fixture(scope="module")
+def chromium() -> str:
+    found = shutil.which("chromium") or shutil.which("chromium-browser")
+    if found is None:
+        reason = "chromium is not installed (Debian: apt-get install chromium)"
+        if os.environ.get("SB3_CURE_REQUIRE_CHROMIUM") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return found
+
+
+def look(chromium: str, page: str, folder: Path) -> tuple[dict[str, list[int]], list[str]]:
+    """Open a page from disk: widths of its images and videos (0: broken), and what the console says.
+
+    A script that measures is added, and the page's policy allows scripts for it; what else it forbids stays forbidden.
+    """
+    allowed = page.replace("default-src", "script-src 'unsafe-inline'; default-src", 1)
+    assert allowed != page
+    (folder / "probed.html").write_text(allowed.replace("</body>", PROBE + "</body>"))
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr"]
+    options += ["--virtual-time-budget=10000", f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
+    command = [chromium, *options, (folder / "probed.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert probe, done.stderr[-2000:]
+    return json.loads(html.unescape(probe[1])), [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
+
+
+def test_nothing_is_broken_in_a_browser(chromium: str, results: Path, tmp_path: Path) -> None:
+    page = (results / "report.html").read_text()
+    sizes, console = look(chromium, page, tmp_path)
+    assert console == []
+    assert len(sizes["images"]) == page.count("<img ") > 8 and min(sizes["images"]) > 0
+    assert sizes["videos"] == [64]
+
+
+def test_the_browser_check_finds_what_is_broken(chromium: str, results: Path, tmp_path: Path) -> None:
+    """A damaged picture and video, a picture from the network, and an error on the console."""
+    page = (results / "report.html").read_text()
+    broken = '<img src="data:image/png;base64,AAAA"><video src="data:video/mp4;base64,AAAA"></video>'
+    broken += '<img src="http://127.0.0.1:9/x.png"><script>nowhere()</script></body>'
+    sizes, console = look(chromium, page.replace("</body>", broken), tmp_path)
+    assert sizes["images"].count(0) == 2 and sizes["videos"].count(0) == 1
+    assert len(console) == 2 and "Content Security Policy" in console[0] and "nowhere is not defined" in console[1]
