@@ -55,6 +55,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``srl: my_package.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - ``optimize`` samples only the hyper-parameters that the chosen kind of curiosity uses, and several processes may
       start at once on a database that does not exist yet;
+    - ``--trial-id 0`` is the first trial, where rl-zoo3 takes 0 for none;
     - a missing file of settings is explained.
     """
 
@@ -64,6 +65,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"The settings file {self.config} does not exist: give one with --conf-file, such as "
                 "zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
             )
+        if self.storage and self.study_name and self.trial_id == 0:
+            trial = self.load_trial(self.storage, self.study_name, 0)
+            self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
         return super().read_hyperparameters()
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
