@@ -15,6 +15,7 @@ from PIL import Image
 from results_for_tests import CURE, RAE, write_cell, write_grid
 
 from sb3_cure.experiments import report
+from sb3_cure.experiments.statistics import read_results
 
 TASK = "cartpole-swingup"
 HOSTILE = '<img src=x onerror=alert(1)>|$x$ "quoted" [a](b)'
@@ -49,7 +50,7 @@ def write_curves(folder: Path) -> None:
 
 
 def write_visitation(folder: Path) -> None:
-    """Three seeds in which the curious policy meets four times the random one's error, in states spread twice as wide."""
+    """Three seeds: the curious policy meets four times the random one's error, in states spread twice as wide."""
     write_grid(folder, kind="visitation", seeds=3, methods={"cure_only": {}}, baseline="cure_only")
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -155,16 +156,8 @@ def test_visitation_tables(results: Path) -> None:
 
 def test_conditions_and_plots(results: Path) -> None:
     _, row, *_ = rows_of(results / "curves" / "table.md", "Run conditions")
-    assert row[2:9] == [
-        "0, 1",
-        "100,000",
-        "1.0 h",
-        "cpu",
-        "bf16",
-        "x86_64, 2 threads, AVX512",
-        "sb3_cure 0.1.0, torch 2.13.0",
-    ]
-    assert row[9:] == ["abc1234", "1"]
+    machine = ["cpu", "bf16", "x86_64, 2 threads, AVX512"]
+    assert row[2:] == ["0, 1", "100,000", "1.0 h", *machine, "sb3_cure 0.1.0, torch 2.13.0", "abc1234", "1"]
     for name in ("curves/learning_curves", "curves/paired_difference", "curves/aggregates", "visitation/coverage"):
         with Image.open(results / f"{name}.png") as image:
             assert min(image.size) > 100
@@ -179,10 +172,7 @@ def test_page_holds_everything_itself(results: Path) -> None:
     images = re.findall(r"<img [^>]*>", page)
     assert images and all(re.search(r'alt="[^"]+"', image) for image in images)
     assert "No aggregates over tasks" in page and "Not run: no cell is done." in page
-    config = {"action_repeat": 8, "arguments": RAE}
-    assert all(
-        html.escape(json.dumps(value)[1:-1]) in re.sub(r"\s+", " ", page) for value in (config["action_repeat"], "rae")
-    )
+    assert html.escape('"action_repeat": 8') in page and html.escape('"srl": "rae"') in page
 
 
 def test_names_are_text_only(tmp_path: Path) -> None:
@@ -193,10 +183,8 @@ def test_names_are_text_only(tmp_path: Path) -> None:
     for seed in (0, 1):
         write_cell(folder, TASK, "sac_ae", seed, curve(0, 1))
         write_cell(folder, TASK, arm, seed, curve(0, 2), arguments={"srl": HOSTILE})
-    run = folder / TASK / arm / "seed0" / "run.json"
-    run.write_text(
-        json.dumps({"versions": {HOSTILE: HOSTILE}, "machine": HOSTILE, "commit": [HOSTILE], "seconds": "x"})
-    )
+    run = {"versions": {HOSTILE: HOSTILE}, "machine": HOSTILE, "commit": [HOSTILE], "seconds": "x"}
+    (folder / TASK / arm / "seed0" / "run.json").write_text(json.dumps(run))
     (folder / TASK / arm / "seed0" / "reconstructions.png").write_bytes(b"no picture")
     (folder / TASK / arm / "seed0" / "policy.mp4").write_bytes(b"no video")
     report.write_report(folder, tmp_path / "out" / "page.html")
@@ -213,14 +201,13 @@ def test_names_are_text_only(tmp_path: Path) -> None:
         assert {len(re.findall(r"(?<!\\)\|", line)) for line in [header, *rows]} == {11}
 
 
-def test_which_media(results: Path, tmp_path: Path) -> None:
+def test_which_media(tmp_path: Path) -> None:
     """Of the first seed by default; all or none on demand."""
-    write_media(results / "curves" / TASK / "sac_ae" / "seed1")
-    counts = {}
-    for which in ("none", "first", "all"):
-        report.write_report(results, tmp_path / "page.html", media=which)
-        counts[which] = (tmp_path / "page.html").read_text().count("<video")
-    shutil.rmtree(results / "curves" / TASK / "sac_ae" / "seed1" / "policy.mp4", ignore_errors=True)
+    write_curves(tmp_path / "curves")
+    for seed in (0, 1):
+        write_media(tmp_path / "curves" / TASK / "sac_ae" / f"seed{seed}")
+    (experiment,) = read_results(tmp_path)
+    counts = {which: report.media_html(experiment, which).count("<video") for which in ("none", "first", "all")}
     assert counts == {"none": 0, "first": 1, "all": 2}
 
 
