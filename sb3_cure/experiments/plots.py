@@ -82,27 +82,25 @@ def reconstructions_over_training(
 
     :param path: File to write
     :param observed: One frame of each observation, uint8 [n, C, H, W] with C = 1 or 3
-    :param rows: Agent steps, and what is drawn then of the same shape
+    :param rows: Agent steps of training, and what is drawn then of the same shape
     :param title: Title of the figure
     """
-    labels = ["observed", *(f"{steps:,}" for steps, _ in rows)]
+    errors = [np.square((drawn.astype(np.float32) - observed) / 255).mean() for _, drawn in rows]
+    labels = ["observed"]
+    labels += [f"{steps:,} agent steps\nMSE {error:.4f}" for (steps, _), error in zip(rows, errors, strict=True)]
     pictures = [observed, *(drawn for _, drawn in rows)]
     n_rows, columns = len(pictures), len(observed)
     height = 1.1 * n_rows * observed.shape[2] / observed.shape[3]
-    dense = ConstrainedLayoutEngine(h_pad=0.01, hspace=0)
-    figure = Figure(figsize=(1.1 * columns + 1.8, height + 0.5), layout=dense)
+    dense = ConstrainedLayoutEngine(h_pad=0.02, hspace=0)
+    figure = Figure(figsize=(1.1 * columns + 1.2, height + 0.5), layout=dense)
     axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
     for place, label, images in zip(axes, labels, pictures, strict=True):
         strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
-        place.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest", aspect="equal")
+        place.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
         place.set_xticks([])
         place.set_yticks([strip.shape[0] / 2], [label])
-        if place is not axes[0]:
-            error = np.square((images.astype(np.float32) - observed) / 255).mean()
-            place.annotate(f"MSE {error:.4f}", (1.01, 0.5), xycoords="axes fraction", va="center", fontsize=9)
-    figure.supylabel("agent steps of training", fontsize=10)
-    figure.suptitle(title)
-    figure.savefig(path, dpi=120)
+    axes[0].set_title(title)
+    figure.savefig(path, dpi=120, bbox_inches="tight")
 
 
 def uncomfortable_frames(
