@@ -324,6 +324,8 @@ class ReconstructionCallback(_PictureCallback):
         model: Any = self.model
         model.policy.set_training_mode(False)
         if self.observations is None:
+            if model.replay_buffer.size() == 0:
+                return
             self.observations = _spread_over(model.replay_buffer, self.columns)
         observed = th.as_tensor(self.observations, device=model.device)
         with th.no_grad():

@@ -160,7 +160,7 @@ def test_wrong_command_lines_are_one_sentence(tmp_path: Path, capsys: pytest.Cap
 def test_a_cell_keeps_its_curve_and_is_not_run_twice(tmp_path: Path) -> None:
     """Evaluated untrained, at every interval and at the end; a second call touches nothing."""
     (cell,) = load_grid(write_grid(tmp_path)).cells
-    folder = run_cell(cell, tmp_path)
+    folder = run_cell(cell, tmp_path, pictures=False)
     rows = read_rows(folder / "eval.csv")
     assert [row["environment_steps"] for row in rows] == [0, 160, 320, 400]
     assert [row["agent_steps"] for row in rows] == [0, 40, 80, 100]
@@ -183,7 +183,7 @@ def test_a_cell_keeps_its_curve_and_is_not_run_twice(tmp_path: Path) -> None:
     assert CuReSAC.load(folder / "model.zip").num_timesteps == 100
     assert not (folder / "checkpoint").exists()
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != ".lock"}
-    run_cell(cell, tmp_path)
+    run_cell(cell, tmp_path, pictures=False)
     assert before == {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != ".lock"}
 
 
@@ -192,7 +192,7 @@ def test_the_arms_of_a_seed_are_paired(tmp_path: Path) -> None:
     methods = {"cure": {"config": "zoo.yml"}, "none": {"config": "zoo.yml", "overrides": {"curiosity": None}}}
     grid = load_grid(write_grid(tmp_path, methods=methods, seeds=2, budget=76))
     for cell in grid.cells:
-        run_cell(cell, tmp_path)
+        run_cell(cell, tmp_path, pictures=False)
     models = {}
     for cell in grid.cells:
         folder = tmp_path / cell.folder
@@ -221,11 +221,11 @@ def test_warm_ups_of_the_arms_are_the_same(tmp_path: Path) -> None:
 def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
     """A cell that was begun with another budget must not be mixed with this one."""
     path = write_grid(tmp_path, budget=80)
-    folder = run_cell(load_grid(path).cells[0], tmp_path)
+    folder = run_cell(load_grid(path).cells[0], tmp_path, pictures=False)
     (folder / "DONE").unlink()
     before = (folder / "eval.csv").read_bytes()
     with pytest.raises(GridError, match="was begun with other settings: budget is 80 there and 160 now"):
-        run_cell(load_grid(path, budget=160).cells[0], tmp_path)
+        run_cell(load_grid(path, budget=160).cells[0], tmp_path, pictures=False)
     assert (folder / "eval.csv").read_bytes() == before
 
 
@@ -237,12 +237,12 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
 
     def learn_while_another_tries(self: CuReSAC, *args: Any, **kwargs: Any) -> CuReSAC:
         with pytest.raises(GridError, match="is being run by another process") as refusal:
-            run_cell(cell, tmp_path)
+            run_cell(cell, tmp_path, pictures=False)
         refusals.append(refusal)
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(CuReSAC, "learn", learn_while_another_tries)
-    run_cell(cell, tmp_path)
+    run_cell(cell, tmp_path, pictures=False)
     assert len(refusals) == 1
 
 
@@ -272,12 +272,12 @@ def test_a_cell_goes_on_after_any_exception(tmp_path: Path, monkeypatch: pytest.
     )
     monkeypatch.setattr(PixelBox, "step", count)
     with pytest.raises(RuntimeError, match="the power went"):
-        run_cell(cell, tmp_path, checkpoint_minutes=0)
+        run_cell(cell, tmp_path, checkpoint_minutes=0, pictures=False)
     folder = tmp_path / cell.folder
     assert not (folder / "DONE").exists()
     reached = updates[-1]
     updates.clear()
-    run_cell(cell, tmp_path, checkpoint_minutes=0)
+    run_cell(cell, tmp_path, checkpoint_minutes=0, pictures=False)
     assert steps_of(folder / "eval.csv") == [0, 160, 320, 400]
     assert updates[0] in (reached, reached + 1), "it began where the checkpoint was taken, not anew"
     conditions = json.loads((folder / "run.json").read_text())
@@ -300,13 +300,13 @@ def test_a_failing_cell_does_not_stop_the_others(
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(CuReSAC, "learn", learn_or_fail)
-    assert run.main([str(path), "--out", str(out)]) == 1
+    assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 1
     assert "seed0 failed: RuntimeError: no luck" in capsys.readouterr().out.replace("\n", " ")
     folder = out / "tiny" / "PixelBox" / "cure"
     assert "learn_or_fail" in (folder / "seed0" / "error.txt").read_text()
     assert (folder / "seed1" / "DONE").exists() and not (folder / "seed0" / "DONE").exists()
     monkeypatch.setattr(CuReSAC, "learn", learn)
-    assert run.main([str(path), "--out", str(out)]) == 0
+    assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 0
     assert (folder / "seed0" / "DONE").exists() and not (folder / "seed0" / "error.txt").exists()
     capsys.readouterr()
     assert run.main([str(path), "--out", str(out), "--dry-run"]) == 0
@@ -337,7 +337,7 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
     monkeypatch.setattr(visitation, "COMMON_UPDATES", 150)
     monkeypatch.setattr(visitation, "COMMON_SHARE", 100)
     grid = visitation_grid(tmp_path)
-    assert run.run_grid(grid, tmp_path / "out") == []
+    assert run.run_grid(grid, tmp_path / "out", pictures=False) == []
     for cell in grid.cells:
         folder = tmp_path / "out" / cell.folder
         rows = read_rows(folder / "visitation.csv")
@@ -367,7 +367,16 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
 
 
 def launch(path: Path, out: Path, *options: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "sb3_cure.experiments.run", str(path), "--out", str(out), *options]
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_cure.experiments.run",
+        str(path),
+        "--out",
+        str(out),
+        "--no-pictures",
+        *options,
+    ]
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, text=True)
 
 

@@ -36,7 +36,7 @@ _EVAL_COLUMNS = (
 _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 
 
-def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0) -> Path:
+def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, pictures: bool = True) -> Path:
     """Train and measure one cell, unless that is done.
 
     Writes ``config.json``, ``eval.csv``, ``episodes.csv``, ``run.json``, ``model.zip`` and pictures into the cell's
@@ -46,6 +46,7 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0) 
     :param cell: What to run
     :param results: Folder of all results
     :param checkpoint_minutes: A checkpoint is kept after every evaluation, and when so many minutes have passed
+    :param pictures: Whether to draw and to film as well
     :return: The cell's folder
     :raises GridError: if the folder holds the same cell with other settings, or another process is running it
     """
@@ -54,15 +55,16 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0) 
     with _alone_in(folder):
         if not (folder / DONE).exists():
             _keep_config(cell, folder)
-            _CellRun(cell, folder, checkpoint_minutes).finish()
+            _CellRun(cell, folder, checkpoint_minutes, pictures).finish()
     return folder
 
 
 class _CellRun:
     """What a cell needs while it runs; ``finish`` does what is left to do."""
 
-    def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float):
+    def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool):
         self.cell, self.folder = cell, folder
+        self.pictures = pictures
         self.checkpoint_seconds = 60 * checkpoint_minutes
         self.eval_env = gym.make(cell.task, **cell.env_kwargs)
         self.action_repeat = action_repeat_of(self.eval_env)
@@ -101,13 +103,14 @@ class _CellRun:
         left = self.agent_steps(cell.budget) - self.model.num_timesteps
         if cell.budget > 0 and left > 0:
             fresh = self.model.num_timesteps == 0
-            pictures = watch_reconstructions(cell, self.action_repeat, self.folder)
-            self.model.learn(left, callback=[_Watch(self), *pictures], reset_num_timesteps=fresh)
+            drawing = watch_reconstructions(cell, self.action_repeat, self.folder) if self.pictures else []
+            self.model.learn(left, callback=[_Watch(self), *drawing], reset_num_timesteps=fresh)
         # Not among the results until everything else is: the state from here on can be made anew.
         self.model.save(self.folder / "model.zip")
         if cell.kind == "visitation":
             measure_visits(self.model, cell, self.folder)
-        draw_cell(self.model, cell, self.folder)
+        if self.pictures:
+            draw_cell(self.model, cell, self.folder)
         self.write_tables()
         self._report(force=True)
         write_json(self.folder / "run.json", self._run_conditions())

@@ -5,8 +5,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 
+from sb3_cure.callbacks import ReconstructionCallback
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, trained_actors
@@ -17,7 +19,20 @@ from sb3_cure.experiments.video import write_video
 
 FILM_SEED = 30_000
 FRAMES = 16
+ROWS_OF_RECONSTRUCTIONS = 8
 PROBE_UPDATES = 500
+
+
+def watch_reconstructions(cell: Cell, action_repeat: int, folder: Path) -> list[BaseCallback]:
+    """
+    :param cell: A cell that is about to be trained
+    :param action_repeat: Environment steps per agent step
+    :param folder: Where to write ``reconstructions.png``, one row per time
+    :return: Callbacks that draw it during training
+    """
+    every = max(cell.budget // action_repeat // ROWS_OF_RECONSTRUCTIONS, 1)
+    learns_from_images = cell.arguments["policy"] == "CnnPolicy" and cell.arguments.get("srl", "rae") is not None
+    return [ReconstructionCallback(folder, every)] if learns_from_images else []
 
 
 def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
@@ -47,7 +62,8 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
         write_video(folder / "policy.mp4", episode, fps, repeat, f"{actors[0]} policy: {name}")
         env.close()
     if head is not None and is_image_space(model.observation_space) and model.replay_buffer.size() > 0:  # type: ignore[union-attr]
-        strip = reconstruct_with_probe(model, frame_stack, PROBE_UPDATES)
+        is_drawn = (folder / "reconstructions.png").exists()  # by `watch_reconstructions`
+        strip = None if is_drawn else reconstruct_with_probe(model, frame_stack, PROBE_UPDATES)
         if strip is not None:
             title = f"What the latents know of the image: {name}"
             plots.reconstruction_grid(folder / "reconstructions.png", strip, title)

@@ -32,6 +32,7 @@ def run_grid(
     *,
     engine: str = "local",
     checkpoint_minutes: float = 10.0,
+    pictures: bool = True,
     address: str | None = None,
     cpus_per_cell: float = 1,
     gpus_per_cell: float = 0,
@@ -43,6 +44,7 @@ def run_grid(
     :param results: Folder of all results; with several machines one that they share
     :param engine: ``"local"``: one cell after the other in this process; ``"ray"``: side by side in worker processes
     :param checkpoint_minutes: At most so many minutes of a cell are lost by an interruption
+    :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
     :param cpus_per_cell: Ray: cores per cell, also its threads
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card
@@ -55,20 +57,20 @@ def run_grid(
     with _live_progress(grid.cells, results):
         if engine == "ray":
             resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-            failed = _run_with_ray(left, results, checkpoint_minutes, address, resources)
+            failed = _run_with_ray(left, (results, checkpoint_minutes, pictures), address, resources)
         else:
-            failed = [cell for cell in left if not _run_and_tell(cell, results, checkpoint_minutes)]
+            failed = [cell for cell in left if not _run_and_tell(cell, results, checkpoint_minutes, pictures)]
     if grid.kind == "visitation":
         for sentence in measure_common_heads(grid, results):
             print(f"No common heads for {sentence}.")
     return failed
 
 
-def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float) -> bool:
+def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
     """Whether the cell could be run; a failure must not stop the others."""
     error = results / cell.folder / ERROR
     try:
-        run_cell(cell, results, checkpoint_minutes)
+        run_cell(cell, results, checkpoint_minutes, pictures)
     except Exception:
         error.parent.mkdir(parents=True, exist_ok=True)
         write_text(error, traceback.format_exc())
@@ -78,7 +80,7 @@ def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float) -> bool:
 
 
 def _run_with_ray(
-    cells: Sequence[Cell], results: Path, checkpoint_minutes: float, address: str | None, resources: dict[str, Any]
+    cells: Sequence[Cell], settings: tuple[Path, float, bool], address: str | None, resources: dict[str, Any]
 ) -> list[Cell]:
     try:
         import ray
@@ -88,7 +90,7 @@ def _run_with_ray(
     ray.init(address=address, log_to_driver=False, **own)
     try:
         run = ray.remote(**resources)(_run_and_tell)
-        pending = {run.remote(cell, results, checkpoint_minutes): cell for cell in cells}
+        pending = {run.remote(cell, *settings): cell for cell in cells}
         failed = []
         while pending:
             for reference in ray.wait(list(pending), timeout=5)[0]:
@@ -97,7 +99,7 @@ def _run_with_ray(
                     succeeded = ray.get(reference)
                 except ray.exceptions.RayError as error:
                     # The worker has died more often than `retries`: nobody else could have told.
-                    write_text(results / cell.folder / ERROR, f"{error}\n")
+                    write_text(settings[0] / cell.folder / ERROR, f"{error}\n")
                     succeeded = False
                 if not succeeded:
                     failed.append(cell)
@@ -255,6 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell, such as 0.25")
     parser.add_argument("--retries", type=int, default=3, help="Ray: new starts of a cell whose worker died")
     parser.add_argument("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
+    parser.add_argument("--no-pictures", action="store_true", help="neither draw nor film")
     parser.add_argument("--dry-run", action="store_true", help="list the cells and their states, run nothing")
     options = parser.parse_args(arguments)
     try:
@@ -273,6 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.out,
             engine=options.engine,
             checkpoint_minutes=options.checkpoint_minutes,
+            pictures=not options.no_pictures,
             address=options.address,
             cpus_per_cell=options.cpus_per_cell,
             gpus_per_cell=options.gpus_per_cell,
