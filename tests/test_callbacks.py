@@ -225,17 +225,17 @@ def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_pa
 def test_heads_that_do_not_draw_get_a_probe_or_one_sentence(tmp_path: Path) -> None:
     """A decoder fitted to the latents draws; without it nothing is written, and that is said once."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl=Silent)
-    probed = ReconstructionCallback(tmp_path / "probe", every=15, probe_updates=60)
+    probed = ReconstructionCallback(tmp_path / "probe", every=25, probe_updates=30)
     refused = ReconstructionCallback(tmp_path / "none", every=5, probe_updates=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model.learn(31, callback=[probed, refused])
+        model.learn(26, callback=[probed, refused])
     said = [str(warning.message) for warning in caught if "draws nothing" in str(warning.message)]
     assert len(said) == 1 and "Silent does not reconstruct" in said[0]
     assert names(tmp_path) == ["probe"] and names(tmp_path / "probe") == ["reconstructions.png"]
     observed = probed.observations.astype(float)
     untouched = np.abs(observed - 128).mean()  # what an untrained decoder is off by: it draws grey
-    assert np.abs(probed.rows[-1][1] - observed).mean() < 0.6 * untouched
+    assert np.abs(probed.rows[-1][1] - observed).mean() < 0.75 * untouched
 
 
 def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:
