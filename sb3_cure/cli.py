@@ -3,7 +3,6 @@
 import importlib
 import sys
 from collections.abc import Sequence
-from types import ModuleType
 
 USAGE = """\
 usage: sb3-cure COMMAND [ARGUMENTS]      (sb3-cure COMMAND --help shows a command's arguments)
@@ -16,7 +15,7 @@ usage: sb3-cure COMMAND [ARGUMENTS]      (sb3-cure COMMAND --help shows a comman
   report       statistics and pictures of a grid's results, as one HTML file
   doctor       what this machine has and what is missing
 """
-#: Commands and the extra of sb3-cure that they need, if any
+#: Commands, and the extra of sb3-cure that they need
 COMMANDS: dict[str, str | None] = {
     "train": "zoo",
     "enjoy": "zoo",
@@ -28,17 +27,21 @@ COMMANDS: dict[str, str | None] = {
 }
 
 
-def _import(module: str, command: str) -> ModuleType:
-    """The module that does the work; commands are imported when they are called, as each takes seconds."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if missing in ("", "sb3_cure"):
-            raise
-        raise SystemExit(
-            f'sb3-cure {command} needs {missing}, which is not installed: pip install "sb3-cure[{COMMANDS[command]}]"'
-        ) from error
+#: What the extras bring, as far as it is imported by name
+OPTIONAL = ("rl_zoo3", "optuna", "yaml", "huggingface_sb3", "matplotlib", "imageio", "rich", "pandas", "rliable", "ray")
+
+
+def _run(command: str, arguments: Sequence[str]) -> int:
+    # Imported here, because each command's imports take seconds and may be missing.
+    if command == "doctor":
+        return importlib.import_module("sb3_cure.doctor").main(arguments)
+    if command == "experiment":
+        importlib.import_module("sb3_cure.allocator").tune_allocator()
+        return importlib.import_module("sb3_cure.experiments.run").main(arguments) or 0
+    if command == "report":
+        return importlib.import_module("sb3_cure.experiments.report").main(arguments) or 0
+    importlib.import_module("sb3_cure.zoo").run(command, arguments)
+    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,16 +56,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command not in COMMANDS:
         print(f"sb3-cure has no command {command!r}; it has {', '.join(COMMANDS)}.", file=sys.stderr)
         return 2
-    if command == "doctor":
-        return importlib.import_module("sb3_cure.doctor").main(arguments)
-    if command in ("experiment", "report"):
-        program = {"experiment": "run", "report": "report"}[command]
-        module = _import(f"sb3_cure.experiments.{program}", command)
-        if command == "experiment":
-            importlib.import_module("sb3_cure.allocator").tune_allocator()
-        return module.main(arguments) or 0
-    _import("sb3_cure.zoo", command).run(command, arguments)
-    return 0
+    try:
+        return _run(command, arguments)
+    except ModuleNotFoundError as error:
+        missing = (error.name or "").partition(".")[0]
+        if missing not in OPTIONAL:
+            raise
+        extra = "cluster" if missing == "ray" else COMMANDS[command]
+        raise SystemExit(
+            f'sb3-cure {command} needs {missing}, which is not installed: pip install "sb3-cure[{extra}]"'
+        ) from error
 
 
 if __name__ == "__main__":
