@@ -63,6 +63,8 @@ def test_differences_pair_the_seeds(results: Path) -> None:
     assert difference.t.verdict == "inconclusive"
     (final,) = statistics.paired_differences(experiment, "finals")
     assert final.t.value == pytest.approx(150)
+    (mirrored,) = statistics.paired_differences(experiment, baseline="cure_sac_ae")
+    assert (mirrored.method, mirrored.other, mirrored.t.value) == ("sac_ae", "cure_sac_ae", -difference.t.value)
 
 
 def test_only_what_both_arms_finished_is_paired(results: Path) -> None:

@@ -27,6 +27,8 @@ from sb3_cure.experiments.statistics import Experiment, ResultsError
 from sb3_cure.experiments.tables import Table, interval_text, markdown_text, number_text, of_tasks, plural, ratio_text
 
 THRESHOLDS = (250.0, 500.0, 750.0)
+#: With more arms than these, each is compared with the baseline only
+PAIRS_UP_TO = 5
 #: Optional files of a cell: caption
 MEDIA = {
     "policy.mp4": "the task policy, with its SRL error",
@@ -244,6 +246,8 @@ def _curves(
         parts.append(tables.difference_table(experiment, differences))
         finals = statistics.paired_differences(experiment, "finals")
         parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
+    if 2 < len(experiment.methods) <= PAIRS_UP_TO:
+        parts.append(tables.pairs_table(list(_all_pairs(experiment))))
     try:
         found = statistics.aggregate(experiment)
     except ResultsError as error:
@@ -266,6 +270,14 @@ def _curves(
     )
     parts.append(tables.aggregate_table(experiment, found))
     return headlines, parts
+
+
+def _all_pairs(experiment: Experiment) -> Iterator[statistics.PairedDifference]:
+    """Any two arms, the later minus the earlier, over all tasks that both have."""
+    for index, other in enumerate(experiment.methods):
+        rows = statistics.paired_differences(experiment, baseline=other)
+        for method in experiment.methods[index + 1 :]:
+            yield from [row for row in rows if row.method == method][:1]
 
 
 # HTML

@@ -486,9 +486,10 @@ def percentile_interval(groups: Sequence[np.ndarray], draws: int = 20_000) -> Es
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """An arm minus the baseline, seed by seed.
+    """An arm minus another, seed by seed.
 
     :param method: The arm
+    :param other: The arm that is subtracted
     :param task: Short name, or None for all tasks together
     :param differences: By task, one value per seed that both arms have done
     :param t: Mean difference with the t interval
@@ -496,6 +497,7 @@ class PairedDifference:
     """
 
     method: str
+    other: str
     task: str | None
     differences: dict[str, np.ndarray]
     t: Estimate
@@ -511,11 +513,14 @@ class PairedDifference:
         return sum(len(values) for values in self.differences.values())
 
 
-def paired_differences(experiment: Experiment, measure: str = "areas") -> list[PairedDifference]:
-    """Every other arm against the baseline: per task, and over all tasks where there are several.
+def paired_differences(
+    experiment: Experiment, measure: str = "areas", baseline: str | None = None
+) -> list[PairedDifference]:
+    """Every other arm against one: per task, and over all tasks where there are several.
 
     :param experiment: An experiment
     :param measure: ``"areas"`` or ``"finals"``
+    :param baseline: The arm that is subtracted, by default the experiment's baseline
     :return: Arm by arm, all tasks together first; arms without a single pair are left out
     """
     arms = {
@@ -523,13 +528,14 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
         for task in experiment.tasks
         for method in experiment.methods
     }
+    baseline = experiment.baseline if baseline is None else baseline
     found = []
     for method in experiment.methods:
-        if method == experiment.baseline:
+        if method == baseline:
             continue
         by_task = {}
         for task in experiment.tasks:
-            arm, base = arms[task, method], arms.get((task, experiment.baseline))
+            arm, base = arms[task, method], arms.get((task, baseline))
             shared = [seed for seed in arm.seeds if base is not None and seed in base.seeds]
             if base is not None and shared:
                 values = [dict(zip(each.seeds, getattr(each, measure), strict=True)) for each in (arm, base)]
@@ -538,7 +544,7 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
         for row in [by_task, *rows] if len(rows) > 1 else rows:
             groups = list(row.values())
             name = None if row is by_task else next(iter(row))
-            found.append(PairedDifference(method, name, row, t_interval(groups), percentile_interval(groups)))
+            found.append(PairedDifference(method, baseline, name, row, t_interval(groups), percentile_interval(groups)))
     return found
 
 

@@ -205,25 +205,27 @@ def difference_table(
     :param note: What to know about them
     :return: The differences with both intervals
     """
-    texts = [
-        [
-            row.method,
-            of_tasks(row),
-            f"{row.pairs}",
-            number_text(row.t.value, 1),
-            interval_text(row.t, 1),
-            interval_text(row.percentile, 1),
-            f"{row.wins} of {row.pairs}",
-            row.t.verdict,
-        ]
-        for row in rows
-    ]
-    return Table(
-        f"Paired difference from {experiment.baseline}: {measure}",
-        ["arm", "task", ">pairs", ">difference", ">95 % t", ">95 % percentile", ">pairs above", "verdict"],
-        texts,
-        note,
-    )
+    texts = [[row.method, of_tasks(row), *_difference(row)] for row in rows]
+    columns = ["arm", "task", *_DIFFERENCE_COLUMNS]
+    return Table(f"Paired difference from {experiment.baseline}: {measure}", columns, texts, note)
+
+
+def pairs_table(rows: Sequence[statistics.PairedDifference]) -> Table:
+    """
+    :param rows: Paired differences in area between any two arms
+    :return: One row for each
+    """
+    texts = [[f"{row.method} minus {row.other}", of_tasks(row), *_difference(row)] for row in rows]
+    title = "Paired difference between any two arms: area under the curve"
+    return Table(title, ["arms", "task", *_DIFFERENCE_COLUMNS], texts, "As above, over all tasks.")
+
+
+_DIFFERENCE_COLUMNS = (">pairs", ">difference", ">95 % t", ">95 % percentile", ">pairs above", "verdict")
+
+
+def _difference(row: statistics.PairedDifference) -> list[str]:
+    intervals = [interval_text(row.t, 1), interval_text(row.percentile, 1)]
+    return [str(row.pairs), number_text(row.t.value, 1), *intervals, f"{row.wins} of {row.pairs}", row.t.verdict]
 
 
 def of_tasks(row: statistics.PairedDifference) -> str:
