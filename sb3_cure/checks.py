@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.policies import CnnPolicy, CuRePolicy, MlpPolicy
-from sb3_cure.precision import resolve_precision
+from sb3_cure.precision import COMPILE, resolve_precision
 from sb3_cure.srl import get_srl_class
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def check_arguments(model: "CuReSAC") -> None:
     _check_choice("curiosity_target", model.curiosity_target, ("observation", "next_observation"))
     _check_choice("update", model.update, ("sequential", "joint"))
     resolve_precision(model.precision, model.device)
+    _check_choice("compile", model.compile, COMPILE)
     CuriousMixer(model.curiosity_prob)
     for name in ("gamma", "curiosity_gamma", "tau", "encoder_tau"):
         _check_range(name, getattr(model, name), 0.0, 1.0)

@@ -40,7 +40,7 @@ from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
-from sb3_cure.precision import autocast_context, resolve_precision
+from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
@@ -106,8 +106,8 @@ class CuReSAC(SAC):
     everywhere in SB3: environment steps divided by the action repeat.
 
     With ``srl=None, curiosity=None`` this is SB3's SAC bit for bit: its policies, its choice of replay buffer and its
-    update; ``encoder_tau``, ``update``, ``precision`` and ``actor_update_interval`` then do not apply. For an agent
-    without SRL on the shared encoder add ``policy_kwargs=dict(share_encoder=True)``.
+    update; ``encoder_tau``, ``update``, ``precision``, ``compile`` and ``actor_update_interval`` then do not apply.
+    For an agent without SRL on the shared encoder add ``policy_kwargs=dict(share_encoder=True)``.
 
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
@@ -143,6 +143,8 @@ class CuReSAC(SAC):
     :param update: ``"joint"`` (one encoder pass for all, see ``EncoderOptimizer``) or ``"sequential"`` (a pass and a
         step for each loss: Algorithm 1 to the letter)
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 where the hardware computes it natively
+    :param compile: Whether updates run the networks through torch.compile: True (with a warning and eager where it does
+        not work), False, or ``"auto"``: eager, as it does not pay on CPUs and was not measured on GPUs
     :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: the updates of
         one step are made during the next, so that actions come from a policy that is one step behind
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number; also the curious agent's
@@ -189,6 +191,7 @@ class CuReSAC(SAC):
         encoder_tau: float = 0.05,
         update: str = "joint",
         precision: str = "auto",
+        compile: str | bool = "auto",
         overlap: bool = False,
         ent_coef: str | float = "auto_0.1",
         ent_coef_lr_factor: float = 0.1,
@@ -231,6 +234,7 @@ class CuReSAC(SAC):
         self.encoder_tau = encoder_tau
         self.update = update
         self.precision = precision
+        self.compile = compile
         self.overlap = overlap
         self.ent_coef_lr_factor = ent_coef_lr_factor
 
@@ -280,6 +284,11 @@ class CuReSAC(SAC):
         self._computed_precision = resolve_precision(self.precision, self.device)
         if self.verbose >= 1:
             print(f"Networks compute in {self._computed_precision} (precision={self.precision!r})")
+        self._compiles, sentence = resolve_compile(self.compile, self.device)
+        if self._compiles:
+            self.policy.compile_networks()
+        if self.verbose >= 1:
+            print(sentence)
         self._setup_temperatures()
 
     def _policy_blueprint(self) -> dict[str, Any]:
@@ -786,6 +795,8 @@ class CuReSAC(SAC):
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
             self.policy.to(self.device)
+            if self._compiles:
+                self.policy.compile_networks()
             if self.curiosity_encoder_grad:
                 self.policy.encoder_optimizer.add_source("curious")
             self._setup_curious_temperature()

@@ -18,6 +18,7 @@ from sb3_cure.curiosity import CuriousReward
 from sb3_cure.encoder_optimizer import EncoderOptimizer
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.layers import Projection, full_precision, init_weights, preprocess
+from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
@@ -243,6 +244,22 @@ class CuRePolicy(SACPolicy):
     def remove_curious_agent(self) -> None:
         """Drop the second actor-critic."""
         self.curious_actor = self.curious_critic = self.curious_critic_target = None  # type: ignore[assignment]
+
+    def compile_networks(self) -> None:
+        """Run all that is not compiled yet, and heavy, through torch.compile in training mode.
+
+        Random numbers are drawn outside, so that they stay those of eager networks.
+        """
+        encoders = (self.encoder, self.encoder_target)
+        actors = (self.actor, self.curious_actor)
+        critics = (self.critic, self.critic_target, self.curious_critic, self.curious_critic_target)
+        modules = [part for encoder in encoders for part in (encoder.trunk, encoder.projection)]
+        modules += [part for actor in actors if actor for part in (actor.features_extractor, actor.latent_pi)]
+        modules += [critic for critic in critics if critic]
+        modules += [] if self.srl is None else list(self.srl.children())
+        for module in modules:
+            if module._compiled_call_impl is None:
+                compile_while_training(module, self)
 
     def preprocess(self, observations: th.Tensor) -> th.Tensor:
         """

@@ -1,8 +1,21 @@
-"""In which number format the networks compute."""
+"""How the networks compute: in which number format, and whether through torch.compile."""
+
+import functools
+import time
+import warnings
+from typing import Any
 
 import torch as th
+from torch import nn
 
 PRECISIONS = ("auto", "fp32", "bf16")
+COMPILE = ("auto", True, False)
+
+#: Why ``compile="auto"`` is eager
+NOT_COMPILED = {
+    "cpu": "compiling takes longer than it saves on a CPU",
+    "cuda": "what compiling costs and saves on a GPU was not measured yet",
+}
 
 
 def _has_fast_bf16(device: th.device) -> bool:
@@ -36,3 +49,61 @@ def autocast_context(precision: str, device: th.device) -> th.autocast:
     :return: Context in which convolutions and linear maps use that format; weights stay fp32
     """
     return th.autocast(device.type, th.bfloat16, enabled=precision == "bf16")
+
+
+@functools.cache
+def _why_not_compiled(device_type: str) -> str | None:
+    """What keeps torch.compile from working here, or None. Only trying tells: it needs a C++ compiler, for GPUs Triton,
+    headers, a Python that it knows."""
+    # A number that makes the function new: results of a compiler that is gone may lie in the cache on disk.
+    now = time.time()
+    try:
+        th.compile(lambda x: x.sin() * now)(th.zeros(8, device=device_type))
+    except Exception as error:
+        return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    return None
+
+
+def resolve_compile(compile: str | bool, device: th.device) -> tuple[bool, str]:
+    """
+    :param compile: ``"auto"``, True or False
+    :param device: Device of the networks
+    :return: Whether updates run the networks through torch.compile, and a sentence that says so; with True, but where
+        torch.compile does not work, they do not, and a warning says why
+    """
+    if compile == "auto":
+        reason = NOT_COMPILED.get(device.type, NOT_COMPILED["cuda"])
+        return False, f"Networks run eagerly (compile='auto': {reason})"
+    if not compile:
+        return False, "Networks run eagerly (compile=False)"
+    failure = _why_not_compiled(device.type)
+    if failure is not None:
+        sentence = f"Networks run eagerly: compile=True, but torch.compile does not work here ({failure})"
+        warnings.warn(f"{sentence}; install what is missing, or leave compile='auto'.", stacklevel=2)
+        return False, sentence
+    return True, "Networks are compiled in the first updates (compile=True)"
+
+
+def compile_while_training(module: nn.Module, owner: nn.Module) -> None:
+    """Run a module through torch.compile, in place, whenever its owner is in training mode.
+
+    Otherwise it stays eager: acting and measuring see batches of many sizes, each of which would be compiled anew.
+    Names and values of the parameters stay what they are; copies and pickles of the module are eager.
+
+    :param module: The module, called as ``module(...)``
+    :param owner: Whose ``training`` is asked
+    """
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return module._call_impl(*args, **kwargs)
+
+    # A function of ours, as torch.compile passes over frames of torch.nn itself, such as that of nn.Sequential; with a
+    # code object of its own, by which compiled graphs are kept and counted.
+    call.__code__ = call.__code__.replace()
+    compiled = th.compile(call)
+
+    def dispatch(*args: Any, **kwargs: Any) -> Any:
+        return (compiled if owner.training else module._call_impl)(*args, **kwargs)
+
+    # Where nn.Module.compile keeps its result, too.
+    module._compiled_call_impl = dispatch

@@ -1,6 +1,7 @@
 """What the tests share: tiny environments (a dot moved about a square), tiny models, and how to compare two of them."""
 
 import copy
+import functools
 from typing import Any
 
 import gymnasium as gym
@@ -115,6 +116,41 @@ def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
     defaults.update(kwargs)
     defaults["policy_kwargs"] = {**policy_kwargs, **kwargs.get("policy_kwargs", {})}
     return CuReSAC(policy, env, **defaults)
+
+
+def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
+    """Gradient of every part of the agent in one update from the model's state, as its optimiser receives it.
+
+    :param model: A model with curiosity="separate" and update="joint"
+    :param seed: Seed of the batch and of the random numbers of the update
+    :return: Flat gradients by part
+    """
+    policy = model.policy
+    owners = {
+        "encoder": policy.encoder,
+        "srl": policy.srl,
+        "actor": policy.actor,
+        "critic": policy.critic,
+        "curious actor": policy.curious_actor,
+        "curious critic": policy.curious_critic,
+    }
+    found: dict[str, th.Tensor] = {}
+
+    def keep(name: str, parameters: list[th.nn.Parameter], step: Any, *arguments: Any) -> Any:
+        found[name] = th.cat([p.grad.flatten().clone() for p in parameters if p.grad is not None])
+        return step(*arguments)
+
+    optimizers = {name: owner.optimizer for name, owner in owners.items() if name != "encoder"}
+    optimizers["encoder"] = policy.encoder_optimizer.optimizers["joint"]
+    for name, optimizer in optimizers.items():
+        optimizer.step = functools.partial(keep, name, list(owners[name].parameters()), optimizer.step)
+    th.manual_seed(seed)
+    np.random.seed(seed)
+    model._n_updates = 0
+    model.train(1, 128)
+    for optimizer in optimizers.values():
+        del optimizer.step
+    return found
 
 
 def state_of(model: SAC) -> dict[str, Any]:

@@ -1,14 +1,12 @@
 """The quick ways of doing things do the same things: overlapped updates, bfloat16, no waiting for the device."""
 
 import copy
-import functools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, tiny_model
+from envs_for_tests import PixelBox, gradients_of_an_update, tiny_model
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -124,33 +122,6 @@ def test_overlap_needs_worker_processes(tmp_path: Path) -> None:
 # ----------------------------------------------------------------------- bfloat16
 
 
-def _gradients(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
-    """Gradient of every part of the agent in one update from the model's state, as its optimiser receives it."""
-    policy = model.policy
-    owners = {
-        "encoder": policy.encoder,
-        "srl": policy.srl,
-        "actor": policy.actor,
-        "critic": policy.critic,
-        "curious actor": policy.curious_actor,
-        "curious critic": policy.curious_critic,
-    }
-    found: dict[str, th.Tensor] = {}
-
-    def keep(name: str, parameters: list[th.nn.Parameter], step: Any, *arguments: Any) -> Any:
-        found[name] = th.cat([p.grad.flatten().clone() for p in parameters if p.grad is not None])
-        return step(*arguments)
-
-    for name, owner in owners.items():
-        optimizer = policy.encoder_optimizer.optimizers["joint"] if name == "encoder" else owner.optimizer
-        optimizer.step = functools.partial(keep, name, list(owner.parameters()), optimizer.step)
-    th.manual_seed(seed)
-    np.random.seed(seed)
-    model._n_updates = 0
-    model.train(1, 128)
-    return found
-
-
 @pytest.mark.parametrize("srl", ["rae", "curl"])
 def test_bfloat16_gradients_point_where_those_of_float32_do(srl: str) -> None:
     """One state, one batch, one stream of random numbers: cosine of at least 0.99 for every part of the agent."""
@@ -167,7 +138,7 @@ def test_bfloat16_gradients_point_where_those_of_float32_do(srl: str) -> None:
         model.set_logger(trained.logger)
         model.set_parameters(state)
         model.replay_buffer = trained.replay_buffer
-        found[precision] = _gradients(model, seed=5)
+        found[precision] = gradients_of_an_update(model, seed=5)
     assert found["fp32"].keys() == found["bf16"].keys() and len(found["fp32"]) == 6
     for name, expected in found["fp32"].items():
         cosine = float(th.cosine_similarity(expected, found["bf16"][name], dim=0))
