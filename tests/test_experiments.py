@@ -125,6 +125,10 @@ def test_the_projects_grids_can_be_built(path: Path) -> None:
             dict(methods={"a": {"config": "zoo.yml", "pretrain": {"collector": "task", "budget": 8}}}),
             "pretrain.collector of methods.a .* is 'task', but it must be 'curious' or 'random'",
         ),
+        (
+            dict(methods={"a": {"config": "zoo.yml", "overrides": {"srl": "my_heads.Nowhere"}}}),
+            "srl of methods.a .* is 'my_heads.Nowhere', which cannot be imported",
+        ),
         (dict(baseline="sac"), "baseline in .* is 'sac', but the methods are cure"),
         (dict(evaluation={"every": 0}), "evaluation.every in .* is 0, but it must be a whole number, 1 or more"),
         (dict(budgets=3), "'budgets' in .* is unknown"),
@@ -216,6 +220,17 @@ def test_warm_ups_of_the_arms_are_the_same(tmp_path: Path) -> None:
         buffer = model.replay_buffer
         buffers.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy(), buffer.frames[:15].copy()))
     assert differences(buffers[0], buffers[1]) == differences(buffers[0], buffers[2]) == []
+
+
+def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
+    """A grid trains, interrupts and resumes a user's head like the package's own."""
+    overrides = {"srl": "test_save_load.Denoising"}
+    (cell,) = load_grid(
+        write_grid(tmp_path, budget=160, methods={"own": {"config": "zoo.yml", "overrides": overrides}})
+    ).cells
+    folder = run_cell(cell, tmp_path, pictures=False)
+    assert type(CuReSAC.load(folder / "model.zip").policy.srl).__name__ == "Denoising"
+    assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "test_save_load.Denoising"
 
 
 def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:

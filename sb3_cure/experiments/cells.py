@@ -1,6 +1,5 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
-import copy
 import fcntl
 import json
 import shutil
@@ -123,8 +122,7 @@ class _CellRun:
 
     def _begin(self) -> CuReSAC:
         self.state["started"] = _now()
-        # A copy, as SB3 writes into policy_kwargs
-        return CuReSAC(env=self._make_env(), seed=self.cell.seed, **copy.deepcopy(self.cell.arguments))
+        return CuReSAC(env=self._make_env(), seed=self.cell.seed, **self.cell.build_arguments())
 
     # -------------------------------------------------------------- evaluation
 

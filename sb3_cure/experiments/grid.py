@@ -1,6 +1,8 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
+import copy
 import inspect
+import pkgutil
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -76,6 +78,13 @@ class Cell:
     def folder(self) -> Path:
         """Where it lies below the folder of results."""
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
+
+    def build_arguments(self) -> dict[str, Any]:
+        """A copy of ``arguments``, as SB3 writes into some, with the class of a head that is named like a module's."""
+        arguments = copy.deepcopy(self.arguments)
+        if "." in str(arguments.get("srl")):
+            arguments["srl"] = pkgutil.resolve_name(arguments["srl"])
+        return arguments
 
     def config(self) -> dict[str, Any]:
         """What its ``config.json`` holds."""
@@ -205,6 +214,14 @@ def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[st
             raise GridError(
                 f"{key} in {config_path} is {value!r}, but grids evaluate no strings: write a YAML mapping."
             )
+    if "." in str(arguments.get("srl")):
+        try:
+            pkgutil.resolve_name(arguments["srl"])
+        except (ImportError, AttributeError, ValueError) as error:
+            raise GridError(
+                f"srl of {where} is {arguments['srl']!r}, which cannot be imported ({error}): name a class as "
+                "module.Class, in a module of the working directory or an installed one."
+            ) from None
     pretrain = None
     if "pretrain" in method:
         phase = _mapping("pretrain", method["pretrain"], path)

@@ -3,6 +3,7 @@
 import argparse
 import json
 import re
+import sys
 import threading
 import time
 import traceback
@@ -260,6 +261,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--no-pictures", action="store_true", help="neither draw nor film")
     parser.add_argument("--dry-run", action="store_true", help="list the cells and their states, run nothing")
     options = parser.parse_args(arguments)
+    if "" not in sys.path:
+        sys.path.append("")  # a grid may name a head of a module in the working directory
     try:
         grid = load_grid(
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
