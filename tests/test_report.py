@@ -110,8 +110,8 @@ def test_tables_of_curves(results: Path) -> None:
     assert not_run[2:5] == ["0", "not run", "not run"]
     (difference,) = rows_of(results / "curves" / "table.md", "Paired difference from sac\\_ae: area")[1:]
     minus = "\N{MINUS SIGN}"
-    assert difference[:4] == ["cure_sac_ae", TASK, "2", "75.0"]
-    assert difference[4:] == [f"[{minus}242.7, 392.7]", "[50.0, 100.0]", "2 of 2", "inconclusive"]
+    assert difference[:5] == ["cure_sac_ae", TASK, "2", "2", "75.0"]
+    assert difference[5:] == [f"[{minus}242.7, 392.7]", "[50.0, 100.0]", "2", "inconclusive"]
     headline = "cure\\_sac\\_ae minus sac\\_ae: area under the curve 75.0"
     assert headline in (results / "curves" / "table.md").read_text()
 
@@ -140,8 +140,8 @@ def test_pretraining_beside_the_paper(results: Path) -> None:
         [TASK, "random_pretraining", "0", "not run", "784 ± 12", "\N{EN DASH}"],
     ]
     (row,) = rows_of(results / "pretraining" / "table.md", "Paired difference between any two arms")[1:]
-    assert row[:4] == ["cure_pretraining minus vanilla", TASK, "1", "25.0"]
-    assert row[4:] == ["one seed: no interval", "one seed: no interval", "1 of 1", "one seed: no interval"]
+    assert row[:5] == ["cure_pretraining minus vanilla", TASK, "1", "1", "25.0"]
+    assert row[5:] == ["one seed: no interval", "one seed: no interval", "1", "one seed: no interval"]
 
 
 def test_visitation_tables(results: Path) -> None:

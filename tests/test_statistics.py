@@ -61,6 +61,7 @@ def test_differences_pair_the_seeds(results: Path) -> None:
     assert difference.t.high == pytest.approx(75 + 12.7062 * 25, rel=1e-5)
     assert (difference.percentile.low, difference.percentile.high) == (50, 100)
     assert difference.t.verdict == "inconclusive"
+    assert difference.same_starts == 2
     (final,) = statistics.paired_differences(experiment, "finals")
     assert final.t.value == pytest.approx(150)
     (mirrored,) = statistics.paired_differences(experiment, baseline="cure_sac_ae")
@@ -104,6 +105,7 @@ def test_several_tasks_count_alike(tmp_path: Path) -> None:
     pooled, *rows = statistics.paired_differences(read_results(folder)[0])
     assert pooled.task is None and [row.task for row in rows] == ["x-y", "z-w"]
     assert pooled.t.value == pytest.approx(60) and pooled.t.n == 5
+    assert (pooled.same_starts, rows[0].same_starts, rows[1].same_starts) == (1, 1, 0)
     assert pooled.t.low is not None and pooled.t.high is not None
     assert pooled.t.low < pooled.percentile.low and pooled.t.high > pooled.percentile.high  # type: ignore[operator]
 

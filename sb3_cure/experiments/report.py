@@ -315,6 +315,7 @@ figure { margin: 18px 0; }
 img, video { max-width: 100%; height: auto; display: block; }
 .media { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(480px, 100%), 1fr)); gap: 16px 26px; }
 .media figure { margin: 6px 0; }
+.media .broad { grid-column: 1 / -1; }
 .media video { width: 100%; max-width: 480px; background: #000; }
 details { margin: 10px 0; }
 details details { margin-left: 20px; }
@@ -339,7 +340,8 @@ def _picture_html(png: bytes, caption: str) -> str:
         width, height = image.size
     text, size = escape(caption), f'width="{width * 2 // 3}" height="{height * 2 // 3}"'
     image_html = f'<img src="{_data("image/png", png)}" {size} alt="{text}">'
-    return f"<figure>{image_html}<figcaption>{text}</figcaption></figure>\n"
+    kind = ' class="broad"' if width > 1.6 * height else ""
+    return f"<figure{kind}>{image_html}<figcaption>{text}</figcaption></figure>\n"
 
 
 def _media_html(path: Path, caption: str) -> str:
@@ -399,11 +401,9 @@ def _configs_html(experiment: Experiment) -> str:
 
 def _facts(experiment: Experiment) -> str:
     evaluation = experiment.grid.get("evaluation")
-    every = (
-        f", evaluated every {evaluation.get('every')} of them over {evaluation.get('episodes')} episodes"
-        if isinstance(evaluation, dict)
-        else ""
-    )
+    every = ""
+    if isinstance(evaluation, dict):
+        every = f", evaluated every {evaluation.get('every')} of them (episodes: {evaluation.get('episodes')})"
     done = sum(cell.done for cell in experiment.cells.values())
     return (
         f"{experiment.kind}; {experiment.budget:,} environment steps{every}; {plural(len(experiment.tasks), 'task')}, "

@@ -367,6 +367,7 @@ class ArmSummary:
 
     :param seeds: Seeds that are done and have a curve
     :param areas: Area under the curve by seed
+    :param starts: Return of the first evaluation by seed, before training
     :param finals: Return of the last evaluation by seed
     :param curve_iqr: Interquartile range over seeds, averaged over the curve; nan with one seed
     :param reached: For each threshold the steps of each seed
@@ -376,6 +377,7 @@ class ArmSummary:
     method: str
     seeds: tuple[int, ...]
     areas: np.ndarray
+    starts: np.ndarray
     finals: np.ndarray
     curve_iqr: float
     reached: dict[float, np.ndarray]
@@ -398,6 +400,7 @@ def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Se
         method,
         tuple(cells),
         np.array([area_under_curve(*curve) for curve in curves]),
+        np.array([values[0] for _, values in curves]),
         np.array([values[-1] for _, values in curves]),
         spread,
         {limit: np.array([steps_to_threshold(*curve, limit) for curve in curves]) for limit in thresholds},
@@ -494,6 +497,7 @@ class PairedDifference:
     :param differences: By task, one value per seed that both arms have done
     :param t: Mean difference with the t interval
     :param percentile: Mean difference with the percentile interval
+    :param same_starts: In how many pairs both arms earn the same before training, as they do from equal weights
     """
 
     method: str
@@ -502,6 +506,7 @@ class PairedDifference:
     differences: dict[str, np.ndarray]
     t: Estimate
     percentile: Estimate
+    same_starts: int
 
     @property
     def wins(self) -> int:
@@ -533,19 +538,28 @@ def paired_differences(
     for method in experiment.methods:
         if method == baseline:
             continue
-        by_task = {}
+        by_task, same = {}, {}
         for task in experiment.tasks:
             arm, base = arms[task, method], arms.get((task, baseline))
             shared = [seed for seed in arm.seeds if base is not None and seed in base.seeds]
             if base is not None and shared:
-                values = [dict(zip(each.seeds, getattr(each, measure), strict=True)) for each in (arm, base)]
-                by_task[task] = np.array([values[0][seed] - values[1][seed] for seed in shared])
+                by_task[task], starts = (
+                    np.array([_by_seed(arm, name)[seed] - _by_seed(base, name)[seed] for seed in shared])
+                    for name in (measure, "starts")
+                )
+                same[task] = int((starts == 0).sum())
         rows = [{task: values} for task, values in by_task.items()]
         for row in [by_task, *rows] if len(rows) > 1 else rows:
             groups = list(row.values())
             name = None if row is by_task else next(iter(row))
-            found.append(PairedDifference(method, baseline, name, row, t_interval(groups), percentile_interval(groups)))
+            starts_alike = sum(same[task] for task in row)
+            intervals = t_interval(groups), percentile_interval(groups)
+            found.append(PairedDifference(method, baseline, name, row, *intervals, starts_alike))
     return found
+
+
+def _by_seed(arm: ArmSummary, measure: str) -> dict[int, float]:
+    return dict(zip(arm.seeds, getattr(arm, measure), strict=True))
 
 
 # Aggregates over tasks, by rliable

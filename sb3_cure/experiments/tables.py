@@ -14,11 +14,13 @@ from sb3_cure.experiments.statistics import Estimate, Experiment
 
 NONE = "\N{EN DASH}"
 DIFFERENCES = (
-    "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation starts. "
-    "The t interval (which gives the verdict) draws each task's mean from Student's t around the mean of its pairs and "
-    "weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap resamples seeds within "
-    "tasks; with two to five of them it is too narrow (it covers the truth in about 50 to 85 % of cases), and is here "
-    "for comparison. Verdicts are not corrected for the number of arms and tasks."
+    "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation starts "
+    "(same start: in how many pairs both earn the same before training; not so after pretraining, or with other "
+    "networks). The t interval, which gives the verdict, draws each task's mean from Student's t around the mean of "
+    "its pairs and weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap resamples "
+    "seeds within tasks; with two to five of them it is too narrow (it covers the truth in about 50 to 85 % of "
+    "cases), and is here for comparison. Above: in how many pairs the arm is above. Verdicts are not corrected for "
+    "the number of arms and tasks."
 )
 
 
@@ -220,12 +222,12 @@ def pairs_table(rows: Sequence[statistics.PairedDifference]) -> Table:
     return Table(title, ["arms", "task", *_DIFFERENCE_COLUMNS], texts, "As above, over all tasks.")
 
 
-_DIFFERENCE_COLUMNS = (">pairs", ">difference", ">95 % t", ">95 % percentile", ">pairs above", "verdict")
+_DIFFERENCE_COLUMNS = (">pairs", ">same start", ">difference", ">95 % t", ">95 % percentile", ">above", "verdict")
 
 
 def _difference(row: statistics.PairedDifference) -> list[str]:
-    intervals = [interval_text(row.t, 1), interval_text(row.percentile, 1)]
-    return [str(row.pairs), number_text(row.t.value, 1), *intervals, f"{row.wins} of {row.pairs}", row.t.verdict]
+    numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, 1)]
+    return [*numbers, interval_text(row.t, 1), interval_text(row.percentile, 1), str(row.wins), row.t.verdict]
 
 
 def of_tasks(row: statistics.PairedDifference) -> str:
