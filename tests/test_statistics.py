@@ -239,7 +239,7 @@ def test_coverage_counts_cells_of_equally_many_states(tmp_path: Path) -> None:
     write_cell(folder, TASK, "cure_sac_ae", 0, {}, states=states)
     random, curious = statistics.state_coverage(read_results(folder)[0])
     assert (random.actor, random.occupied.tolist(), random.entropy.tolist()) == ("random", [1], [0.0])
-    assert (curious.actor, curious.occupied.tolist(), curious.steps, curious.grid) == ("curious", [2], 100, 100)
+    assert (curious.actor, curious.occupied.tolist(), curious.steps, curious.grid) == ("curious", [2], 100, 31)
     assert curious.entropy[0] == pytest.approx(1, abs=0.02)
     assert curious.ratio == statistics.Estimate(2, None, None, 1) and np.isnan(random.ratio.value)
 

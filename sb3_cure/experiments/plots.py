@@ -460,7 +460,7 @@ def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     """What any panel shows, once, below all of them."""
     shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if shown:
-        columns = min(len(shown), 6)
+        columns = min(len(shown), int(figure.get_figwidth() // 1.8))
         figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 

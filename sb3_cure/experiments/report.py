@@ -316,7 +316,7 @@ img, video { max-width: 100%; height: auto; display: block; }
 .media { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(480px, 100%), 1fr)); gap: 16px 26px; }
 .media figure { margin: 6px 0; }
 .media .broad { grid-column: 1 / -1; }
-.media video { width: 100%; max-width: 480px; background: #000; }
+.media video { width: 100%; max-width: 400px; background: #000; }
 details { margin: 10px 0; }
 details details { margin-left: 20px; }
 summary { cursor: pointer; font-weight: 600; overflow-wrap: anywhere; }
@@ -340,7 +340,7 @@ def _picture_html(png: bytes, caption: str) -> str:
         width, height = image.size
     text, size = escape(caption), f'width="{width * 2 // 3}" height="{height * 2 // 3}"'
     image_html = f'<img src="{_data("image/png", png)}" {size} alt="{text}">'
-    kind = ' class="broad"' if width > 1.6 * height else ""
+    kind = ' class="broad"' if width > 1.3 * height else ""
     return f"<figure{kind}>{image_html}<figcaption>{text}</figcaption></figure>\n"
 
 

@@ -29,8 +29,9 @@ HEADS = ("own", "common")
 HIGHEST_RETURN = 1000.0
 #: Below this part of a published mean, a return is suspected to be a bug of ours.
 SUSPECT_BELOW = 0.75
-#: About so many cells has the grid on which visited states are counted, whatever their dimension.
-GRID_CELLS = 10_000
+#: At most so many cells has the grid on which visited states are counted, whatever their dimension: not more than an
+#: actor takes steps (10 episodes of cartpole are 1250), or all would do equally well, each step in a cell of its own.
+GRID_CELLS = 1000
 DRAWS = 100_000
 RLIABLE_REPS = 2000
 
@@ -733,7 +734,7 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
             cells = experiment.done(task, method).values()
             pairs = dict.fromkeys((visit.head, visit.actor) for cell in cells for visit in cell.visitation)
             heads = list(dict.fromkeys(head for head, _ in pairs))
-            for head, actor in sorted(pairs, key=lambda pair: heads.index(pair[0])):
+            for head, actor in sorted(pairs, key=lambda pair: (heads.index(pair[0]), _place(pair[1]))):
                 visits = [
                     [visit for visit in cell.visitation if (visit.head, visit.actor) == (head, actor)] for cell in cells
                 ]
@@ -756,6 +757,11 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
                     )
                 )
     return rows
+
+
+def _place(actor: str) -> int:
+    """Of an actor in tables: the random one, with which the others are compared, comes first."""
+    return ("random", "task", "curious", actor).index(actor)
 
 
 def _mean_error(cell: CellResult, head: str, actor: str) -> float:
@@ -861,7 +867,8 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
             for actor, states in cell.items()
             if len(states)
         }
-        for method, actor in dict.fromkeys((method, actor) for method, _, actor in counts):
+        arms = dict.fromkeys((method, actor) for method, _, actor in counts)
+        for method, actor in sorted(arms, key=lambda arm: (experiment.methods.index(arm[0]), _place(arm[1]))):
             seeds = [seed for arm, seed, who in counts if (arm, who) == (method, actor)]
             ratios = [
                 len(counts[method, seed, actor]) / len(counts[method, seed, "random"])

@@ -301,7 +301,8 @@ def ratio_text(estimate: Estimate) -> str:
     """
     if not math.isfinite(estimate.value):
         return NONE
-    return f"{number_text(estimate.value, 2)} {interval_text(estimate, 2)}"
+    shown = "(one seed)" if estimate.low is None else interval_text(estimate, 2)
+    return f"{number_text(estimate.value, 2)} {shown}"
 
 
 def coverage_table(rows: Sequence[statistics.Coverage]) -> Table:
