@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl demo test check bench notebooks clean help
+.PHONY: .venv gl chromium demo test check bench notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -62,6 +62,10 @@ gl: .venv/.installed
 		$(call apt_install,libegl1 libopengl0 libgl1-mesa-dri)
 		$(RUN) sb3_cure.envs.rendering
 	fi
+
+# A browser that opens the report as its readers do; without it those tests are skipped.
+chromium:
+	@if ! command -v chromium >/dev/null; then $(call apt_install,chromium); fi
 
 demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten minutes on two cores)
 	$(RUN) sb3_cure.experiments.demo --out demo

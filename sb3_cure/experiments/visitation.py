@@ -19,6 +19,7 @@ from sb3_cure.experiments.files import Row, read_rows, write_csv
 from sb3_cure.experiments.grid import Cell, Grid
 from sb3_cure.srl import RAE
 
+#: Plus the cell's seed: the arms of a seed start from the same states, another seed from others
 VISIT_SEED = 20_000
 #: Updates of a common head: an autoencoder tells little before some thousands of them
 COMMON_UPDATES = 3000
@@ -54,7 +55,9 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
         arrays["state_names"] = np.array(physics_state_names(env))
     episodes = {}
     for actor in visiting_actors(model, cell):
-        episodes[actor] = list(run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED, states=has_physics))
+        episodes[actor] = list(
+            run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED + cell.seed, states=has_physics)
+        )
         arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in episodes[actor]]).astype(np.float32)
         if has_physics:
             states = np.concatenate([each.states for each in episodes[actor]])
@@ -115,7 +118,7 @@ def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
     model = CuReSAC.load(results / cell.folder / "model.zip", custom_objects={"buffer_size": 1})
     env = gym.make(cell.task, **cell.env_kwargs)
     for actor in visiting_actors(model, cell):
-        yield actor, list(run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED))
+        yield actor, list(run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED + cell.seed))
     env.close()
 
 
