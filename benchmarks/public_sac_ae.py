@@ -1,0 +1,123 @@
+"""Time the plain SAC-AE update of ``benchmarks/sac_ae.py`` against that of the public implementation.
+
+    git clone https://github.com/denisyarats/pytorch_sac_ae
+    python -m benchmarks.public_sac_ae pytorch_sac_ae
+
+Both get the same batches in the paper's setting and take turns; with and without the allocator settings of
+``sb3_cure.allocator``, each in a process of its own, as they cannot be undone.
+"""
+
+import argparse
+import importlib
+import itertools
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from benchmarks.harness import BATCH_SIZE, Times, interleaved, make_model, median_ratio, summary
+from benchmarks.sac_ae import PlainSacAe
+from sb3_cure.allocator import tune_allocator
+
+PLAIN, PUBLIC = "benchmarks/sac_ae.py", "public implementation"
+#: The published command line's arguments, with the CuRe paper's width of 1024
+ARGUMENTS = dict(
+    hidden_dim=1024,
+    init_temperature=0.1,
+    alpha_lr=1e-4,
+    alpha_beta=0.5,
+    critic_tau=0.01,
+    encoder_tau=0.05,
+    decoder_latent_lambda=1e-6,
+    decoder_weight_lambda=1e-7,
+    num_layers=4,
+    num_filters=32,
+)
+
+
+class _Silent:
+    """A logger that takes everything and writes nothing."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *arguments: None
+
+
+class _Buffer:
+    """The same batches for both, in turn; observations are bytes, which either makes floats of in its update."""
+
+    def __init__(self, batches: list[ReplayBufferSamples]) -> None:
+        self._batches: Iterator[ReplayBufferSamples] = itertools.cycle(batches)
+
+    def next(self) -> ReplayBufferSamples:
+        """
+        :return: A batch, as ``PlainSacAe`` takes it
+        """
+        return next(self._batches)
+
+    def sample(self) -> tuple[th.Tensor, ...]:
+        """
+        :return: A batch, as the public implementation's own buffer returns it
+        """
+        batch = self.next()
+        images, next_images = batch.observations.float(), batch.next_observations.float()
+        return images, batch.actions, batch.rewards, next_images, 1 - batch.dones
+
+
+def _public_agent(checkout: str, shape: tuple[int, ...]) -> Any:
+    try:
+        importlib.import_module("gym")
+    except ImportError:  # it is imported for a wrapper that is not used here
+        gym: Any = ModuleType("gym")
+        gym.Wrapper, gym.spaces = object, SimpleNamespace(Box=None)
+        sys.modules["gym"] = gym
+    sys.path.insert(0, checkout)
+    return importlib.import_module("sac_ae").SacAeAgent(shape, (1,), th.device("cpu"), **ARGUMENTS)
+
+
+def measure(checkout: str, repeats: int, tuned: bool) -> Times:
+    """
+    :param checkout: Path of the public implementation's checkout
+    :param repeats: Rounds
+    :param tuned: Whether to set the allocator as ``make bench`` does
+    :return: Seconds per update of each round, by implementation
+    """
+    if tuned:
+        tune_allocator()
+    replay_buffer = make_model().replay_buffer
+    batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)]
+    buffers = {name: _Buffer(batches) for name in (PLAIN, PUBLIC)}
+    plain, public, silent = PlainSacAe(actions=1), _public_agent(checkout, batches[0].observations.shape[1:]), _Silent()
+    # Of two updates the first includes the actors.
+    steps = itertools.count()
+    variants = {
+        PLAIN: lambda: plain.update(buffers[PLAIN].next()),
+        PUBLIC: lambda: public.update(buffers[PUBLIC], silent, next(steps)),
+    }
+    return interleaved(variants, repeats, calls=2)
+
+
+def main() -> None:
+    """Measure and print times and ratios."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkout", type=Path, help="folder that holds the public implementation's sac_ae.py")
+    parser.add_argument("--repeats", type=int, default=7, help="rounds (default: 7)")
+    options = parser.parse_args()
+    if not (options.checkout / "sac_ae.py").is_file():
+        parser.error(f"{options.checkout} holds no sac_ae.py: give the folder into which pytorch_sac_ae was cloned")
+    for tuned in (False, True):
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+            times = process.submit(measure, str(options.checkout.resolve()), options.repeats, tuned).result()
+        print("With the allocator settings" if tuned else "As the C library allocates by default")
+        for name, seconds in times.items():
+            print(f"  {name}: {summary(seconds)}")
+        print(f"  {PLAIN} / {PUBLIC}: {median_ratio(times, PLAIN, PUBLIC):.2f}")
+
+
+if __name__ == "__main__":
+    main()
