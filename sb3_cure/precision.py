@@ -13,8 +13,8 @@ COMPILE = ("auto", True, False)
 
 #: Why ``compile="auto"`` is eager
 NOT_COMPILED = {
-    "cpu": "compiling takes longer than it saves on a CPU",
-    "cuda": "what compiling costs and saves on a GPU was not measured yet",
+    "cpu": "compiled updates were slower on the CPU they were measured on",
+    "cuda": "compiled updates were not measured on a GPU yet",
 }
 
 
