@@ -10,6 +10,33 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 #: What replaces the parameter cell of each notebook: it names all parameters, with values that take seconds.
 TINY = {
     "01_quickstart": "STEPS = 300",
+    "02_srl_error_visitation": """
+STEPS = 100
+EPISODES = 1
+WARMUP_UPDATES = 20
+BATCH_SIZE = 8
+NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
+PAPERS_PIXELS = dict(image_size=36, renderer="fast")
+""",
+    "03_learning_curves": """
+BUDGET = 320
+SEEDS = 2
+EVALUATION = dict(every=320, episodes=1)
+LEARNING_STARTS = 20
+WARMUP_UPDATES = 10
+BATCH_SIZE = 8
+NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
+""",
+    "04_pretraining": """
+BUDGET = 320
+PRETRAINING = 320
+SEEDS = 2
+EVALUATION = dict(every=320, episodes=1)
+LEARNING_STARTS = 20
+WARMUP_UPDATES = 10
+BATCH_SIZE = 8
+NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
+""",
 }
 
 
@@ -22,6 +49,8 @@ def test_notebook_runs_with_a_tiny_budget(path: Path, tmp_path: Path) -> None:
     parameters[0].source = TINY[path.stem]
     client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}})
     client.execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert not [output.text for output in outputs if output.get("name") == "stderr"]  # no warnings, no progress bars
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -136,13 +136,13 @@ def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
     console = Console()
     stopped = threading.Event()
 
-    def refresh(live: Live) -> None:
+    def refresh(show: Callable[[Table], object]) -> None:
         while not stopped.wait(1.0):
-            live.update(progress_table(cells, results))
+            show(progress_table(cells, results))
 
-    with Live(progress_table(cells, results), console=console, auto_refresh=console.is_terminal) as live:
-        thread = threading.Thread(target=refresh, args=(live,), daemon=True)
-        if console.is_terminal:
+    with _shown(console, progress_table(cells, results)) as show:
+        thread = threading.Thread(target=refresh, args=(show,), daemon=True)
+        if console.is_terminal or console.is_jupyter:
             thread.start()
         try:
             yield
@@ -150,7 +150,19 @@ def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
             stopped.set()
             if thread.is_alive():
                 thread.join()
-            live.update(progress_table(cells, results), refresh=True)
+            show(progress_table(cells, results))
+
+
+@contextmanager
+def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]]:
+    """A table on a terminal or in a notebook, and what replaces it by another; elsewhere the last one is printed."""
+    if console.is_jupyter:  # where rich's Live needs ipywidgets
+        from IPython.display import display
+
+        yield display(table, display_id=True).update
+    else:
+        with Live(table, console=console, auto_refresh=console.is_terminal) as live:
+            yield lambda later: live.update(later, refresh=True)
 
 
 def progress_table(cells: Sequence[Cell], results: Path) -> Table:
