@@ -19,7 +19,7 @@ import yaml
 from envs_for_tests import PixelBox, differences, state_of
 
 from sb3_cure import CuReSAC
-from sb3_cure.experiments import run, visitation
+from sb3_cure.experiments import run, visitation, yardsticks
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
@@ -382,6 +382,20 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
         for cell in grid.cells
     ]
     assert returns[0] == returns[1] and returns[2] == returns[3] and returns[0].isdisjoint(returns[2])
+
+
+def test_yardsticks_follow_an_autoencoder_from_its_first_update() -> None:
+    """Untrained it errs like a prediction of zero, as the paper reports; then it learns. Rows make the table."""
+    rows = yardsticks.measure_task("dmc_pixels/cartpole-swingup-v0", (0,), (0, 1, 6), 40, frame_stack=1)
+    error = {(row["predictor"], row["updates"]): row["error_mean"] for row in rows}
+    # .0518 +- .0005 was measured elsewhere from the renderer's pixels alone.
+    assert error["zero", 0] == pytest.approx(0.0518, abs=0.001)
+    assert error["autoencoder", 0] == pytest.approx(error["zero", 0], rel=0.1)
+    assert error["mean_image", 0] < error["autoencoder", 6] < error["autoencoder", 0]
+    *_, line = yardsticks.table(rows)
+    numbers = [f"{error[key]:.4f}" for key in (("zero", 0), ("mean_image", 0), ("autoencoder", 0))]
+    assert line.startswith(f"| cartpole-swingup | 0.0002 | 0.0540 | {' | '.join(numbers)} |")
+    assert line.endswith(f"| {error['autoencoder', 6]:.4f} (6) |")
 
 
 # ------------------------------------------------------------------- processes

@@ -6,6 +6,7 @@ the policies of *other* seeds saw, and judge all policies of a seed alike.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -62,12 +63,12 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
         if has_physics:
             states = np.concatenate([each.states for each in episodes[actor]])
             arrays[f"{actor}_states"] = states.astype(np.float32)
-    mean_image = np.mean([_mean_target(model, seen) for seen in episodes.values()], axis=0)
+    mean_image = np.mean([mean_target(model, seen) for seen in episodes.values()], axis=0)
     rows: list[Row] = []
     for actor, seen in episodes.items():
         for number, each in enumerate(seen):
             constant = {"zero": np.zeros_like(mean_image), "mean_image": mean_image}
-            errors = {head: _constant_errors(model, each.observations, image) for head, image in constant.items()}
+            errors = {head: constant_errors(model, each.observations, image) for head, image in constant.items()}
             for head, values in {"own": each.srl_errors, **errors}.items():
                 rows.append(_row(actor, head, number, values, each))
     env.close()
@@ -148,23 +149,34 @@ def _fit_common_head(cell: Cell, observations: np.ndarray) -> CuReSAC:
         buffer_size=1,
         seed=1000 + cell.seed,
     )
+    env.close()
+    for _ in fit_head(model, observations, COMMON_UPDATES):
+        pass
+    return model
+
+
+def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
+    """Train encoder and autoencoder on given observations alone, with neither rewards nor actions.
+
+    :param model: A model with an autoencoder; what it has learned so far is the start
+    :param observations: Images in 0-255, [n, *shape]
+    :param updates: Updates, of 128 observations and with Adam at 1e-3
+    :return: After each update, its number (from 1)
+    """
     policy = model.policy
-    head = policy.srl
-    if head is None:
-        raise RuntimeError("a model with srl='rae' has no head")  # cannot happen; for the type checker
+    head: Any = policy.srl
     optimizer = th.optim.Adam([*policy.encoder.parameters(), *head.parameters()], lr=1e-3)
-    random = np.random.default_rng(cell.seed)
-    policy.set_training_mode(True)
-    for _ in range(COMMON_UPDATES):
-        batch = _batch(observations[random.integers(len(observations), size=128)], model.device)
+    random = np.random.default_rng(model.seed)
+    for number in range(1, updates + 1):
+        policy.set_training_mode(True)
+        batch = observation_batch(observations[random.integers(len(observations), size=128)], model.device)
         with model._autocast():
             latents = policy.encoder(policy.augment(batch.observations))
             loss = head.loss(batch, latents).loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    env.close()
-    return model
+        yield number
 
 
 def _add_common_rows(judge: CuReSAC, cell: Cell, results: Path) -> None:
@@ -172,13 +184,17 @@ def _add_common_rows(judge: CuReSAC, cell: Cell, results: Path) -> None:
     rows = [row for row in read_rows(path) if row["head"] != "common"]
     for actor, episodes in _episodes(cell, results):
         for number, episode in enumerate(episodes):
-            errors = srl_errors(judge, _batch(episode.observations, judge.device))
+            errors = srl_errors(judge, observation_batch(episode.observations, judge.device))
             rows.append(_row(actor, "common", number, errors, episode))
     write_csv(path, COLUMNS, rows)
 
 
-def _batch(observations: np.ndarray, device: th.device) -> ReplayBufferSamples:
-    """Observations alone: all that an autoencoder reads."""
+def observation_batch(observations: np.ndarray, device: th.device) -> ReplayBufferSamples:
+    """
+    :param observations: Images in 0-255, [n, *shape]
+    :param device: Where the batch is to be
+    :return: A batch with observations alone, which are all that an autoencoder reads
+    """
     images = th.as_tensor(observations, device=device)
     nothing = th.zeros((len(images), 1), device=device)
     return ReplayBufferSamples(images, nothing, images, nothing, nothing)
@@ -195,13 +211,23 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
             yield ((images.div(8, rounding_mode="floor") + 0.5) / 32 - 0.5).cpu().numpy()
 
 
-def _mean_target(model: CuReSAC, episodes: Sequence[Episode]) -> np.ndarray:
+def mean_target(model: CuReSAC, episodes: Sequence[Episode]) -> np.ndarray:
+    """
+    :param model: A model, whose autoencoder says what is to be drawn
+    :param episodes: Episodes with observations
+    :return: The mean image of all steps, in the scale of the autoencoder's target
+    """
     sums = [part.sum(axis=0) for each in episodes for part in _targets(model, each.observations)]
     return np.sum(sums, axis=0) / sum(len(each.observations) for each in episodes)
 
 
-def _constant_errors(model: CuReSAC, observations: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Error per observation of predicting the same image always, [n]."""
+def constant_errors(model: CuReSAC, observations: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """
+    :param model: A model, whose autoencoder says what is to be drawn
+    :param observations: Images in 0-255, [n, *shape]
+    :param image: What is drawn, whatever is seen, in the scale of the autoencoder's target
+    :return: Error of each observation, [n]
+    """
     parts = [np.square(part - image).reshape(len(part), -1).mean(axis=1) for part in _targets(model, observations)]
     return np.concatenate(parts)
 
