@@ -246,16 +246,13 @@ class CuRePolicy(SACPolicy):
         self.curious_actor = self.curious_critic = self.curious_critic_target = None  # type: ignore[assignment]
 
     def compile_networks(self) -> None:
-        """Run all that is not compiled yet, and heavy, through torch.compile in training mode.
-
-        Random numbers are drawn outside, so that they stay those of eager networks.
+        """Run what is not compiled yet through torch.compile in training mode: encoders, projections and the head's
+        modules. The rest of actors and critics is products of matrices, between which there is nothing to fuse.
         """
-        encoders = (self.encoder, self.encoder_target)
-        actors = (self.actor, self.curious_actor)
-        critics = (self.critic, self.critic_target, self.curious_critic, self.curious_critic_target)
-        modules = [part for encoder in encoders for part in (encoder.trunk, encoder.projection)]
-        modules += [part for actor in actors if actor for part in (actor.features_extractor, actor.latent_pi)]
-        modules += [critic for critic in critics if critic]
+        modules = [
+            part for encoder in (self.encoder, self.encoder_target) for part in (encoder.trunk, encoder.projection)
+        ]
+        modules += [actor.features_extractor for actor in (self.actor, self.curious_actor) if actor]
         modules += [] if self.srl is None else list(self.srl.children())
         for module in modules:
             if module._compiled_call_impl is None:
