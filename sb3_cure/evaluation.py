@@ -79,7 +79,7 @@ def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Non
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    head = model.policy.srl
+    head = getattr(model.policy, "srl", None)
     if not isinstance(head, CURL):
         return
     actors = [*trained_actors(model), "random"]

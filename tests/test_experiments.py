@@ -19,7 +19,7 @@ import yaml
 from envs_for_tests import PixelBox, differences, state_of
 
 from sb3_cure import CuReSAC
-from sb3_cure.experiments import run, visitation, yardsticks
+from sb3_cure.experiments import cells, run, visitation, yardsticks
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
@@ -34,9 +34,10 @@ DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale":
 
 
 @pytest.fixture(autouse=True)
-def _pixel_box() -> Iterator[None]:
-    """The tiny task under an id: 20 agent steps per episode, an action repeat of 4."""
+def _pixel_box(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The tiny task under an id: 20 steps per episode, an action repeat of 4. Checkpoints do not wait for the disk."""
     gym.register(TASK, PixelBox)
+    monkeypatch.setattr(cells, "_flush_to_disk", lambda path: None)
     yield
     del gym.registry[TASK]
 
@@ -103,6 +104,8 @@ def test_the_projects_grids_can_be_built(path: Path) -> None:
     [
         (dict(kind="curve"), "kind in .* is 'curve', but it must be one of curves, visitation, pretraining"),
         (dict(budget="many"), "budget in .* is 'many', but it must be a whole number, 0 or more"),
+        (dict(budget=float("inf")), "budget in .* is inf, but it must be a whole number, 0 or more"),
+        (dict(tasks=[{"a": 1}]), "task {'a': 1} in .* is not registered"),
         (dict(budget=None), "has no 'budget', which it needs"),
         (dict(seeds=0), "seeds in .* is 0, but it must be how many"),
         (dict(seeds=[1, -2]), r"seeds in .* is \[1, -2\]"),
@@ -150,7 +153,10 @@ def test_wrong_command_lines_are_one_sentence(tmp_path: Path, capsys: pytest.Cap
         "--methods none": "method 'none' is not in",
         "--budget 10m": "'10m' is no number of steps",
         "--seeds x": "'x' names no seeds",
-        "--address auto": "--address and --gpus-per-cell are of Ray: add --engine ray",
+        "--seeds ,": "',' names no seeds",
+        "--tasks ,": "',' names nothing",
+        "--retries 1": "--retries is of Ray: add --engine ray",
+        "--address auto": "--address is of Ray: add --engine ray",
     }.items():
         with pytest.raises(SystemExit):
             run.main([path, *out, *wrong.split()])
@@ -223,7 +229,7 @@ def test_warm_ups_of_the_arms_are_the_same(tmp_path: Path) -> None:
 
 
 def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
-    """A grid trains, interrupts and resumes a user's head like the package's own."""
+    """A grid trains, keeps and loads a user's head like the package's own."""
     overrides = {"srl": "test_save_load.Denoising"}
     (cell,) = load_grid(
         write_grid(tmp_path, budget=160, methods={"own": {"config": "zoo.yml", "overrides": overrides}})
@@ -234,14 +240,102 @@ def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
 
 
 def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
-    """A cell that was begun with another budget must not be mixed with this one."""
+    """A finished cell is not taken for one of another budget, and the grid's description stays as it was."""
     path = write_grid(tmp_path, budget=80)
-    folder = run_cell(load_grid(path).cells[0], tmp_path, pictures=False)
-    (folder / "DONE").unlink()
-    before = (folder / "eval.csv").read_bytes()
-    with pytest.raises(GridError, match="was begun with other settings: budget is 80 there and 160 now"):
-        run_cell(load_grid(path, budget=160).cells[0], tmp_path, pictures=False)
-    assert (folder / "eval.csv").read_bytes() == before
+    out = tmp_path / "out"
+    assert run.run_grid(load_grid(path), out, pictures=False) == []
+    files = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    for other in (load_grid(path, budget=160), load_grid(path, budget=160, seeds=[7])):
+        with pytest.raises(GridError, match="was run with other settings: budget is 80 there and 160 now"):
+            run.run_grid(other, out, pictures=False)
+    assert {file: file.read_bytes() for file in out.rglob("*") if file.is_file()} == files
+    assert run.run_grid(load_grid(path, seeds=[1]), out, pictures=False) == []
+    assert json.loads((out / "tiny" / "grid.json").read_text())["seeds"] == [0, 1]
+
+
+@pytest.mark.parametrize("kind", ["curves", "visitation"])
+def test_arms_without_srl_or_curiosity_are_measured_too(tmp_path: Path, kind: str) -> None:
+    """SB3's own SAC, and a shared encoder without head, as baselines: returns and visits without SRL errors."""
+    none = {"srl": None, "curiosity": None, "warmup_updates": None}
+    methods = {
+        "sac": {"config": "zoo.yml", "overrides": {**none, "policy_kwargs": {"net_arch": [8]}}},
+        "encoder": {
+            "config": "zoo.yml",
+            "overrides": {**none, "policy_kwargs": {**TINY["policy_kwargs"], "share_encoder": True}},
+        },
+    }
+    for cell in load_grid(write_grid(tmp_path, kind=kind, budget=160, methods=methods)).cells:
+        folder = run_cell(cell, tmp_path)
+        last = read_rows(folder / "eval.csv")[-1]
+        assert last["return_mean"] > 0 and last["task_srl_error"] == "" == last["curious_return_mean"]
+        if kind == "visitation":
+            heads = {(row["actor"], row["head"]) for row in read_rows(folder / "visitation.csv")}
+            assert heads == {(actor, head) for actor in ("task", "random") for head in ("zero", "mean_image")}
+
+
+def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped just before ``DONE``, a cell is finished from its checkpoint, with the same rows."""
+    (cell,) = load_grid(write_grid(tmp_path)).cells
+    write = cells.write_text
+
+    def fail(path: Path, text: str) -> None:
+        if path.name == "DONE":
+            raise OSError("the disk went")
+        write(path, text)
+
+    monkeypatch.setattr(cells, "write_text", fail)
+    with pytest.raises(OSError, match="the disk went"):
+        run_cell(cell, tmp_path, 0, pictures=False)
+    monkeypatch.setattr(cells, "write_text", write)
+    before = (tmp_path / cell.folder / "eval.csv").read_text()
+    run_cell(cell, tmp_path, 0, pictures=False)
+    assert (tmp_path / cell.folder / "DONE").exists() and not (tmp_path / cell.folder / "checkpoint").exists()
+    rows = [line.split(",")[:3] for line in before.splitlines()]
+    after = [line.split(",")[:3] for line in (tmp_path / cell.folder / "eval.csv").read_text().splitlines()]
+    assert after == rows
+
+
+def test_training_after_a_pretraining_that_was_stopped_at_its_end_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checkpoint of pretraining's last step is followed by all of the training."""
+    method = {
+        "config": "zoo.yml",
+        "overrides": {"curiosity": None},
+        "pretrain": {"collector": "curious", "budget": 160},
+    }
+    (cell,) = load_grid(write_grid(tmp_path, budget=160, methods={"p": method})).cells
+    end = CuReSAC._end_pretraining
+
+    def keep_then_fail(self: CuReSAC) -> None:
+        if self._collector is not None:
+            raise RuntimeError("the power went")
+
+    # `pretrain` calls it last, after the callback has kept what there is of the last step but one.
+    monkeypatch.setattr(CuReSAC, "_end_pretraining", keep_then_fail)
+    with pytest.raises(RuntimeError, match="the power went"):
+        run_cell(cell, tmp_path, 0, pictures=False)
+    monkeypatch.setattr(CuReSAC, "_end_pretraining", end)
+    folder = run_cell(cell, tmp_path, 0, pictures=False)
+    assert steps_of(folder / "eval.csv") == [0, 160]
+    assert CuReSAC.load(folder / "model.zip").num_timesteps == 40
+
+
+def test_a_damaged_checkpoint_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """The cell begins anew rather than failing for ever, and says why."""
+    (cell,) = load_grid(write_grid(tmp_path, budget=160)).cells
+    write = cells.write_text
+    monkeypatch.setattr(cells, "write_text", lambda path, text: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_cell(cell, tmp_path, 0, pictures=False)
+    monkeypatch.setattr(cells, "write_text", write)
+    (newest,) = (tmp_path / cell.folder / "checkpoint").iterdir()
+    (newest / "model.zip").write_bytes((newest / "model.zip").read_bytes()[:1000])
+    folder = run_cell(cell, tmp_path, 10, pictures=False)
+    assert "cannot be read" in capsys.readouterr().out
+    assert steps_of(folder / "eval.csv") == [0, 160] and (folder / "DONE").exists()
 
 
 def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -372,6 +466,11 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
         for actor in actors:
             assert visits[f"{actor}_states"].shape == (125, 4) and visits[f"{actor}_errors"].shape == (125,)
             assert visits[f"{actor}_errors"].mean() == pytest.approx(error[actor, "own"], rel=1e-4)
+    # A choice of cells changes nothing about the common heads: they are the experiment's.
+    written = {path: path.read_bytes() for path in (tmp_path / "out").rglob("visitation.csv")}
+    few = load_grid(tmp_path / "grid.yml", methods=["cure"], seeds=[1])
+    assert run.run_grid(few, tmp_path / "out", pictures=False) == []
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("visitation.csv")} == written
     # The arms of a seed are measured on the same random episodes, another seed on others.
     returns = [
         {
@@ -415,7 +514,7 @@ def launch(path: Path, out: Path, *options: str) -> subprocess.Popen:
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, text=True)
 
 
-def wait_for(what: Any, seconds: float = 120) -> Any:
+def wait_for(what: Any, seconds: float = 400) -> Any:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if found := what():
@@ -431,13 +530,13 @@ def test_a_killed_grid_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     )
     out = tmp_path / "out"
     folder = out / "tiny" / "cartpole-swingup" / "cure" / "seed0"
-    process = launch(path, out)
+    process = launch(path, out, "--checkpoint-minutes", "0.02")
     wait_for(lambda: (folder / "checkpoint" / "1").exists())
     process.send_signal(signal.SIGKILL)
     process.wait()
     generations = [int(each.name) for each in (folder / "checkpoint").iterdir() if each.name.isdigit()]
     kept = json.loads((folder / "checkpoint" / str(max(generations)) / "state.json").read_text())
-    assert kept["agent_steps"] * 8 >= 1600 and not (folder / "DONE").exists()
+    assert kept["agent_steps"] > 0 and not (folder / "DONE").exists()
     process = launch(path, out)
     assert process.wait(timeout=300) == 0
     assert steps_of(folder / "eval.csv") == [0, 800, 1600, 2400, 3200, 4000]
@@ -452,10 +551,10 @@ def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
         evaluation=dict(every=400, episodes=1),
     )  # fmt: skip
     out = tmp_path / "out"
-    cells = [out / cell.folder for cell in load_grid(path).cells]
-    process = launch(path, out, "--engine", "ray", "--cpus-per-cell", "1")
+    folders = [out / cell.folder for cell in load_grid(path).cells]
+    process = launch(path, out, "--engine", "ray", "--checkpoint-minutes", "0.02")
     try:
-        victim = wait_for(lambda: next((cell for cell in cells if (cell / "checkpoint" / "1").exists()), None))
+        victim = wait_for(lambda: next((cell for cell in folders if (cell / "checkpoint" / "1").exists()), None))
         holders = [
             child
             for child in psutil.Process(process.pid).children(recursive=True)
@@ -466,7 +565,7 @@ def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
         assert process.wait(timeout=400) == 0
     finally:
         process.kill()
-    for cell in cells:
+    for cell in folders:
         assert (cell / "DONE").exists()
         assert steps_of(cell / "eval.csv") == [0, 400, 800, 1200, 1600, 2000, 2400]
         with (cell / "episodes.csv").open() as file:

@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -27,6 +28,8 @@ from sb3_cure.experiments.visitation import measure_visits
 EVAL_SEED = 10_000
 #: The file that tells that a cell is finished
 DONE = "DONE"
+#: The file that tells why a cell failed, until it is begun again
+ERROR = "error.txt"
 _PROGRESS_SECONDS = 2.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
@@ -44,18 +47,40 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
 
     :param cell: What to run
     :param results: Folder of all results
-    :param checkpoint_minutes: A checkpoint is kept after every evaluation, and when so many minutes have passed
+    :param checkpoint_minutes: Minutes between two checkpoints: at most so much is lost by an interruption
     :param pictures: Whether to draw and to film as well
     :return: The cell's folder
-    :raises GridError: if the folder holds the same cell with other settings, or another process is running it
+    :raises GridError: if the folder holds the same cell with other settings
+    :raises CellIsRunning: if another process is running it
     """
     folder = Path(results) / cell.folder
+    check_settings(cell, results)
     folder.mkdir(parents=True, exist_ok=True)
     with _alone_in(folder):
         if not (folder / DONE).exists():
+            (folder / ERROR).unlink(missing_ok=True)
             _keep_config(cell, folder)
             _CellRun(cell, folder, checkpoint_minutes, pictures).finish()
+        shutil.rmtree(folder / "checkpoint", ignore_errors=True)
     return folder
+
+
+def check_settings(cell: Cell, results: str | Path) -> None:
+    """
+    :param cell: A cell that is to be run, or that has been run
+    :param results: Folder of all results
+    :raises GridError: if its folder holds results of other settings
+    """
+    path = Path(results) / cell.folder / "config.json"
+    if not path.exists():
+        return
+    begun, now = json.loads(path.read_text()), _plain(cell.config())
+    for key in now:
+        if begun.get(key) != now[key]:
+            raise GridError(
+                f"{path.parent} was run with other settings: {key} is {begun.get(key)!r} there and {now[key]!r} now. "
+                "Choose another --out, or remove that folder."
+            )
 
 
 class _CellRun:
@@ -68,11 +93,11 @@ class _CellRun:
         self.eval_env = gym.make(cell.task, **cell.env_kwargs)
         self.action_repeat = action_repeat_of(self.eval_env)
         # Tells whether the task's reward has been seen, and how long everything took in all attempts.
-        self.state: dict[str, Any] = {"phase": "pretrain" if cell.pretrain else "train", "seconds": 0.0, "attempts": 0}
+        self.state: dict[str, Any] = {"phase": "pretrain" if cell.pretrain else "train", "seconds": 0.0, "attempts": []}
         self.evaluations: list[Row] = []
         self.episodes: list[Row] = []
         self.model = self._restore() or self._begin()
-        self.state["attempts"] += 1
+        self.state["attempts"].append({"started": _now(), **describe_run(), "device": str(self.model.device)})
         self._resumed_at = time.monotonic()
         self._reported_at = self._kept_at = -np.inf
 
@@ -91,12 +116,23 @@ class _CellRun:
     # ------------------------------------------------------------------ phases
 
     def finish(self) -> None:
+        try:
+            self._train()
+            self._keep_results()
+        finally:
+            self.eval_env.close()
+            if self.model.env is not None:
+                self.model.env.close()
+
+    def _train(self) -> None:
         cell, pretrain = self.cell, self.cell.pretrain
         if self.state["phase"] == "pretrain" and pretrain is not None:
             left = self.agent_steps(pretrain.budget) - self.model.num_timesteps
             if left > 0:
                 fresh = self.model.num_timesteps == 0
                 self.model.pretrain(left, pretrain.collector, callback=_Watch(self), reset_num_timesteps=fresh)
+            # Also where the checkpoint was the last step's: then nothing was left for `pretrain` to end.
+            self.model._end_pretraining()
             self.state["phase"] = "train"
             self.keep()
         left = self.agent_steps(cell.budget) - self.model.num_timesteps
@@ -104,6 +140,9 @@ class _CellRun:
             fresh = self.model.num_timesteps == 0
             drawing = watch_reconstructions(cell, self.action_repeat, self.folder) if self.pictures else []
             self.model.learn(left, callback=[_Watch(self), *drawing], reset_num_timesteps=fresh)
+
+    def _keep_results(self) -> None:
+        cell = self.cell
         # Not among the results until everything else is: the state from here on can be made anew.
         self.model.save(self.folder / "model.zip")
         if cell.kind == "visitation":
@@ -113,7 +152,6 @@ class _CellRun:
         self.write_tables()
         self._report(force=True)
         write_json(self.folder / "run.json", self._run_conditions())
-        shutil.rmtree(self.checkpoints, ignore_errors=True)
         write_text(self.folder / DONE, "")
 
     def _make_env(self) -> Any:
@@ -121,7 +159,6 @@ class _CellRun:
         return make_vec_env(lambda: gym.make(self.cell.task, **self.cell.env_kwargs), n_envs=self.cell.n_envs)
 
     def _begin(self) -> CuReSAC:
-        self.state["started"] = _now()
         return CuReSAC(env=self._make_env(), seed=self.cell.seed, **self.cell.build_arguments())
 
     # -------------------------------------------------------------- evaluation
@@ -144,7 +181,7 @@ class _CellRun:
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
-            if self.model.policy.srl is not None:
+            if getattr(self.model.policy, "srl", None) is not None:
                 row[f"{actor}_srl_error"] = float(np.concatenate(errors).mean())
         self.evaluations.append(row)
 
@@ -176,6 +213,8 @@ class _CellRun:
         write_json(unfinished / "state.json", state)
         write_csv(unfinished / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(unfinished / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
+        for path in (*unfinished.iterdir(), unfinished):
+            _flush_to_disk(path)
         older = self._generations()
         unfinished.rename(self.checkpoints / str(older[-1] + 1 if older else 0))
         for number in older:
@@ -188,16 +227,22 @@ class _CellRun:
         return time.monotonic() - since > self.checkpoint_seconds
 
     def _restore(self) -> CuReSAC | None:
-        """The newest checkpoint, or None."""
-        generations = self._generations()
-        if not generations:
-            return None
-        newest = self.checkpoints / str(generations[-1])
+        """The newest checkpoint that can be read, or None."""
+        for number in reversed(self._generations()):
+            try:
+                return self._load(self.checkpoints / str(number))
+            except Exception as error:
+                print(f"The checkpoint {self.checkpoints / str(number)} cannot be read ({error}) and is left out.")
+        return None
+
+    def _load(self, newest: Path) -> CuReSAC:
         model = CuReSAC.load(newest / "model.zip", env=self._make_env())
         model.load_replay_buffer(newest / "replay_buffer.pkl")
         self.state = json.loads((newest / "state.json").read_text())
         self.evaluations = read_rows(newest / "eval.csv")
         self.episodes = read_rows(newest / "episodes.csv")
+        # Loading starts all random streams from the cell's seed: without this each attempt would repeat the first's.
+        model.set_random_seed(self.cell.seed + 1000 * len(self.state["attempts"]))
         return model
 
     def _generations(self) -> list[int]:
@@ -229,14 +274,17 @@ class _CellRun:
         self._report()
 
     def _run_conditions(self) -> dict[str, Any]:
+        attempts = self.state["attempts"]
         return {
             **describe_run(),
             "device": str(self.model.device),
             "precision": getattr(self.model, "_computed_precision", "fp32"),
-            "started": self.state["started"],
+            "started": attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
-            "attempts": self.state["attempts"],
+            "attempts": len(attempts),
+            # Where it was interrupted: what each attempt ran on
+            **({"history": attempts} if len(attempts) > 1 else {}),
         }
 
 
@@ -271,7 +319,7 @@ class _Watch(BaseCallback):
             run.evaluations[-1]["seconds"] = round(run.seconds, 1)
             self._losses.clear()
             run.write_tables()
-        if (evaluates and self.num_timesteps > 0) or run.is_checkpoint_due():
+        if run.is_checkpoint_due():
             run.keep()
 
 
@@ -283,33 +331,42 @@ def action_repeat_of(env: gym.Env) -> int:
     return int(env.get_wrapper_attr("action_repeat")) if env.has_wrapper_attr("action_repeat") else 1
 
 
+class CellIsRunning(GridError):
+    """Another process is at this cell."""
+
+
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
     """The lock goes with the process, however that ends."""
     with (folder / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise GridError(
+        except BlockingIOError:
+            raise CellIsRunning(
                 f"{folder} is being run by another process: wait for it, or choose another --out."
             ) from None
+        except OSError as error:
+            print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this cell.")
         yield
 
 
 def _keep_config(cell: Cell, folder: Path) -> None:
     env = gym.make(cell.task, **cell.env_kwargs)
-    config = json.loads(json.dumps({**cell.config(), "action_repeat": action_repeat_of(env)}, default=repr))
+    write_json(folder / "config.json", {**_plain(cell.config()), "action_repeat": action_repeat_of(env)})
     env.close()
-    path = folder / "config.json"
-    if path.exists():
-        begun = json.loads(path.read_text())
-        different = sorted(key for key in {*begun, *config} if begun.get(key) != config.get(key))
-        if different:
-            raise GridError(
-                f"{folder} was begun with other settings: {different[0]} is {begun.get(different[0])!r} there and "
-                f"{config.get(different[0])!r} now. Choose another --out, or remove that folder."
-            )
-    write_json(path, config)
+
+
+def _plain(config: dict[str, Any]) -> dict[str, Any]:
+    """As it comes back from a file."""
+    return json.loads(json.dumps(config, default=repr))
+
+
+def _flush_to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _now() -> str:

@@ -6,15 +6,17 @@ import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import stable_baselines3
 import torch as th
 
 import sb3_cure
 
 Row = dict[str, Any]
+#: What decides what is computed: algorithms, physics, pixels
+_DEPENDENCIES = ("stable_baselines3", "torch", "numpy", "gymnasium", "shimmy", "dm_control", "mujoco")
 
 
 def describe_run() -> dict[str, Any]:
@@ -24,14 +26,24 @@ def describe_run() -> dict[str, Any]:
     threads = th.get_num_threads()
     return {
         "versions": {
-            "sb3_cure": sb3_cure.__version__,
-            "stable_baselines3": stable_baselines3.__version__,
-            "torch": th.__version__,
             "python": platform.python_version(),
+            "sb3_cure": sb3_cure.__version__,
+            **{name: version(name) for name in _DEPENDENCIES},
         },
-        "machine": f"{platform.machine()}, {threads} threads, {th.backends.cpu.get_cpu_capability()}",
+        "machine": f"{_processor()}, {threads} threads, {th.backends.cpu.get_cpu_capability()}",
+        "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "commit": _commit(),
     }
+
+
+def _processor() -> str:
+    """Its model where Linux tells, else its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def _commit() -> str | None:
@@ -64,13 +76,18 @@ def _number(text: str) -> Any:
     return text
 
 
+def _beside(path: Path) -> Path:
+    """Another name for each process and machine: several may write the same file."""
+    return path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}")
+
+
 def write_text(path: Path, text: str) -> None:
     """All of it or nothing: written beside, then renamed.
 
     :param path: File to write
     :param text: Its content
     """
-    beside = path.with_name(f".{path.name}.new")
+    beside = _beside(path)
     with beside.open("w") as file:
         file.write(text)
         file.flush()
@@ -93,7 +110,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
     :param rows: Mappings that have all columns
     """
     lines = [columns, *([row[column] for column in columns] for row in rows)]
-    beside = path.with_name(f".{path.name}.new")
+    beside = _beside(path)
     with beside.open("w", newline="") as file:
         csv.writer(file).writerows(lines)
     beside.replace(path)

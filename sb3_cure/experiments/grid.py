@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import math
 import pkgutil
 import re
 from collections.abc import Sequence
@@ -98,7 +99,8 @@ class Grid:
     :param experiment: Its name, the folder of its results
     :param kind: One of ``KINDS``
     :param baseline: The arm with which the others are compared
-    :param cells: Seed by seed, so that whole comparisons are finished early
+    :param cells: What was chosen, seed by seed, so that whole comparisons are finished early
+    :param complete: All that the file (or an earlier choice of seeds) makes of it
     :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
     """
 
@@ -106,6 +108,7 @@ class Grid:
     kind: str
     baseline: str
     cells: tuple[Cell, ...]
+    complete: tuple[Cell, ...]
     description: dict[str, Any]
 
 
@@ -160,10 +163,11 @@ def load_grid(
 
     resolved = {
         (task, arm): _resolve(path, task, arm, _mapping(f"methods.{arm}", arms[arm], path))
-        for task in chosen_tasks
-        for arm in chosen_arms
+        for task in dict.fromkeys(all_tasks.values())
+        for arm in arms
     }
-    cells = tuple(
+    every_seed = sorted({*all_seeds, *chosen_seeds})
+    complete = tuple(
         Cell(
             experiment=content["experiment"],
             kind=content["kind"],
@@ -175,21 +179,26 @@ def load_grid(
             budget=budget if resolved[task, arm]["train"] else 0,
             **{key: value for key, value in resolved[task, arm].items() if key != "train"},
         )
-        for seed in chosen_seeds
-        for task in chosen_tasks
-        for arm in chosen_arms
+        for seed in every_seed
+        for task in dict.fromkeys(all_tasks.values())
+        for arm in arms
+    )
+    cells = tuple(
+        cell
+        for cell in complete
+        if cell.seed in chosen_seeds and cell.task in chosen_tasks and cell.method in chosen_arms
     )
     description = {
         "experiment": content["experiment"],
         "kind": content["kind"],
         "budget": budget,
-        "seeds": sorted({*all_seeds, *chosen_seeds}),
+        "seeds": every_seed,
         "tasks": list(dict.fromkeys(all_tasks.values())),
         "methods": arms,
         "baseline": baseline,
         "evaluation": {"every": every, "episodes": episodes},
     }
-    return Grid(content["experiment"], content["kind"], baseline, cells, description)
+    return Grid(content["experiment"], content["kind"], baseline, cells, complete, description)
 
 
 def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[str, Any]:
@@ -276,7 +285,8 @@ def _check_name(key: str, value: Any, path: Path) -> None:
 
 
 def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or value < least:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not math.isfinite(value) or value != int(value) or value < least:
         raise GridError(f"{key} in {path} is {value!r}, but it must be a whole number, {least} or more: change it.")
     return int(value)
 
@@ -294,7 +304,7 @@ def _tasks(value: Any, path: Path) -> dict[str, str]:
     if not isinstance(value, list) or not value:
         raise GridError(f"tasks in {path} is {value!r}, but it must be a list of Gymnasium ids: write some.")
     for task in value:
-        if task not in gym.registry:
+        if not isinstance(task, str) or task not in gym.registry:
             raise GridError(
                 f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
                 "dmc_pixels/<domain>-<task>-v0)."

@@ -17,14 +17,12 @@ from rich.live import Live
 from rich.table import Table
 
 from sb3_cure.allocator import tune_allocator
-from sb3_cure.experiments.cells import DONE, run_cell
+from sb3_cure.experiments.cells import DONE, ERROR, CellIsRunning, check_settings, run_cell
 from sb3_cure.experiments.files import write_json, write_text
 from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
 from sb3_cure.experiments.visitation import measure_common_heads
 
 ENGINES = ("local", "ray")
-#: The file that tells why a cell failed; gone when it succeeds
-ERROR = "error.txt"
 
 
 def run_grid(
@@ -53,6 +51,9 @@ def run_grid(
     :return: The cells that failed; each has its traceback in ``error.txt``
     """
     results = Path(results).resolve()
+    # Before anything is written: finished cells too, as they are to be compared with those that are run now.
+    for cell in grid.complete:
+        check_settings(cell, results)
     _keep_grid(grid, results / grid.experiment)
     left = [cell for cell in grid.cells if not (results / cell.folder / DONE).exists()]
     with _live_progress(grid.cells, results):
@@ -69,15 +70,21 @@ def run_grid(
 
 def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
     """Whether the cell could be run; a failure must not stop the others."""
-    error = results / cell.folder / ERROR
+    tune_allocator()
     try:
         run_cell(cell, results, checkpoint_minutes, pictures)
+    except CellIsRunning as elsewhere:
+        print(elsewhere)
     except Exception:
-        error.parent.mkdir(parents=True, exist_ok=True)
-        write_text(error, traceback.format_exc())
+        _keep_error(cell, results, traceback.format_exc())
         return False
-    error.unlink(missing_ok=True)
     return True
+
+
+def _keep_error(cell: Cell, results: Path, text: str) -> None:
+    path = results / cell.folder / ERROR
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, text)
 
 
 def _run_with_ray(
@@ -88,9 +95,17 @@ def _run_with_ray(
     except ImportError:
         raise GridError('engine="ray" needs Ray, which is not installed: pip install "sb3-cure[cluster]".') from None
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
-    ray.init(address=address, log_to_driver=False, **own)
     try:
-        run = ray.remote(**resources)(_run_and_tell)
+        ray.init(address=address or "local", **own)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise GridError(
+            f"--address is {address!r}, but no Ray cluster answers there ({error}): start one (ray start --head), or "
+            "leave --address out for this machine alone."
+        ) from None
+    try:
+        _check_resources(ray.nodes(), resources)
+        # A process per cell: what one leaves behind does not burden the next.
+        run = ray.remote(max_calls=1, **resources)(_run_and_tell)
         pending = {run.remote(cell, *settings): cell for cell in cells}
         failed = []
         while pending:
@@ -100,7 +115,11 @@ def _run_with_ray(
                     succeeded = ray.get(reference)
                 except ray.exceptions.RayError as error:
                     # The worker has died more often than `retries`: nobody else could have told.
-                    write_text(settings[0] / cell.folder / ERROR, f"{error}\n")
+                    _keep_error(cell, settings[0], f"{error}\n")
+                    succeeded = False
+                if succeeded and not (settings[0] / cell.folder).exists():
+                    sentence = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
+                    _keep_error(cell, settings[0], f"{sentence}\n")
                     succeeded = False
                 if not succeeded:
                     failed.append(cell)
@@ -109,12 +128,28 @@ def _run_with_ray(
         ray.shutdown()
 
 
+def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
+    """A cell that fits on no machine would wait for ever."""
+    wanted = {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"]}
+    for kind, amount in wanted.items():
+        largest = max((node["Resources"].get(kind, 0) for node in nodes if node["Alive"]), default=0)
+        if amount > largest:
+            raise GridError(
+                f"--{kind.lower()}s-per-cell is {amount:g}, but no machine of this Ray cluster has more than "
+                f"{largest:g}: ask for less."
+            )
+
+
 def _keep_grid(grid: Grid, folder: Path) -> None:
     """Write ``grid.json``; what an earlier call ran besides stays part of the experiment."""
     path = folder / "grid.json"
     description = dict(grid.description)
     if path.exists():
-        before = json.loads(path.read_text())
+        try:
+            before = json.loads(path.read_text())
+            before["seeds"], before["tasks"], before["methods"], before["kind"]
+        except (ValueError, KeyError, TypeError):
+            raise GridError(f"{path} is damaged: remove it; the next call writes it anew.") from None
         description["seeds"] = sorted({*before["seeds"], *description["seeds"]})
         description["tasks"] = list(dict.fromkeys([*before["tasks"], *description["tasks"]]))
         description["methods"] = {**before["methods"], **description["methods"]}
@@ -134,23 +169,41 @@ def _keep_grid(grid: Grid, folder: Path) -> None:
 def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
     """Show how far all cells are, as their files tell, whichever process or machine runs them."""
     console = Console()
+    watches = console.is_terminal or console.is_jupyter
     stopped = threading.Event()
 
     def refresh(show: Callable[[Table], object]) -> None:
+        told = _finished(cells, results)
         while not stopped.wait(1.0):
-            show(progress_table(cells, results))
+            if watches:
+                show(progress_table(cells, results))
+            else:  # in the log of a job
+                told = _tell_finished(cells, results, told)
 
     with _shown(console, progress_table(cells, results)) as show:
         thread = threading.Thread(target=refresh, args=(show,), daemon=True)
-        if console.is_terminal or console.is_jupyter:
-            thread.start()
+        thread.start()
         try:
             yield
         finally:
             stopped.set()
-            if thread.is_alive():
-                thread.join()
+            thread.join()
             show(progress_table(cells, results))
+
+
+def _finished(cells: Sequence[Cell], results: Path) -> dict[Path, str]:
+    states = {cell.folder: read_progress(cell, results)[0] for cell in cells}
+    return {folder: state for folder, state in states.items() if state in ("done", "failed")}
+
+
+def _tell_finished(cells: Sequence[Cell], results: Path, told: dict[Path, str]) -> dict[Path, str]:
+    """Print what has been finished since; returns what has been told."""
+    finished = _finished(cells, results)
+    for folder, state in finished.items():
+        if told.get(folder) != state:
+            done = sum(each == "done" for each in finished.values())
+            print(f"{folder} {state}; {done} of {len(cells)} cells done", flush=True)
+    return finished
 
 
 @contextmanager
@@ -240,12 +293,17 @@ def _seed_choice(text: str) -> int | list[int]:
     try:
         numbers = [int(part) for part in text.split(",") if part]
     except ValueError:
+        numbers = []
+    if not numbers:
         raise argparse.ArgumentTypeError(f"{text!r} names no seeds: write how many (5), or which (0,3,4)") from None
     return numbers if "," in text else numbers[0]
 
 
 def _names(text: str) -> list[str]:
-    return [name for name in text.split(",") if name]
+    names = [name for name in text.split(",") if name]
+    if not names:
+        raise argparse.ArgumentTypeError(f"{text!r} names nothing: write for example a,b")
+    return names
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -283,9 +341,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for cell in grid.cells:
                 print(f"{cell.folder}: {read_progress(cell, options.out)[0]}")
             return 0
-        if options.engine == "local" and (options.address or options.gpus_per_cell):
-            raise GridError("--address and --gpus-per-cell are of Ray: add --engine ray.")
-        tune_allocator()
+        of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
+        given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
+        if options.engine == "local" and given:
+            raise GridError(f"--{given[0].replace('_', '-')} is of Ray: add --engine ray.")
+        if options.out.exists() and not options.out.is_dir():
+            raise GridError(f"--out is {options.out}, which is a file: give a folder.")
         failed = run_grid(
             grid,
             options.out,
@@ -309,7 +370,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _failures(failed: Iterable[Cell], results: Path) -> Iterator[str]:
     for cell in failed:
-        path = results / cell.folder / ERROR
+        path = Path(results) / cell.folder / ERROR
         yield f"{cell.folder} failed: {path.read_text().strip().splitlines()[-1]} ({path})"
 
 

@@ -4,6 +4,7 @@ A policy's own head is one yardstick, but heads differ from run to run. Common h
 the policies of *other* seeds saw, and judge all policies of a seed alike.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state_names
 from sb3_cure.evaluation import Episode, even_negatives, run_episodes, srl_errors, trained_actors
-from sb3_cure.experiments.files import Row, read_rows, write_csv
-from sb3_cure.experiments.grid import Cell, Grid
+from sb3_cure.experiments.files import Row, read_rows, write_csv, write_json
+from sb3_cure.experiments.grid import Cell, Grid, short_name
 from sb3_cure.srl import RAE
 
 #: Plus the cell's seed: the arms of a seed start from the same states, another seed from others
@@ -39,7 +40,7 @@ def visiting_actors(model: CuReSAC, cell: Cell) -> list[str]:
 
 
 def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
-    """Roll out each policy and write ``visitation.csv`` and ``visits.npz``.
+    """Roll out each policy, as it acts in training, and write ``visitation.csv`` and ``visits.npz``.
 
     Errors are those of the model's own head, and of two predictions that know nothing: ``zero``, the middle grey,
     and ``mean_image``, the mean of everything that the policies saw in these episodes.
@@ -56,9 +57,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
         arrays["state_names"] = np.array(physics_state_names(env))
     episodes = {}
     for actor in visiting_actors(model, cell):
-        episodes[actor] = list(
-            run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED + cell.seed, states=has_physics)
-        )
+        episodes[actor] = _roll_out(model, cell, env, actor, has_physics)
         arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in episodes[actor]]).astype(np.float32)
         if has_physics:
             states = np.concatenate([each.states for each in episodes[actor]])
@@ -69,7 +68,8 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
         for number, each in enumerate(seen):
             constant = {"zero": np.zeros_like(mean_image), "mean_image": mean_image}
             errors = {head: constant_errors(model, each.observations, image) for head, image in constant.items()}
-            for head, values in {"own": each.srl_errors, **errors}.items():
+            own = {"own": each.srl_errors} if len(each.srl_errors) else {}  # none without a head
+            for head, values in {**own, **errors}.items():
                 rows.append(_row(actor, head, number, values, each))
     env.close()
     np.savez_compressed(folder / "visits.npz", **arrays)  # type: ignore[arg-type]
@@ -77,10 +77,11 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
 
 
 def measure_common_heads(grid: Grid, results: Path) -> list[str]:
-    """Fit common heads and add their rows to the ``visitation.csv`` of all finished cells that have none yet.
+    """Fit common heads and add their rows to the ``visitation.csv`` of all seeds whose arms are all finished.
 
     For each task and seed an autoencoder is fitted to an even mix of what the random, task and curious policies of
-    the other seeds saw. Policies are rolled out anew from each cell's ``model.zip``: the same episodes as before.
+    the other seeds saw, whichever cells this call of the grid has chosen. Policies are rolled out anew from each cell's
+    ``model.zip``: the same episodes as before. Done again only when more seeds are finished.
 
     :param grid: The grid, of kind ``"visitation"``
     :param results: Folder of all results
@@ -88,20 +89,24 @@ def measure_common_heads(grid: Grid, results: Path) -> list[str]:
     """
     left_out = []
     for task in dict.fromkeys(cell.task for cell in grid.cells):
-        cells = [cell for cell in grid.cells if cell.task == task and _is_measurable(cell, results)]
-        seeds = sorted({cell.seed for cell in cells})
+        of_task = [cell for cell in grid.complete if cell.task == task]
+        unfinished = {cell.seed for cell in of_task if not _is_measurable(cell, results)}
+        seeds = sorted({cell.seed for cell in of_task} - unfinished)
         if len(seeds) < 2:
-            left_out.append(f"{task}: a common head needs finished cells of two seeds, with their model.zip")
+            left_out.append(f"{task}: they need two seeds of which all methods are finished, with their model.zip")
             continue
-        if all(_has_common_rows(results / cell.folder) for cell in cells):
+        record = results / grid.experiment / short_name(task) / "common_heads.json"
+        if record.exists() and json.loads(record.read_text())["seeds"] == seeds:
             continue
-        mixes = {seed: _mix([cell for cell in cells if cell.seed == seed], results) for seed in seeds}
+        cells = {seed: [cell for cell in of_task if cell.seed == seed] for seed in seeds}
+        mixes = {seed: _mix(cells[seed], results) for seed in seeds}
         for seed in seeds:
+            print(f"{task}: a common head for seed {seed}, of what the policies of the other seeds saw", flush=True)
             others = np.concatenate([mixes[other] for other in seeds if other != seed])
-            own = [cell for cell in cells if cell.seed == seed]
-            judge = _fit_common_head(own[0], others)
-            for cell in own:
+            judge = _fit_common_head(cells[seed][0], others)
+            for cell in cells[seed]:
                 _add_common_rows(judge, cell, results)
+        write_json(record, {"seeds": seeds, "updates": COMMON_UPDATES, "observations_per_policy": COMMON_SHARE})
     return left_out
 
 
@@ -110,8 +115,12 @@ def _is_measurable(cell: Cell, results: Path) -> bool:
     return (folder / "DONE").exists() and (folder / "model.zip").exists()
 
 
-def _has_common_rows(folder: Path) -> bool:
-    return any(row["head"] == "common" for row in read_rows(folder / "visitation.csv"))
+def _roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool = False) -> list[Episode]:
+    """Episodes of a policy as it acts in training, with sampled actions; always the same ones."""
+    seed = VISIT_SEED + cell.seed
+    with th.random.fork_rng():
+        th.manual_seed(seed)
+        return list(run_episodes(model, env, cell.eval_episodes, actor, deterministic=False, seed=seed, states=states))
 
 
 def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
@@ -119,7 +128,7 @@ def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
     model = CuReSAC.load(results / cell.folder / "model.zip", custom_objects={"buffer_size": 1})
     env = gym.make(cell.task, **cell.env_kwargs)
     for actor in visiting_actors(model, cell):
-        yield actor, list(run_episodes(model, env, cell.eval_episodes, actor, seed=VISIT_SEED + cell.seed))
+        yield actor, _roll_out(model, cell, env, actor)
     env.close()
 
 
@@ -202,7 +211,7 @@ def observation_batch(observations: np.ndarray, device: th.device) -> ReplayBuff
 
 def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
     """What an autoencoder is to draw of observations, float32 [n, ...], some at a time."""
-    head = model.policy.srl
+    head = getattr(model.policy, "srl", None)
     for start in range(0, len(observations), 128):
         images = th.as_tensor(observations[start : start + 128], device=model.device)
         if isinstance(head, RAE):
