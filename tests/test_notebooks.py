@@ -37,6 +37,15 @@ WARMUP_UPDATES = 10
 BATCH_SIZE = 8
 NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
 """,
+    "05_your_own_srl_head": """
+STEPS = 300
+EPISODES = 2
+""",
+    "06_your_own_camera_env": """
+STEPS = 60
+WARMUP = 40
+EPISODES = 1
+""",
 }
 
 
