@@ -88,6 +88,7 @@ def test_the_projects_grids_can_be_built(path: Path) -> None:
     grid = load_grid(path, seeds=1)
     assert grid.experiment == ("fast_" if path.parent.name == "fast" else "") + path.stem
     kwargs = {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2}}
+    assert grid.complete[: len(grid.cells)] == grid.cells
     for cell in {cell.method: cell for cell in grid.cells}.values():
         env_kwargs = {key: value for key, value in cell.env_kwargs.items() if key == "frame_stack"}
         size = cell.env_kwargs.get("image_size", 84)

@@ -193,7 +193,7 @@ def test_names_are_text_only(tmp_path: Path) -> None:
     page = (tmp_path / "out" / "page.html").read_text()
     assert "<img src=x" not in page and html.escape(HOSTILE) in page
     assert "reconstructions.png cannot be shown" in page and "policy.mp4 cannot be shown" in page
-    for path in (tmp_path / "out" / "summary.md", folder / "table.md"):
+    for path in (folder / "summary.md", folder / "table.md"):
         text = path.read_text()
         assert "<" not in text and not re.search(r"(?<!\\)\]\(b\)", text)
         lines = [line for line in text.splitlines() if line.startswith("|")]

@@ -323,3 +323,20 @@ def test_names_in_the_grid_cannot_leave_the_folder(results: Path) -> None:
     write_grid(results, methods={"../../secret": {}, "sac_ae": {}})
     with pytest.raises(ResultsError, match="cannot be the name of a folder"):
         read_results(results)
+
+
+def test_other_pixels_are_not_judged_by_published_numbers(tmp_path: Path) -> None:
+    """The same curves in small grey images get neither a comparison nor a verdict; crops of 100 pixels do, for CURL."""
+    crops = {"srl": "curl", "srl_kwargs": {"augmentation": "crop"}}
+    for name, arguments, env_kwargs, compared in (
+        ("usual", {"srl": "rae"}, {"image_size": 84}, True),
+        ("small", {"srl": "rae"}, {"image_size": 36, "grayscale": True}, False),
+        ("fast", {"srl": "rae"}, {"renderer": "fast"}, False),
+        ("crops", crops, {"image_size": 100}, True),
+        ("whole", {"srl": "curl"}, {"image_size": 100}, False),
+    ):
+        folder = tmp_path / name
+        write_grid(folder)
+        write_cell(folder, TASK, "sac_ae", 0, curve(0, 50, 100), arguments=arguments, env_kwargs=env_kwargs)
+        (experiment,) = read_results(str(folder))
+        assert bool(statistics.compare_with_published([experiment])) == compared, name

@@ -31,7 +31,7 @@ THRESHOLDS = (250.0, 500.0, 750.0)
 PAIRS_UP_TO = 5
 #: Optional files of a cell: caption
 MEDIA = {
-    "policy.mp4": "the task policy, with its SRL error",
+    "policy.mp4": "the policy that the caption names, with its SRL error",
     "reconstructions.png": "reconstructions over training",
     "uncomfortable.png": "what the agent finds uncomfortable: frames of the replay buffer with the highest SRL error",
     "curiosity_map.png": "SRL error and visits over the true state",
@@ -168,7 +168,7 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
             ]
             for task in dict.fromkeys(row.task for row in judged)
         }
-        lines = {task: _yardsticks(task, errors) for task in bars}
+        lines = {task: _yardsticks(experiment, task, errors) for task in bars}
         caption = (
             f"SRL error per step under the {head} head, by policy: mean, with minimum and maximum as error bars. "
             "Lines: the mean error of always predicting zero, or the mean image, and the paper's value for curiosity."
@@ -179,13 +179,13 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
     return list(_visitation_headlines(experiment, coverage, errors)), parts
 
 
-def _yardsticks(task: str, errors: Sequence[statistics.ErrorSummary]) -> dict[str, float]:
+def _yardsticks(experiment: Experiment, task: str, errors: Sequence[statistics.ErrorSummary]) -> dict[str, float]:
     lines = {}
     for head, label in (("zero", "always zero"), ("mean_image", "mean image")):
         values = [row.error_mean for row in errors if (row.task, row.head) == (task, head)]
         if values:
             lines[label] = float(np.mean(values))
-    theirs = published.SRL_ERROR.get(published.task_key(task))
+    theirs = published.SRL_ERROR.get(published.task_key(task)) if experiment.sees_published_pixels else None
     return {**lines, "paper's cure": theirs["curious"].mean} if theirs else lines
 
 
@@ -503,7 +503,7 @@ def write_report(
     title = markdown_text(results.resolve().name)
     summary = [f"# {title}\n", *(render_markdown(section, level=2) for section in sections)]
     summary += [table.markdown() + "\n"] if table else []
-    files[out.with_name("summary.md")] = "\n".join(summary).encode()
+    files[results / "summary.md"] = "\n".join(summary).encode()
     for section in sections:
         files[section.experiment.folder / "table.md"] = render_markdown(section, plots_beside=True).encode()
         for part in section.parts:

@@ -83,6 +83,14 @@ class CellResult:
     def done(self) -> bool:
         return self.status == DONE
 
+    @property
+    def sees_published_pixels(self) -> bool:
+        """Whether its images are those of the published results: only then numbers compare."""
+        arguments = self.config.get("arguments", {})
+        crops = arguments.get("srl_kwargs", {}).get("augmentation") == "crop"
+        usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
+        return {**usual, **self.config.get("env_kwargs", {})} == usual
+
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """
         :param column: A column of ``eval.csv``
@@ -164,6 +172,11 @@ class Experiment:
             if (at, arm) == (task, method) and cell.done
         }
 
+    @property
+    def sees_published_pixels(self) -> bool:
+        """Whether all of its finished cells do, see ``CellResult``."""
+        return all(cell.sees_published_pixels for cell in self.cells.values() if cell.done)
+
     def state(self, task: str, method: str) -> dict[str, list[int]]:
         """
         :return: Seeds of an arm on a task by the status of their cells; those of the grid are "not run" at least
@@ -178,13 +191,14 @@ class Experiment:
 # Reading
 
 
-def read_results(folder: Path) -> list[Experiment]:
+def read_results(folder: str | Path) -> list[Experiment]:
     """Read everything that ``sb3-cure experiment`` wrote.
 
     :param folder: A folder of experiments, or the folder of one
     :return: The experiments, by name
     :raises ResultsError: with one sentence that names the folder or file and what is wrong with it
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise ResultsError(f"{folder} is no folder: give the one that `sb3-cure experiment` wrote.")
     grids = [folder / "grid.json"] if (folder / "grid.json").exists() else sorted(folder.glob("*/grid.json"))
@@ -428,14 +442,14 @@ class Estimate:
 
     @property
     def verdict(self) -> str:
-        """What a difference says: ``"better"``, ``"worse"``, ``"no difference"`` or ``"inconclusive"``."""
+        """What a difference says: ``"better"``, ``"worse"`` or ``"inconclusive"`` (as few equal pairs are, too)."""
         if self.low is None or self.high is None:
             return "one seed: no interval"
         if self.low > 0:
             return "better"
         if self.high < 0:
             return "worse"
-        return "no difference" if self.low == self.high == 0 else "inconclusive"
+        return "inconclusive (all pairs equal)" if self.low == self.high == 0 else "inconclusive"
 
 
 def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
@@ -925,7 +939,7 @@ class Comparison:
 def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison]:
     """
     :param experiments: Experiments; those about visitation have no returns to compare
-    :return: Every arm at every published step that its curves reach
+    :return: Every arm at every published step that its curves reach, of those that see the published pixels
     """
     rows = []
     for experiment in experiments:
@@ -935,7 +949,7 @@ def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison
                 if not cells or experiment.kind == "visitation" or cells[0].config.get("pretrain"):
                     continue
                 base, curious = published.published_method(cells[0].config.get("arguments", {}))
-                if base is None:
+                if base is None or not all(cell.sees_published_pixels for cell in cells):
                     continue
                 steps, stacked = stack_curves(cells)
                 for at, table in published.RETURNS[base].items():

@@ -274,8 +274,9 @@ def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSumm
     :return: SRL error by policy and head, beside the paper's
     """
     rows = []
+    compares = experiment.sees_published_pixels
     for row in summaries:
-        theirs = published.SRL_ERROR.get(published.task_key(row.task), {}).get(row.actor)
+        theirs = published.SRL_ERROR.get(published.task_key(row.task), {}).get(row.actor) if compares else None
         shown = NONE if theirs is None or row.head != "own" else " / ".join(f"{value:.4f}" for value in theirs)
         errors = [_error(value) for value in (row.error_min, row.error_mean, row.error_max)]
         head = row.head.replace("_", " ")
@@ -290,7 +291,7 @@ def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSumm
         f"an autoencoder's error is its excess over the dither floor already ({published.DITHER_FLOOR:.1e} of the "
         "training loss), and the ratio that of the excesses: over the random actor's under the same head, "
         "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
-        f"{published.PAPER}.",
+        f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}.",
     )
 
 
@@ -332,10 +333,11 @@ def pretraining_table(experiment: Experiment) -> Table:
     :return: Final returns beside the paper's
     """
     rows = []
+    compares = experiment.sees_published_pixels
     for task in experiment.tasks:
         for method in experiment.methods:
             finals = statistics.summarise_arm(experiment, task, method).finals
-            theirs = _papers_arm(method).get(published.task_key(task))
+            theirs = _papers_arm(method).get(published.task_key(task)) if compares else None
             difference = NONE
             if len(finals) and theirs is not None:
                 difference = number_text(float(finals.mean()) - theirs.mean)
@@ -346,7 +348,8 @@ def pretraining_table(experiment: Experiment) -> Table:
         ["task", "arm", ">seeds", ">ours", ">paper", ">difference"],
         rows,
         f"Paper: {published.PAPER}, Table I, after training of unstated length; ours after {experiment.budget:,} "
-        "environment steps, so that differences in level say little: compare the order of the arms.",
+        "environment steps, so that differences in level say little: compare the order of the arms."
+        + ("" if compares else " Not given: these cells see other pixels."),
     )
 
 
