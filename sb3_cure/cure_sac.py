@@ -201,6 +201,8 @@ class CuReSAC(SAC):
         env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
         if env is not None:
             check_action_space(env.action_space)
+        if kwargs.get("policy_kwargs") is not None:
+            kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,

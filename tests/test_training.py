@@ -702,3 +702,13 @@ def test_evaluating_both_policies() -> None:
             observation, *_ = env.step(predict(observation, deterministic=True)[0])
         ends.append(env.get_attr("position")[0].tolist())
     assert ends == [[-1, -1], [1, 1]]
+
+
+def test_the_users_policy_kwargs_stay_as_they_were() -> None:
+    """One dictionary of settings can serve several models and be written down afterwards."""
+    policy_kwargs = {"net_arch": [8], "share_encoder": True}
+    for extras in ({"srl": "rae"}, {"srl": None, "curiosity": None}):
+        before = dict(policy_kwargs)
+        CuReSAC("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs, buffer_size=10, device="cpu", **extras)
+        assert policy_kwargs == before
+        policy_kwargs.pop("share_encoder", None)
