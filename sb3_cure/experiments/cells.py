@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, 
 from sb3_cure.experiments.grid import Cell, GridError
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
+from sb3_cure.files import flush_to_disk
 
 #: Evaluations start from the same states in all cells
 EVAL_SEED = 10_000
@@ -214,7 +214,7 @@ class _CellRun:
         write_csv(unfinished / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(unfinished / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
         for path in (*unfinished.iterdir(), unfinished):
-            _flush_to_disk(path)
+            flush_to_disk(path)
         older = self._generations()
         unfinished.rename(self.checkpoints / str(older[-1] + 1 if older else 0))
         for number in older:
@@ -359,14 +359,6 @@ def _keep_config(cell: Cell, folder: Path) -> None:
 def _plain(config: dict[str, Any]) -> dict[str, Any]:
     """As it comes back from a file."""
     return json.loads(json.dumps(config, default=repr))
-
-
-def _flush_to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _now() -> str:

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -13,6 +12,7 @@ from typing import Any
 import torch as th
 
 import sb3_cure
+from sb3_cure.files import replacing
 
 Row = dict[str, Any]
 #: What decides what is computed: algorithms, physics, pixels
@@ -76,23 +76,14 @@ def _number(text: str) -> Any:
     return text
 
 
-def _beside(path: Path) -> Path:
-    """Another name for each process and machine: several may write the same file."""
-    return path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}")
-
-
 def write_text(path: Path, text: str) -> None:
     """All of it or nothing: written beside, then renamed.
 
     :param path: File to write
     :param text: Its content
     """
-    beside = _beside(path)
-    with beside.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    beside.replace(path)
+    with replacing(path) as beside:
+        beside.write_text(text)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -110,7 +101,5 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
     :param rows: Mappings that have all columns
     """
     lines = [columns, *([row[column] for column in columns] for row in rows)]
-    beside = _beside(path)
-    with beside.open("w", newline="") as file:
+    with replacing(path) as beside, beside.open("w", newline="") as file:
         csv.writer(file).writerows(lines)
-    beside.replace(path)
