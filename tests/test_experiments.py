@@ -37,7 +37,7 @@ DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale":
 def _pixel_box(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The tiny task under an id: 20 steps per episode, an action repeat of 4. Checkpoints do not wait for the disk."""
     gym.register(TASK, PixelBox)
-    monkeypatch.setattr(cells, "_flush_to_disk", lambda path: None)
+    monkeypatch.setattr(cells, "flush_to_disk", lambda path: None)
     yield
     del gym.registry[TASK]
 
