@@ -58,6 +58,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     # What `pos` and the frame counter index: only the used part of these is pickled.
     _ROW_ARRAYS = ("frame_slots", "oldest_frame", "actions", "rewards", "dones", "timeouts")
 
+    #: How often `reset` has begun the numbers of frames anew
+    n_resets = 0
     frames: npt.NDArray[np.uint8]  # [frame_capacity, c, height, width]
     frame_slots: npt.NDArray[np.int32]  # [buffer_size, n_envs, 2 (obs, next_obs), frame_stack], positions in `frames`
     oldest_frame: npt.NDArray[np.int64]  # [buffer_size], running number of the oldest frame that the row needs
@@ -137,6 +139,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         """Forget all transitions."""
         super().reset()
+        self.n_resets += 1
         self._n_valid = 0  # rows that can be sampled: the latest ones before `pos`
         self._n_frames = 0  # frames ever stored; frame number i lies at `frames[i % frame_capacity]`
         # Per environment, the running numbers of the frames of its last `next_obs`; -frame_capacity: none yet

@@ -16,6 +16,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.buffers import transitions
+from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
@@ -25,7 +26,8 @@ from sb3_cure.metrics import newest_frames
 class PeriodicCallback(BaseCallback):
     """Does something every so many agent steps: subclass it and implement ``on_period``.
 
-    The random streams of NumPy and PyTorch are set aside meanwhile: watching a training does not change it.
+    It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random streams of NumPy
+    and PyTorch are set aside meanwhile: watching a training does not change it.
 
     :param every: Agent steps between two calls (of all environments together)
     :param verbose: Verbosity level
@@ -43,8 +45,9 @@ class PeriodicCallback(BaseCallback):
         self._last_period = self.num_timesteps
 
     def _on_step(self) -> bool:
-        if self.num_timesteps - self._last_period >= self.every:
-            self._last_period = self.num_timesteps
+        due = self.num_timesteps // self.every > self._last_period // self.every
+        self._last_period = self.num_timesteps
+        if due:
             with _untouched_randomness(self.model.device):
                 self.on_period()
         return True

@@ -1,8 +1,11 @@
 """CuReSAC: SAC from pixels with state representation learning (SRL) and a policy that is curious about it."""
 
+import contextlib
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -28,6 +31,7 @@ from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
 from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.checkpoint import CheckpointWriter, Resumption, WatchedCallback, resume, watch
 from sb3_cure.checks import (
     check_action_space,
     check_arguments,
@@ -248,6 +252,12 @@ class CuReSAC(SAC):
         self._warmed_up = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
+        # For exact checkpoints: where they go, what a resumed model has yet to restore, the callbacks of the running
+        # `learn`, and what is to be undone when it ends
+        self._checkpoint_writer: CheckpointWriter | None = None
+        self._resumed: Resumption | None = None
+        self._callbacks: list[WatchedCallback] = []
+        self._leaving_learn = contextlib.ExitStack()
         if overlap is True and self.env is not None:
             OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if _init_setup_model:
@@ -399,10 +409,25 @@ class CuReSAC(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        resumed = self._resumed
+        if resumed is not None:
+            # The interrupted call is gone on with: its start and action noise are kept, and its total is meant.
+            reset_num_timesteps = False
+            total_timesteps += self._num_timesteps_at_start - self.num_timesteps
+            kept = {
+                "_num_timesteps_at_start": self._num_timesteps_at_start,
+                "action_noise": deepcopy(self.action_noise),
+            }
+        total, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
         self._metrics.attach(self.logger)
         self._read_env_attributes()
-        return result
+        self._callbacks = watch(callback)
+        if resumed is not None:
+            vars(self).update(kept)
+            resumed.set_up(self)
+        return total, callback
 
     def set_logger(self, logger: Logger) -> None:
         """
@@ -503,6 +528,9 @@ class CuReSAC(SAC):
         :param log_interval: Episodes between two dumps of the logger
         :return: What was collected
         """
+        if self._resumed is not None:
+            self._resumed.enter(self)
+            self._resumed = None
         rollout = super().collect_rollouts(
             self._overlapped or env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
         )
@@ -751,9 +779,11 @@ class CuReSAC(SAC):
         if self.overlap and self.env is not None:
             self._overlapped = OverlappedVecEnv(self.env)
         try:
-            super().learn(*arguments)
+            with self._leaving_learn:
+                super().learn(*arguments)
         finally:
-            self._overlapped = None
+            self._overlapped = self._resumed = None
+            self._callbacks = []
 
     def pretrain(
         self: SelfCuReSAC,
@@ -793,6 +823,14 @@ class CuReSAC(SAC):
             )
         if collector == "curious":
             check_curious_agent(self)
+        if self._resumed is not None and self._collector != collector:
+            if self._collector is not None:
+                raise ValueError(
+                    f"pretrain got collector={collector!r}, but the resumed checkpoint was taken while pretraining "
+                    f"with {self._collector!r}: go on with that one."
+                )
+            # The same script, started again: its pretraining was over when the checkpoint was taken.
+            return self
         self._collector = collector
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
@@ -812,7 +850,7 @@ class CuReSAC(SAC):
     def _end_pretraining(self) -> None:
         if self._collector is None:
             return
-        self._collector = None
+        self._collector = self._resumed = None
         if not self._has_curious_agent and self.policy.curious_actor is not None:
             self.policy.remove_curious_agent()
             if self.curiosity_encoder_grad:
@@ -856,8 +894,38 @@ class CuReSAC(SAC):
 
     # ---------------------------------------------------------------- saving
 
+    @classmethod
+    def resume(
+        cls: type[SelfCuReSAC],
+        path: str | Path,
+        env: GymEnv,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> SelfCuReSAC:
+        """Go on with a training that was killed, from the newest whole checkpoint of ``ExactCheckpoint``.
+
+        The same call of ``learn`` (or ``pretrain``) as before, with the same number of timesteps and the same
+        callbacks, then does what was left of it, and goes on with the log files of a logger that was given by
+        ``set_logger``. A ``pretrain`` that was over is skipped, so that a script can be started again as it is.
+
+        :param path: Folder of the checkpoints
+        :param env: Environments as those before: as many, of the same settings
+        :param device: Where to compute
+        :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
+        :param kwargs: Arguments of the constructor to change; training then no longer equals the one before
+        :return: The model
+        :raises CheckpointError: if there is no whole checkpoint, or the environments do not fit
+        """
+        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
+        return resume(cls, path, env, custom_objects, device=device, **kwargs)  # type: ignore[return-value]
+
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_task_agent", "_curious_agent", "_overlapped"]
+        return [
+            *super()._excluded_save_params(),
+            *("_metrics", "_task_agent", "_curious_agent", "_overlapped"),
+            *("_checkpoint_writer", "_resumed", "_callbacks", "_leaving_learn"),
+        ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -53,6 +53,18 @@ class VectorBox(gym.Env):
         """
         return self.position.astype(np.float32)
 
+    def state_dict(self) -> dict[str, Any]:
+        """For exact resume: all that the future depends on."""
+        generator = self.np_random.bit_generator.state
+        return {"position": self.position, "n_steps": self.n_steps, "generator": generator}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
+        self.position, self.n_steps = np.array(state["position"]), state["n_steps"]
+        self.np_random.bit_generator.state = state["generator"]
+
 
 class PixelBox(VectorBox):
     """``VectorBox`` seen as the newest ``frame_stack`` frames: uint8 (3 * frame_stack, size, size), oldest first.
@@ -97,6 +109,13 @@ class PixelBox(VectorBox):
         self.frames = [frame] * len(self.frames) if first else [*self.frames[1:], frame]
         stacked = np.concatenate(self.frames)
         return stacked.transpose(1, 2, 0) if self.channels_last else stacked
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "frames": list(self.frames)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.frames = list(state["frames"])
 
 
 def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:

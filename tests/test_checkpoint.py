@@ -1,0 +1,435 @@
+"""A training that is killed and resumed equals one that was never killed, bit for bit; no fault costs a checkpoint."""
+
+import contextlib
+import csv
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+
+from benchmarks import faults
+from sb3_cure import CuReSAC, files, generations, make_dmc_env
+from sb3_cure.callbacks import ExactCheckpoint, PeriodicCallback
+from sb3_cure.checkpoint import CheckpointError
+from sb3_cure.generations import Generations
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kill of the process, unlike a loss of power, does not need it."""
+    for module in (files, generations):
+        monkeypatch.setattr(module, "flush_to_disk", lambda path: None)
+
+
+@dataclass
+class Case:
+    """A training: how it is set up and how long it is."""
+
+    make_env: Callable[[], Any]
+    arguments: dict[str, Any] = field(default_factory=dict)
+    policy: str = "CnnPolicy"
+    steps: int = 60
+    save_freq: int = 12
+    pretrain: int = 0
+
+
+def pixels(n_envs: int = 1, **kwargs: Any) -> Callable[[], VecEnv]:
+    return lambda: make_vec_env(PixelBox, n_envs, env_kwargs={"episode_length": 7, **kwargs})
+
+
+def vectors() -> VecEnv:
+    return make_vec_env(VectorBox, 1, env_kwargs={"episode_length": 7})
+
+
+def normalized_rewards() -> VecEnv:
+    return VecNormalize(pixels()(), norm_obs=False)
+
+
+def cartpole() -> Any:
+    return make_dmc_env("cartpole", "swingup", image_size=24, renderer="fast")
+
+
+def in_workers() -> VecEnv:
+    return SubprocVecEnv([lambda: Monitor(PixelBox(episode_length=7))] * 2, start_method="fork")
+
+
+CASES = {
+    "rae, joint": Case(pixels()),
+    "curl, sequential": Case(pixels(), {"srl": "curl", "srl_kwargs": {"crop_size": 32}, "update": "sequential"}),
+    "four environments, small ring": Case(pixels(4), {"buffer_size": 60}, steps=120),
+    "vectors": Case(vectors, policy="MlpPolicy"),
+    "schedules, noise, alternating": Case(
+        pixels(),
+        {
+            "learning_rate": LinearSchedule(1e-3, 1e-4, 1.0),
+            "curiosity_prob": LinearSchedule(0.9, 0.1, 1.0),
+            "action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2)),
+            "srl_schedule": "alternating",
+            "srl_period": 5,
+        },
+    ),
+    "normalized rewards": Case(normalized_rewards, {"curiosity": "bonus"}),
+    "plain SAC": Case(pixels(), {"srl": None, "curiosity": None}),
+    "pretraining": Case(pixels(), {"curiosity": None}, pretrain=25),
+    "workers": Case(in_workers),
+}
+
+
+def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallback) -> CuReSAC:
+    """The script of a user, which is started again with ``resume=True``."""
+    env = case.make_env()
+    checkpoints = ExactCheckpoint(case.save_freq, folder / "checkpoints")
+    if resume:
+        model = CuReSAC.resume(folder / "checkpoints", env, device="cpu")
+    else:
+        model = tiny_model(case.policy, env, **case.arguments)
+        model.set_logger(configure(str(folder / "logs"), ["csv"]))
+    try:
+        if case.pretrain > 0:
+            model.pretrain(case.pretrain, callback=[checkpoints, *callbacks], log_interval=1)
+        model.learn(case.steps, callback=[checkpoints, *callbacks], log_interval=1)
+    finally:
+        model.env.close()
+    return model
+
+
+def outcome(model: CuReSAC, folder: Path) -> dict[str, Any]:
+    """All that training leaves behind; the log without what a clock has written."""
+    buffer = model.replay_buffer
+    ignored = ("psutil",)
+    stored = {name: value for name, value in vars(buffer).items() if isinstance(value, np.ndarray | int)}
+    with (folder / "logs" / "progress.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    clocks = ("time/fps", "time/time_elapsed")
+    log = [{key: value for key, value in row.items() if key not in clocks} for row in rows]
+    return {
+        "networks": state_of(model),
+        "buffer": {name: value for name, value in stored.items() if name not in (*ignored, "n_resets")},
+        "log": log,
+        "counters": (model.num_timesteps, model._n_updates, model._episode_num),
+        "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),
+    }
+
+
+class Killed(Exception):
+    """Stands in for a kill where the process is to live on: nothing is written after it."""
+
+
+class KillAt(BaseCallback):
+    """Raises after so many calls."""
+
+    def __init__(self, calls: int):
+        super().__init__()
+        self.calls = calls
+
+    def _on_step(self) -> bool:
+        self.calls -= 1
+        if self.calls == 0:
+            raise Killed
+        return True
+
+
+_REFERENCE: dict[str, dict[str, Any]] = {}
+
+
+def reference(name: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the case leaves behind without interruption."""
+    if name not in _REFERENCE:
+        folder = tmp_path_factory.mktemp("reference")
+        _REFERENCE[name] = outcome(train(CASES[name], folder), folder)
+    return _REFERENCE[name]
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("calls", [1, 31, 57])
+def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
+    name: str, calls: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    expected = reference(name, tmp_path_factory)
+    with pytest.raises(Killed):
+        train(CASES[name], tmp_path, False, KillAt(calls // CASES[name].make_env().num_envs or 1))
+    np.random.seed(99)  # whatever another process begins with
+    th.manual_seed(99)
+    assert differences(expected, outcome(train(CASES[name], tmp_path, True), tmp_path)) == []
+
+
+@settings(max_examples=8, deadline=None)
+@given(kills=st.lists(st.integers(1, 25), min_size=1, max_size=4), save_freq=st.integers(1, 30))
+def test_any_number_of_kills_at_any_steps(
+    kills: list[int], save_freq: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    case = Case(vectors, policy="MlpPolicy", save_freq=save_freq, steps=40)
+    if "kills" not in _REFERENCE:
+        folder = tmp_path_factory.mktemp("reference")
+        _REFERENCE["kills"] = outcome(train(case, folder), folder)
+    folder = tmp_path_factory.mktemp("killed")
+    for attempt, calls in enumerate(kills):
+        try:
+            train(case, folder, attempt > 0, KillAt(calls))
+        except Killed:
+            continue
+    assert differences(_REFERENCE["kills"], outcome(train(case, folder, True), folder)) == []
+
+
+def _train_in_child(name: str, folder: Path) -> None:
+    os.setsid()
+    train(CASES[name], folder, False)
+
+
+def _wait_for_generation(folder: Path, number: int, process: Any) -> None:
+    deadline = time.monotonic() + 60
+    while max(Generations(folder / "checkpoints").numbers(), default=-1) < number:
+        assert process.is_alive() if hasattr(process, "is_alive") else process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize(
+    ("name", "delay"), [("rae, joint", 0.0), ("rae, joint", 0.05), ("curl, sequential", 0.02), ("workers", 0.03)]
+)
+def test_kill_9(name: str, delay: float, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    expected = reference(name, tmp_path_factory)
+    child = multiprocessing.get_context("fork").Process(target=_train_in_child, args=(name, tmp_path))
+    child.start()
+    _wait_for_generation(tmp_path, 1, child)
+    time.sleep(delay)
+    os.kill(child.pid, signal.SIGKILL)
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)  # workers that were forked do not notice that their parent is gone
+    assert differences(expected, outcome(train(CASES[name], tmp_path, True), tmp_path)) == []
+
+
+SCRIPT = textwrap.dedent(
+    """
+    import sys
+    from pathlib import Path
+    import torch
+    from stable_baselines3.common.logger import configure
+    from sb3_cure import CuReSAC, files, generations, make_dmc_env
+    from sb3_cure.callbacks import ExactCheckpoint
+
+    torch.set_num_threads(1)
+    folder = Path(sys.argv[1])
+    env = make_dmc_env("cartpole", "swingup", image_size=24, renderer="fast")
+    if (folder / "checkpoints").exists():
+        model = CuReSAC.resume(folder / "checkpoints", env)
+    else:
+        model = CuReSAC(
+            "CnnPolicy", env, learning_starts=20, batch_size=8, buffer_size=150, warmup_updates=5, precision="fp32",
+            compile=False, seed=0, device="cpu",
+            policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
+        )
+        model.set_logger(configure(str(folder / "logs"), ["csv"]))
+    model.learn(180, callback=ExactCheckpoint(20, folder / "checkpoints"), log_interval=1)
+    model.save(folder / "final")
+    """
+)
+
+
+def run_script(folder: Path) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(folder)])
+
+
+def what_the_script_leaves(folder: Path) -> tuple[Any, Any]:
+    with (folder / "logs" / "progress.csv").open() as file:
+        rows = [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+    return state_of(CuReSAC.load(folder / "final", device="cpu")), rows
+
+
+def test_kill_9_of_a_script_on_real_pixels(tmp_path: Path) -> None:
+    """The whole story in a user's words: the same script, started again."""
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    whole, killed = run_script(tmp_path / "whole"), run_script(tmp_path / "killed")
+    _wait_for_generation(tmp_path / "killed", 4, killed)
+    killed.kill()
+    killed.wait()
+    assert not (tmp_path / "killed" / "final.zip").exists()
+    assert run_script(tmp_path / "killed").wait() == whole.wait() == 0
+    assert differences(*map(what_the_script_leaves, (tmp_path / "whole", tmp_path / "killed"))) == []
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 1)])
+def test_signals_are_obeyed_after_a_checkpoint(
+    number: int, status: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    expected = reference("rae, joint", tmp_path_factory)
+    child = multiprocessing.get_context("fork").Process(target=_train_in_child, args=("rae, joint", tmp_path))
+    child.start()
+    _wait_for_generation(tmp_path, 1, child)
+    os.kill(child.pid, number)
+    child.join()
+    assert child.exitcode == status  # of a KeyboardInterrupt multiprocessing makes 1, and a shell 130
+    kept = Generations(tmp_path / "checkpoints")
+    assert 0 < kept.read(kept.numbers()[-1]).about["num_timesteps"] < 60
+    assert differences(expected, outcome(train(CASES["rae, joint"], tmp_path, True), tmp_path)) == []
+
+
+# ------------------------------------------------------------------------------------------------- contents
+
+
+def test_frames_are_written_once_and_forgotten_with_the_ring(tmp_path: Path) -> None:
+    case = Case(pixels(), {"buffer_size": 40}, steps=100, save_freq=10)
+    model = train(case, tmp_path)
+    kept = Generations(tmp_path / "checkpoints")
+    numbers = kept.numbers()
+    assert len(numbers) == 3 and numbers[-1] == 10
+    frame_bytes = int(np.prod(model.replay_buffer.frame_shape))
+    newest = kept.read(numbers[-1])
+    sizes = {name: kept.segments.joinpath(name).stat().st_size for name, _, _ in newest.about["frames"]}
+    for name, first, last in newest.about["frames"]:
+        assert sizes[name] == (last - first) * frame_bytes
+    spans = [(first, last) for _, first, last in newest.about["frames"]]
+    assert all(one[1] == other[0] for one, other in zip(spans, spans[1:], strict=False))
+    # No more is kept than the ring holds and what the older generations and the oldest segment need.
+    frames = sum(path.stat().st_size for path in kept.segments.iterdir()) / frame_bytes
+    assert frames <= model.replay_buffer.frame_capacity + 4 * 15
+
+
+def test_a_checkpoint_does_not_disturb_training(tmp_path: Path) -> None:
+    often, seldom = (
+        outcome(train(Case(pixels(), save_freq=save_freq), tmp_path / str(save_freq)), tmp_path / str(save_freq))
+        for save_freq in (1, 1000)
+    )
+    assert differences(often, seldom) == []
+
+
+class OneStart(gym.Wrapper):
+    """Every episode starts from the same state."""
+
+    def reset(self, **_: Any) -> Any:
+        return self.env.reset(seed=3)
+
+
+def test_callbacks_go_on_counting(tmp_path: Path) -> None:
+    class Count(PeriodicCallback):
+        def __init__(self) -> None:
+            super().__init__(10)
+            self.at: list[int] = []
+
+        def on_period(self) -> None:
+            self.at.append(self.num_timesteps)
+
+    def callbacks() -> tuple[Count, EvalCallback]:
+        evaluation = EvalCallback(
+            OneStart(PixelBox(episode_length=7)), eval_freq=9, n_eval_episodes=1, verbose=0, warn=False
+        )
+        return Count(), evaluation
+
+    def at_end(each: tuple[Count, EvalCallback]) -> Any:
+        return each[0].at, each[1].evaluations_timesteps, each[1].n_calls, each[1].best_mean_reward
+
+    whole, killed, resumed = callbacks(), callbacks(), callbacks()
+    train(CASES["rae, joint"], tmp_path / "whole", False, *whole)
+    with pytest.raises(Killed):
+        train(CASES["rae, joint"], tmp_path / "killed", False, *killed, KillAt(33))
+    train(CASES["rae, joint"], tmp_path / "killed", True, *resumed)
+    assert at_end(whole) == at_end(resumed)
+
+
+class NoState(gym.Wrapper):
+    """Keeps to itself what it is like."""
+
+
+def test_environments_that_keep_their_state_to_themselves_begin_a_new_episode(tmp_path: Path) -> None:
+    case = Case(lambda: DummyVecEnv([lambda: Monitor(NoState(PixelBox(episode_length=7)))]))
+    with pytest.warns(UserWarning, match="NoState.*begins with a new episode"), pytest.raises(Killed):
+        train(case, tmp_path, False, KillAt(31))
+    with pytest.warns(UserWarning, match="NoState"):
+        model = train(case, tmp_path, True)
+    assert model.num_timesteps == 60
+    with (tmp_path / "logs" / "progress.csv").open() as file:
+        steps = [int(row["time/total_timesteps"]) for row in csv.DictReader(file)]
+    # 24 steps, of which the last 3 belong to the episode that is given up; then episodes of 7 steps anew
+    assert steps == [7, 14, 21, 31, 38, 45, 52, 59]
+
+
+def test_a_logger_of_the_users_own_is_gone_on_with_too(tmp_path: Path, tmp_path_factory: Any) -> None:
+    """A script that sets its logger before each learn, and so empties the file."""
+    with pytest.raises(Killed):
+        train(CASES["rae, joint"], tmp_path, False, KillAt(40))
+    model = CuReSAC.resume(tmp_path / "checkpoints", pixels()(), device="cpu")
+    model.set_logger(configure(str(tmp_path / "logs"), ["csv"]))
+    model.learn(60, log_interval=1)
+    assert differences(reference("rae, joint", tmp_path_factory)["log"], outcome(model, tmp_path)["log"]) == []
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_another_training_may_not_write_over_checkpoints(tmp_path: Path) -> None:
+    train(CASES["vectors"], tmp_path)
+    before = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    with pytest.raises(CheckpointError, match=r"holds checkpoints of another training.*CuReSAC\.resume"):
+        train(CASES["vectors"], tmp_path)
+    assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == before
+
+
+def test_two_processes_may_not_write_to_one_folder(tmp_path: Path) -> None:
+    with Generations(tmp_path).locked():
+        with pytest.raises(CheckpointError, match="another process writes checkpoints"):
+            tiny_model("MlpPolicy", VectorBox()).learn(5, callback=ExactCheckpoint(5, tmp_path))
+
+
+def test_full_disk_is_known_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = type("Usage", (), {"free": 10_000})
+    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
+    model = tiny_model("MlpPolicy", VectorBox())
+    with pytest.raises(CheckpointError, match=r"will need up to .* GB, but only 0\.00 GB are free"):
+        model.learn(5, callback=ExactCheckpoint(5, tmp_path))
+    assert model.num_timesteps == 0
+
+
+def test_unwritable_folder_is_known_before_training(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    model = tiny_model("MlpPolicy", VectorBox())
+    with pytest.raises(CheckpointError, match="cannot write to .*choose another path"):
+        model.learn(5, callback=ExactCheckpoint(5, tmp_path / "file" / "below"))
+    assert model.num_timesteps == 0
+
+
+def test_other_numbers_of_environments_are_refused(tmp_path: Path) -> None:
+    train(CASES["rae, joint"], tmp_path)
+    with pytest.raises(CheckpointError, match="got 4 environments, but .* of a training with 1"):
+        CuReSAC.resume(tmp_path / "checkpoints", pixels(4)())
+
+
+def test_no_checkpoint_is_said(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="there is no checkpoint in"):
+        CuReSAC.resume(tmp_path / "nothing", PixelBox())
+
+
+# -------------------------------------------------------------------------------------------------- faults
+
+
+def test_no_fault_costs_more_than_the_checkpoint_that_it_hits(tmp_path: Path) -> None:
+    """The campaign of benchmarks/faults.py, with a part of its failing writes."""
+    outcomes = faults.campaign(tmp_path, points=40)
+    assert [outcome for outcome in outcomes if not outcome.expected] == []
+    assert len(outcomes) >= 200
+    assert {outcome.resumed for outcome in outcomes} == {"newest", "former", "without some frames"}
