@@ -149,18 +149,21 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
 
     :param venv: Environments to change; they need not have been reset
     :param state: What ``vec_env_state`` gave; it is not changed
-    :raises ValueError: if the state is of environments that were built in another way
-    :raises RuntimeError: if a step is under way, or if loading fails in a worker
+    :raises ValueError: if the state is of environments that were built in another way; they may then be changed in part
+    :raises RuntimeError: if a step is under way
     """
     *_, base = layers = _layers(venv)
-    if len(state["envs"]) != base.num_envs:
+    try:
+        if len(state["envs"]) != base.num_envs:
+            raise ValueError(f"it is of {len(state['envs'])} environments, and here are {base.num_envs}")
+        _check_layers(layers, state["layers"])
+        _in_envs(base, _load_env_state, [(env_state,) for env_state in state["envs"]])
+        for layer, layer_state in zip(layers, state["layers"], strict=True):
+            _load_layer_state(layer, layer_state)
+    except Exception as error:
         raise ValueError(
-            f"The saved state is of {len(state['envs'])} environment(s), but there are {base.num_envs}: build as many."
-        )
-    _check_layers(layers, state["layers"])
-    _in_envs(base, _load_env_state, [(env_state,) for env_state in state["envs"]])
-    for layer, layer_state in zip(layers, state["layers"], strict=True):
-        _load_layer_state(layer, layer_state)
+            f"The saved state does not fit these environments, build them as they were built when it was saved: {error}"
+        ) from error
 
 
 def why_not_restorable(venv: VecEnv) -> str | None:
@@ -208,7 +211,7 @@ def _in_envs(venv: VecEnv, function: Callable[..., Any], arguments: Sequence[tup
     for index, own in enumerate(arguments):
         [(result, error)] = venv.env_method("_sb3_cure_call", function, *own, indices=index)
         if error is not None:
-            raise RuntimeError(f"The state of environment {index} could not be saved or loaded in its worker: {error}")
+            raise RuntimeError(f"The worker of environment {index} could not save or load its state: {error}")
         results.append(result)
     return results
 
@@ -263,10 +266,7 @@ def _load_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
 def _check_layers(layers: list[Any], states: list[dict[str, Any]]) -> None:
     found, saved = [type(layer).__name__ for layer in layers], [state["layer"] for state in states]
     if found != saved:
-        raise ValueError(
-            f"The saved state is of {' around '.join(saved)}, but this is {' around '.join(found)}: "
-            "build the environments as they were built then."
-        )
+        raise ValueError(f"it is of {' around '.join(saved)}, and here is {' around '.join(found)}")
 
 
 def _layer_state(layer: Any) -> dict[str, Any]:
@@ -296,7 +296,7 @@ def _load_layer_state(layer: Any, state: dict[str, Any]) -> None:
         layer.checked_step = layer.checked_data_reuse = True
     for space, generator in zip(_spaces(layer), state["spaces"], strict=True):
         space._np_random = _generator(generator)  # type: ignore[assignment]
-    if "np_random" in state:
+    if state.get("np_random") is not None:
         layer._np_random = _generator(state["np_random"])
         layer._np_random_seed = state["np_random_seed"]
 
