@@ -67,7 +67,6 @@ _STATELESS: tuple[type, ...] = (
     wrappers.TransformAction,
     wrappers.TransformObservation,
     wrappers.TransformReward,
-    OverlappedVecEnv,
     VecCheckNan,
     VecExtractDictObs,
     VecTransposeImage,
@@ -77,11 +76,10 @@ _STATELESS: tuple[type, ...] = (
 ATTRIBUTES: dict[type, tuple[str, ...]] = {
     **dict.fromkeys(_STATELESS, ()),
     StackFrames: ("_frames",),
-    wrappers.Autoreset: ("autoreset",),
     wrappers.DelayObservation: ("observation_queue",),
     wrappers.FrameStackObservation: ("obs_queue",),
-    wrappers.NormalizeObservation: ("obs_rms", "_update_running_mean"),
-    wrappers.NormalizeReward: ("return_rms", "discounted_reward", "_update_running_mean"),
+    wrappers.NormalizeObservation: ("obs_rms",),
+    wrappers.NormalizeReward: ("return_rms", "discounted_reward"),
     wrappers.OrderEnforcing: ("_has_reset",),
     wrappers.RecordEpisodeStatistics: (
         "episode_count",
@@ -109,7 +107,7 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
 _SHIMMY = "shimmy.dm_control_compatibility"
 _SUITE = "dm_control.suite."
 _NUMBERS = (bool, int, float, np.generic, np.ndarray)
-# What the tasks of the suite change in MuJoCo's model at reset: places and sizes of targets, gains, terrain, colours.
+# What the tasks of the suite change in MuJoCo's model at reset: targets, obstacles, gains, terrain.
 _MODEL_ARRAYS = (
     "body_pos",
     "body_quat",
@@ -119,7 +117,6 @@ _MODEL_ARRAYS = (
     "geom_size",
     "hfield_data",
     "light_pos",
-    "mat_rgba",
     "site_pos",
     "site_rgba",
     "site_size",
@@ -217,13 +214,13 @@ def _in_envs(venv: VecEnv, function: Callable[..., Any], arguments: Sequence[tup
 
 
 def _layers(outermost: Any) -> list[Any]:
-    """All layers, the outermost first."""
+    """All layers, the outermost first; without that of overlapped updates, which is put on in ``learn``."""
     layers = [outermost]
     while isinstance(layers[-1], gym.Wrapper | VecEnvWrapper):
         layers.append(layers[-1].venv if isinstance(layers[-1], VecEnvWrapper) else layers[-1].env)
     if getattr(layers[-1], "waiting", False) and isinstance(layers[-1], SubprocVecEnv):
         raise RuntimeError("A step of the environments is under way: call step_wait() before their state is touched.")
-    return layers
+    return [layer for layer in layers if not isinstance(layer, OverlappedVecEnv)]
 
 
 def _has_state_dict(layer: Any) -> bool:
@@ -240,8 +237,12 @@ def _why_not(layer: Any) -> str | None:
     if _has_state_dict(layer) or type(layer) in ATTRIBUTES:
         return None
     if _is_dmc(layer):
-        task = type(getattr(layer.unwrapped._env, "task", None))
-        return None if task.__module__.startswith(_SUITE) else f"the task {task.__name__} is not of dm_control.suite"
+        from dm_control.rl.control import Environment
+
+        task = type(getattr(layer._env, "task", None))
+        if type(layer._env) is Environment and task.__module__.startswith(_SUITE):
+            return None
+        return f"dm_control's {type(layer._env).__name__} of the task {task.__name__} is not one of dm_control.suite"
     if isinstance(layer, gym.Wrapper | VecEnvWrapper):
         return f"the wrapper {name} may keep a state of its own and has no state_dict() and load_state_dict(state)"
     return f"the environment {name} has no state_dict() and load_state_dict(state)"
