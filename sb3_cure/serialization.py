@@ -74,15 +74,25 @@ def read_state(file: str | Path | BinaryIO, *, max_bytes: int = MAX_BYTES) -> di
     :raises ArchiveError: if the file is anything but a whole state, in one sentence
     """
     with open_archive(file, max_bytes) as archive:
-        arrays = archive.arrays()
-        node = archive.json(_JSON_MEMBER)
-        archive.check_all_read()
-        if not isinstance(node, dict) or node.keys() != {"version", "state"} or node["version"] != VERSION:
-            raise archive.error(f"is no state of version {VERSION}")
-        state = Decoder(arrays).decode_all(node["state"])
-        if type(state) is not dict:
-            raise archive.error(f"holds a {type(state).__name__} instead of a dictionary")
-        return state
+        return decode_state(archive)
+
+
+def decode_state(archive: "Archive", materialize: "Callable[[StoredArray], Any] | None" = None) -> dict[str, Any]:
+    """
+    :param archive: A state's file, open
+    :param materialize: What becomes of an array in it, instead of being read
+    :return: The state
+    :raises ArchiveError: if it is anything but a whole state
+    """
+    arrays = archive.arrays()
+    node = archive.json(_JSON_MEMBER)
+    archive.check_all_read()
+    if not isinstance(node, dict) or node.keys() != {"version", "state"} or node["version"] != VERSION:
+        raise archive.error(f"is no state of version {VERSION}")
+    state = Decoder(arrays, materialize).decode_all(node["state"])
+    if type(state) is not dict:
+        raise archive.error(f"holds a {type(state).__name__} instead of a dictionary")
+    return state
 
 
 # ------------------------------------------------------------------- values
@@ -191,9 +201,8 @@ class Decoder:
             value = self.decode(node)
         except ArchiveError:
             raise
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            # The few constructors that JSON's values reach say in many ways that these are not theirs.
-            raise ArchiveError(f"the archive's JSON is damaged: {_one_line(error)}.") from error
+        except Exception as error:  # the few constructors that JSON's values reach refuse them in many ways
+            raise ArchiveError(f"the archive's JSON is damaged ({one_line(error)}).") from error
         if any(array is not None for array in self._arrays):
             raise ArchiveError("the archive holds arrays that its JSON does not name: it is damaged.")
         return value
@@ -292,8 +301,31 @@ def _check_bools(values: np.ndarray) -> None:
         raise ArchiveError("the archive has an array of bools with values that are neither 0 nor 1: it is damaged.")
 
 
-def _one_line(error: BaseException) -> str:
-    return (" ".join(str(error).split()) or type(error).__name__)[:200].rstrip(".")
+def one_line(error: BaseException, length: int = 200) -> str:
+    """
+    :param error: Any error
+    :param length: At most so many characters
+    :return: What it says, as a part of a sentence
+    """
+    text = " ".join("".join(filter(str.isprintable, str(error).replace("\n", " "))).split())
+    return (text or type(error).__name__)[:length].rstrip(".")
+
+
+@contextlib.contextmanager
+def sentences(name: str, smaller: str) -> Iterator[None]:
+    """Whatever fails in this context, in which something is built from a file, is told in one sentence.
+
+    :param name: What to call the file
+    :param smaller: What to do if there is not enough memory
+    """
+    try:
+        yield
+    except ArchiveError:
+        raise
+    except MemoryError as error:
+        raise ArchiveError(f"{name} needs more memory than there is ({one_line(error)}): {smaller}.") from error
+    except Exception as error:
+        raise ArchiveError(f"{name} cannot be loaded: {one_line(error, 1000)}.") from error
 
 
 # --------------------------------------------------------------------- JSON
@@ -337,7 +369,7 @@ def load_json(text: bytes) -> Any:
     except ArchiveError:
         raise
     except (ValueError, RecursionError) as error:
-        raise ArchiveError(f"the archive's JSON cannot be read ({_one_line(error)}).") from error
+        raise ArchiveError(f"the archive's JSON cannot be read ({one_line(error)}).") from error
     # One level at a time: a recursion is what is to be limited.
     level, depth = [node], 0
     while level:
@@ -400,10 +432,8 @@ class StoredArray:
                     raise ValueError("another version of the format")
                 header = np.lib.format.read_array_header_1_0(member, max_header_size=1000)
                 self.shape, self.fortran_order, self.dtype = header
-            except (ArchiveError, MemoryError):
-                raise
             except Exception as error:  # numpy evaluates a literal, which fails in many ways
-                raise archive.error(f"has a member {name!r} without a header of numpy ({_one_line(error)})") from error
+                raise archive.error(f"has a member {name!r} without a header of numpy ({one_line(error)})") from error
             self._start = member.tell()
         if not _is_numeric(self.dtype):
             raise archive.error(
@@ -460,7 +490,7 @@ class Archive:
             self._zip = zipfile.ZipFile(stream)
             members = self._zip.infolist()
         except Exception as error:  # zipfile has no common error for broken files
-            raise self.error(f"is a damaged zip file ({_one_line(error)})") from error
+            raise self.error(f"is a damaged zip file ({one_line(error)})") from error
         #: Size of each member
         self.sizes: dict[str, int] = {}
         for member in members:
@@ -530,7 +560,7 @@ class Archive:
             struct.error,
             ValueError,
         ) as error:
-            raise self.error(f"has a damaged member {name!r} ({_one_line(error)})") from error
+            raise self.error(f"has a damaged member {name!r} ({one_line(error)})") from error
 
     def bytes(self, name: str, max_bytes: int) -> bytes:
         """
