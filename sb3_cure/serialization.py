@@ -325,7 +325,9 @@ def sentences(name: str, smaller: str) -> Iterator[None]:
     except MemoryError as error:
         raise ArchiveError(f"{name} needs more memory than there is ({one_line(error)}): {smaller}.") from error
     except Exception as error:
-        raise ArchiveError(f"{name} cannot be loaded: {one_line(error, 1000)}.") from error
+        # What is no ValueError was not written to be read alone.
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise ArchiveError(f"{name} cannot be loaded: {kind}{one_line(error, 1000)}.") from error
 
 
 # --------------------------------------------------------------------- JSON
