@@ -20,6 +20,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,12 +133,13 @@ def _digest(model: CuReSAC) -> str:
         else:
             digest.update(repr(value).encode())
 
-    buffer = model.replay_buffer
+    buffer: Any = model.replay_buffer
+    resumed: Any = model._resumed
     take(model.get_parameters())
     rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
     take([np.asarray(each) for each in buffer.transitions(rows, np.zeros(len(rows), int))[:5] if each is not None])
     take([model.num_timesteps, model._n_updates, model._last_obs])
-    take([model._resumed.state["random"], model._resumed.state["environments"]])
+    take([resumed.state["random"], resumed.state["environments"]])
     return digest.hexdigest()
 
 
@@ -280,10 +282,14 @@ class _failing:
             os.kill(os.getpid(), signal.SIGKILL)
         self.count += 1
 
+    def _call(self, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        self.point()
+        return call(*args, **kwargs)
+
     def __enter__(self) -> Callable[[], int]:
         self.former = {name: getattr(os, name) for name in self.NAMES}
         for name, call in self.former.items():
-            setattr(os, name, lambda *args, _call=call, **kwargs: (self.point(), _call(*args, **kwargs))[1])
+            setattr(os, name, partial(self._call, call))
         self.open = io.open
 
         def opened(path: Any, mode: str = "r", *args: Any, **kwargs: Any) -> Any:

@@ -116,6 +116,14 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 stacklevel=2,
             )
 
+    def reserve_frames(self) -> None:
+        """Make the file for the frames, if there is to be one and there is none yet.
+
+        :raises ValueError: If ``frames_dir`` cannot hold all frames
+        """
+        if len(self.frames) == 0:
+            self.frames = self._file_for_frames()
+
     def _file_for_frames(self) -> npt.NDArray[np.uint8]:
         """Zeros for all frames, in an unnamed file that ends with this array."""
         shape = (self.frame_capacity, *self.frame_shape)
@@ -172,8 +180,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param infos: One dictionary per environment; ``TimeLimit.truncated`` is used
         :raises ValueError: If observations have another dtype or shape, or ``frames_dir`` cannot hold all frames
         """
-        if len(self.frames) == 0:
-            self.frames = self._file_for_frames()
+        self.reserve_frames()
         stacks, next_stacks = self._split(obs, "obs"), self._split(next_obs, "next_obs")
         action = np.asarray(action).reshape((self.n_envs, self.action_dim))
 

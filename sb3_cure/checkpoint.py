@@ -105,7 +105,7 @@ class CheckpointWriter:
         draft.segments += [segment.entry for segment in segments]
         first = max(segments[-1].last if segments else 0, oldest)
         if first < buffer._n_frames:
-            runs = (memoryview(run).cast("B") for run in _frame_runs(buffer, first, buffer._n_frames))
+            runs = (run.reshape(-1).data for run in _frame_runs(buffer, first, buffer._n_frames))
             entry = draft.new_segment(f"frames-{first}-{buffer._n_frames}", runs)
             segments.append(FrameSegment(entry, first, buffer._n_frames))
         return segments
@@ -149,7 +149,12 @@ def training_state(model: "CuReSAC") -> dict[str, Any]:
         "n_envs": model.n_envs,
         "random": _random_state(model),
         "environments": vec_env_state(model.env),
-        "metrics": {"sums": dict(model._metrics._sums), "counts": dict(model._metrics._counts)},
+        "metrics": {
+            "sums": dict(model._metrics._sums),
+            "counts": dict(model._metrics._counts),
+            # Measured now and then, logged every time (sequential updates)
+            "shares": {} if model.is_plain_sac else dict(model.policy.encoder_optimizer.shares),
+        },
         "logger": _logger_state(model),
         "callbacks": [_changed(callback) for callback in model._callbacks],
     }
@@ -400,7 +405,7 @@ def _load_buffer(model: "CuReSAC", generation: Generation, state: dict[str, Any]
         with (generation.folder.parent / "segments" / segment.entry.name).open("rb") as file:
             file.seek((first - segment.first) * int(np.prod(buffer.frame_shape)))
             for run in _frame_runs(buffer, first, segment.last):
-                file.readinto(memoryview(run).cast("B"))  # type: ignore[attr-defined]
+                file.readinto(run.reshape(-1).data)  # type: ignore[attr-defined]
 
 
 def _forget_frames_before(buffer: FrameStackReplayBuffer, number: int) -> None:
@@ -442,6 +447,9 @@ class Resumption:
         metrics = self.state["metrics"]
         model._metrics._sums = {key: value.to(model.device) for key, value in metrics["sums"].items()}
         model._metrics._counts = dict(metrics["counts"])
+        if not model.is_plain_sac:
+            shares = {key: value.to(model.device) for key, value in metrics["shares"].items()}
+            model.policy.encoder_optimizer.shares = shares
 
     def enter(self, model: "CuReSAC") -> None:
         """Environments and random streams, last of all, so that nothing can disturb them.

@@ -1,11 +1,12 @@
 """CuReSAC: SAC from pixels with state representation learning (SRL) and a policy that is curious about it."""
 
 import contextlib
-from collections.abc import Callable
+import io
+import pathlib
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from stable_baselines3.common.type_aliases import (
     ReplayBufferSamples,
     RolloutReturn,
     Schedule,
+    TensorDict,
     TrainFreq,
 )
 from stable_baselines3.common.utils import update_learning_rate
@@ -30,6 +32,8 @@ from stable_baselines3.sac import policies as sb3_policies
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
+from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
+from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
 from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.checkpoint import CheckpointWriter, Resumption, WatchedCallback, resume, watch
 from sb3_cure.checks import (
@@ -40,12 +44,15 @@ from sb3_cure.checks import (
     check_shared_encoder_space,
     check_srl_error,
 )
+from sb3_cure.files import PathOrFile
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
+from sb3_cure.serialization import ArchiveError
 from sb3_cure.srl import SRLHead, get_srl_class
+from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
 
@@ -894,10 +901,111 @@ class CuReSAC(SAC):
 
     # ---------------------------------------------------------------- saving
 
+    def save(
+        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
+
+        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
+        it was, and ``load`` asks for it as ``custom_objects``.
+
+        :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
+        :param exclude: Names of settings that are not to be saved
+        :param include: Names of settings that are to be saved although they are not by default
+        :raises ValueError: if ``include`` names parts of the running model, which no archive holds
+        """
+        save_model(self, path, exclude, include)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfCuReSAC],
+        path: PathOrFile,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        trusted: bool = False,
+        **kwargs: Any,
+    ) -> SelfCuReSAC:
+        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
+        imported.
+
+        :param path: Path with or without its suffix ``.zip``, or a binary file
+        :param env: Environment to go on learning in; not needed to predict
+        :param device: Device of the networks
+        :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
+            ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
+            archive does not have are ignored
+        :param print_system_info: Whether to print of which system the model was saved, and of this one
+        :param force_reset: Whether to reset the environment before learning goes on
+        :param trusted: Also load what is pickled (by SB3's ``save``, or this package's before it needed no pickle),
+            which runs any code in it, and take settings that the class does not know
+        :param kwargs: Arguments of the constructor to change
+        :return: The model
+        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled or of another algorithm
+        """
+        if trusted and is_pickled_model(path):
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        return load_model(  # type: ignore[return-value]
+            cls, path, env, device, custom_objects, print_system_info, force_reset, trusted, kwargs
+        )
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | TensorDict,  # type: ignore[override]
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
+
+        :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
+        :param exact_match: Whether all of the model's parameters have to be there, and no others
+        :param device: As in SB3; the parameters stay on the model's device
+        :raises ArchiveError: if a file's parameters are not finite or do not fit the model
+        """
+        if not isinstance(load_path_or_dict, dict):
+            archive = read_model(load_path_or_dict, settings=False)
+            check_parameters(self, archive.params, archive.name, exact_match)
+            load_path_or_dict = archive.params
+        super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
+
+    def save_replay_buffer(self, path: PathOrFile) -> None:
+        """Save the used part of the replay buffer, without pickle and without a copy in memory.
+
+        Buffers of classes that this package does not know, and ``HerReplayBuffer``, are pickled, as SB3 does.
+
+        :param path: Path, whose folder is made and which gets the suffix ``.pkl`` if it has none, or a binary file
+        :raises ValueError: if there is no replay buffer
+        """
+        if self.replay_buffer is None:
+            raise ValueError("save_replay_buffer was called on a model without one: load it with an environment.")
+        save_buffer(self.replay_buffer, path, super().save_replay_buffer)
+
+    def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
+        """Load a replay buffer, also one from a stranger.
+
+        :param path: Path with or without its suffix ``.pkl``, or a binary file
+        :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
+        :param trusted: Also load what is pickled, which runs any code in it
+        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled, or does not fit the model
+        """
+        if not is_pickled_buffer(path):
+            self.replay_buffer = load_buffer(self, path)
+        elif trusted:
+            super().load_replay_buffer(path, truncate_last_traj)
+        else:
+            raise ArchiveError(
+                f"{path if isinstance(path, str | pathlib.Path) else 'the file'} is no replay buffer that this package "
+                "saved without pickle, and unpickling runs any code that is in a file: if you know where it comes "
+                "from, load it with trusted=True."
+            )
+
     @classmethod
     def resume(
         cls: type[SelfCuReSAC],
-        path: str | Path,
+        path: str | pathlib.Path,
         env: GymEnv,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,

@@ -150,7 +150,6 @@ class EncoderOptimizer:
             "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
             "weights": dict(self.weights),
             "n_steps": self._n_steps,
-            "shares": dict(self.shares),
         }
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
@@ -173,4 +172,3 @@ class EncoderOptimizer:
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
         self.weights = dict(state["weights"])
         self._n_steps = state["n_steps"]
-        self.shares = dict(state.get("shares", {}))

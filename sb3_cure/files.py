@@ -1,10 +1,18 @@
-"""Files that are written whole or not at all, whatever happens meanwhile."""
+"""Files that are written whole or not at all, whatever happens meanwhile, and SB3's conventions for their names."""
 
 import contextlib
+import io
 import os
+import pathlib
 import platform
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+from stable_baselines3.common.save_util import open_path
+
+PathOrFile: TypeAlias = str | pathlib.Path | io.BufferedIOBase
 
 
 @contextlib.contextmanager
@@ -37,3 +45,43 @@ def flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
+    """A file to write to, by SB3's conventions; one at a path is replaced when it is whole.
+
+    :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
+    :param suffix: ``"zip"`` or ``"pkl"``
+    :return: Path to write under meanwhile, or the file
+    """
+    if not isinstance(path, str | pathlib.Path):
+        yield open_path(path, "w")
+        return
+    path = Path(path)
+    if path.suffix == "":
+        path = Path(f"{path}.{suffix}")
+    if path.is_dir():
+        warnings.warn(f"Path '{path}' is a folder. Will save instead to {path}_2", stacklevel=4)
+        path = Path(f"{path}_2")
+    if not path.parent.exists():
+        warnings.warn(f"Path '{path.parent}' does not exist. Will create it.", stacklevel=4)
+        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
+        yield beside
+
+
+@contextlib.contextmanager
+def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
+    """
+    :param path: Path, with or without its suffix, or a binary file
+    :param suffix: ``"zip"`` or ``"pkl"``
+    :return: The open file, at its start, and what to call it
+    """
+    file = open_path(path, "r", suffix=suffix)
+    try:
+        file.seek(0)
+        yield file, f"'{path}'" if isinstance(path, str | pathlib.Path) else "the file"  # type: ignore[misc]
+    finally:
+        if isinstance(path, str | pathlib.Path):
+            file.close()

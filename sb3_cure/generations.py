@@ -191,7 +191,7 @@ class Generations:
             self.folder(number).rename(gone)
         for leftover in (*self.path.glob(".removed-*"), *self.path.glob(".unfinished-*")):
             shutil.rmtree(leftover, ignore_errors=True)
-        needed = set()
+        needed: set[str] = set()
         for number in numbers[-keep:]:
             try:
                 needed.update(entry.name for entry in self.read(number).segments)

@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import itertools
 import multiprocessing
 import os
 import random
@@ -305,7 +306,7 @@ def test_frames_are_written_once_and_forgotten_with_the_ring(tmp_path: Path) -> 
     for name, first, last in newest.about["frames"]:
         assert sizes[name] == (last - first) * frame_bytes
     spans = [(first, last) for _, first, last in newest.about["frames"]]
-    assert all(one[1] == other[0] for one, other in zip(spans, spans[1:], strict=False))
+    assert all(one[1] == other[0] for one, other in itertools.pairwise(spans))
     # No more is kept than the ring holds and what the older generations and the oldest segment need.
     frames = sum(path.stat().st_size for path in kept.segments.iterdir()) / frame_bytes
     assert frames <= model.replay_buffer.frame_capacity + 4 * 15
@@ -408,14 +409,14 @@ def test_full_disk_is_known_before_training(tmp_path: Path, monkeypatch: pytest.
 def test_unwritable_folder_is_known_before_training(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     model = tiny_model("MlpPolicy", VectorBox())
-    with pytest.raises(CheckpointError, match="cannot write to .*choose another path"):
+    with pytest.raises(CheckpointError, match=r"cannot write to .*choose another path"):
         model.learn(5, callback=ExactCheckpoint(5, tmp_path / "file" / "below"))
     assert model.num_timesteps == 0
 
 
 def test_other_numbers_of_environments_are_refused(tmp_path: Path) -> None:
     train(CASES["rae, joint"], tmp_path)
-    with pytest.raises(CheckpointError, match="got 4 environments, but .* of a training with 1"):
+    with pytest.raises(CheckpointError, match=r"got 4 environments, but .* of a training with 1"):
         CuReSAC.resume(tmp_path / "checkpoints", pixels(4)())
 
 

@@ -1,0 +1,368 @@
+"""The settings of models as JSON: values, and the few kinds of objects and names that are allowed among them.
+
+Classes are looked up by name in a fixed table; nothing that a file names is imported.
+"""
+
+import math
+import pathlib
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common import buffers as sb3_buffers
+from stable_baselines3.common import torch_layers
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+    VectorizedActionNoise,
+)
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import (
+    ConstantSchedule,
+    FloatSchedule,
+    LinearSchedule,
+)
+from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from stable_baselines3.sac import policies as sb3_policies
+from torch.nn.modules import activation
+
+from sb3_cure import encoders, policies
+from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.mixers import CuriousMixer
+from sb3_cure.serialization import ArchiveError, Decoder, Encoder
+from sb3_cure.srl import SRL_HEADS, SRLHead
+
+if TYPE_CHECKING:
+    pass
+
+#: Most numbers in one observation or action; a space of them takes some 20 bytes each
+MAX_SPACE_SIZE = 2**22
+#: Most parallel environments, each of which takes a few bytes in a replay buffer
+MAX_ENVS = 2**16
+#: What belongs to a running model alone, and is never a setting
+NEVER_SAVED = frozenset(
+    "policy device env replay_buffer rollout_buffer _vec_normalize_env _logger actor critic critic_target _metrics "
+    "_task_agent _curious_agent _overlapped".split()
+)
+#: What set-up derives from other settings
+DERIVED = frozenset("lr_schedule batch_norm_stats batch_norm_stats_target _computed_precision _compiles".split())
+
+
+# -------------------------------------------------------------- as JSON
+
+
+def _named() -> dict[str, Any]:
+    """What settings may refer to by name."""
+    classes: list[type] = [
+        policies.CuRePolicy,
+        policies.CnnPolicy,
+        policies.MlpPolicy,
+        sb3_policies.SACPolicy,
+        sb3_policies.CnnPolicy,
+        sb3_policies.MultiInputPolicy,
+        encoders.PixelEncoder,
+        encoders.VectorEncoder,
+        torch_layers.FlattenExtractor,
+        torch_layers.NatureCNN,
+        torch_layers.CombinedExtractor,
+        FrameStackReplayBuffer,
+        sb3_buffers.ReplayBuffer,
+        sb3_buffers.DictReplayBuffer,
+        sb3_buffers.NStepReplayBuffer,
+        HerReplayBuffer,
+        RMSpropTFLike,
+        *SRL_HEADS.values(),
+    ]
+    for module, base in ((activation, th.nn.Module), (th.optim, th.optim.Optimizer)):
+        classes += [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, base)]
+    named: dict[str, Any] = {f"{kind.__module__}.{kind.__qualname__}": kind for kind in classes}
+    return named | {str(strategy): strategy for strategy in GoalSelectionStrategy}
+
+
+_NAMED = _named()
+_NAMES = {value: name for name, value in _NAMED.items()}
+_DICT_SPACE_LIMIT = 1000
+
+
+class SettingsEncoder(Encoder):
+    """``Encoder``, and what the settings of models are made of besides."""
+
+    def encode_other(self, value: Any, path: str, depth: int) -> Any:
+        """
+        :param value: Value of a type that plain states do not have
+        :param path: Where it is
+        :param depth: How many containers it is in
+        :return: Its JSON
+        :raises TypeError: if it is not of the allow-listed kinds
+        """
+
+        def part(item: Any) -> Any:
+            return self.encode(item, path, depth + 1)
+
+        if (isinstance(value, type) or type(value) is GoalSelectionStrategy) and value in _NAMES:
+            return {"name": _NAMES[value]}
+        write = _WRITERS.get(type(value))
+        if write is not None:
+            return {type(value).__name__: part(write(value))}
+        if isinstance(value, pathlib.PurePath):
+            return {"Path": str(value)}
+        if callable(value) and hasattr(value, "__qualname__"):
+            kind = "class" if isinstance(value, type) else "function"
+            raise TypeError(f"{path} is the {kind} {value.__module__}.{value.__qualname__}")
+        raise TypeError(f"{path} is of the type {type(value).__module__}.{type(value).__qualname__}")
+
+
+class SettingsDecoder(Decoder):
+    """``Decoder``, and what ``SettingsEncoder`` writes besides."""
+
+    def decode_other(self, tag: str, content: Any) -> Any:
+        """
+        :param tag: Name of the type
+        :param content: JSON
+        :return: The value
+        :raises ArchiveError: if there is no such type or no such name
+        """
+        if tag == "name" and content in _NAMED:
+            return _NAMED[content]
+        if tag == "Path" and isinstance(content, str):
+            return Path(content)
+        if tag in _READERS:
+            return _READERS[tag](*self.decode(content))
+        return super().decode_other(tag, content)
+
+
+def _write_box(space: spaces.Box) -> tuple:
+    bounds = [
+        bound.flat[0].item() if bound.size and (bound == bound.flat[0]).all() else bound
+        for bound in (space.low, space.high)
+    ]
+    return (*bounds, list(space.shape), space.dtype.str)  # type: ignore[union-attr]
+
+
+def _read_box(low: Any, high: Any, shape: list[int], dtype: str) -> spaces.Box:
+    _check_space_size(shape)
+    for bound in (low, high):
+        if not isinstance(bound, int | float) and (not isinstance(bound, np.ndarray) or bound.shape != tuple(shape)):
+            raise ArchiveError("the archive has a Box whose bounds have another shape than the Box.")
+    return spaces.Box(low, high, tuple(shape), np.dtype(dtype).type)
+
+
+def _check_space_size(shape: list[int]) -> None:
+    if any(type(length) is not int or length < 0 for length in shape) or math.prod(shape) > MAX_SPACE_SIZE:
+        raise ArchiveError(
+            f"the archive has a space of shape {shape!s:.50}, but at most {MAX_SPACE_SIZE} numbers are expected."
+        )
+
+
+def _read_discrete(n: int, start: int, dtype: str) -> spaces.Discrete:
+    return spaces.Discrete(n, start=start, dtype=np.dtype(dtype).type)
+
+
+def _read_multi_discrete(nvec: np.ndarray, start: np.ndarray, dtype: str) -> spaces.MultiDiscrete:
+    _check_space_size(list(nvec.shape))
+    return spaces.MultiDiscrete(nvec, dtype=np.dtype(dtype).type, start=start)
+
+
+def _read_multi_binary(shape: list[int]) -> spaces.MultiBinary:
+    _check_space_size(shape)
+    return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
+
+
+def _read_dict_space(*items: tuple[str, spaces.Space]) -> spaces.Dict:
+    _check_parts([part for _, part in items])
+    return spaces.Dict(OrderedDict(items))  # in this order, where a dict would be sorted
+
+
+def _read_tuple_space(*parts: spaces.Space) -> spaces.Tuple:
+    _check_parts(list(parts))
+    return spaces.Tuple(parts)
+
+
+def _check_parts(parts: list[spaces.Space]) -> None:
+    if sum(_space_size(part) for part in parts) > MAX_SPACE_SIZE:
+        raise ArchiveError(f"the archive has spaces of more than {MAX_SPACE_SIZE} numbers together.")
+
+
+def _space_size(space: spaces.Space) -> int:
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+        return sum(_space_size(part) for part in parts)
+    # No empty space: each takes some kilobytes.
+    return max(math.prod(space.shape or ()), MAX_SPACE_SIZE // _DICT_SPACE_LIMIT)
+
+
+def _read_mixer(n_steps: int, n_curious: int, state: dict[str, Any]) -> CuriousMixer:
+    # Its probability is the setting `curiosity_prob`, which set-up gives it.
+    mixer = CuriousMixer(0.0)
+    mixer.rng.bit_generator.state = state
+    mixer.n_steps, mixer.n_curious = whole(n_steps), whole(n_curious)
+    return mixer
+
+
+def whole(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ArchiveError(f"the archive has the count {value!r:.50}.")
+    return value
+
+
+def _read_normal_noise(mean: Any, sigma: Any, dtype: str) -> NormalActionNoise:
+    return NormalActionNoise(mean, sigma, np.dtype(dtype).type)
+
+
+def _read_ou_noise(
+    mean: Any, sigma: Any, theta: float, dt: float, initial: Any, dtype: str, previous: Any
+) -> OrnsteinUhlenbeckActionNoise:
+    noise = OrnsteinUhlenbeckActionNoise(mean, sigma, theta, dt, initial, np.dtype(dtype).type)
+    noise.noise_prev = previous
+    return noise
+
+
+def _read_vectorized_noise(base: ActionNoise, *noises: ActionNoise) -> VectorizedActionNoise:
+    noise = VectorizedActionNoise(base, len(noises))
+    noise.noises = list(noises)
+    return noise
+
+
+#: Each type's parts, of which the function of the same name in ``_READERS`` makes it again
+_WRITERS: dict[type, Callable[[Any], Any]] = {
+    spaces.Box: _write_box,
+    spaces.Discrete: lambda space: (int(space.n), int(space.start), space.dtype.str),
+    spaces.MultiDiscrete: lambda space: (space.nvec, space.start, space.dtype.str),
+    spaces.MultiBinary: lambda space: (list(space.shape),),
+    spaces.Dict: lambda space: tuple(space.spaces.items()),
+    spaces.Tuple: lambda space: tuple(space.spaces),
+    OrderedDict: lambda items: tuple(items.items()),
+    ConstantSchedule: lambda schedule: (schedule.val,),
+    FloatSchedule: lambda schedule: (schedule.value_schedule,),
+    LinearSchedule: lambda schedule: (schedule.start, schedule.end, schedule.end_fraction),
+    TrainFreq: lambda freq: (freq.frequency, freq.unit.value),
+    NormalActionNoise: lambda noise: (noise._mu, noise._sigma, np.dtype(noise._dtype).str),
+    OrnsteinUhlenbeckActionNoise: lambda noise: (
+        *(noise._mu, noise._sigma, noise._theta, noise._dt, noise.initial_noise),
+        *(np.dtype(noise._dtype).str, noise.noise_prev),
+    ),
+    VectorizedActionNoise: lambda noise: (noise.base_noise, *noise.noises),
+    CuriousMixer: lambda mixer: (mixer.n_steps, mixer.n_curious, mixer.rng.bit_generator.state),
+}
+_READERS: dict[str, Callable[..., Any]] = {
+    "Box": _read_box,
+    "Discrete": _read_discrete,
+    "MultiDiscrete": _read_multi_discrete,
+    "MultiBinary": _read_multi_binary,
+    "Dict": _read_dict_space,
+    "Tuple": _read_tuple_space,
+    "OrderedDict": lambda *items: OrderedDict(items),
+    "ConstantSchedule": ConstantSchedule,
+    "FloatSchedule": FloatSchedule,
+    "LinearSchedule": LinearSchedule,
+    "TrainFreq": lambda frequency, unit: TrainFreq(whole(frequency), TrainFrequencyUnit(unit)),
+    "NormalActionNoise": _read_normal_noise,
+    "OrnsteinUhlenbeckActionNoise": _read_ou_noise,
+    "VectorizedActionNoise": _read_vectorized_noise,
+    "CuriousMixer": _read_mixer,
+}
+
+
+# --------------------------------------------------------------- schema
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and -(2**63) <= int(value) < 2**63
+
+
+def _is_count(value: Any) -> bool:
+    return _is_integer(value) and value >= 0
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _is_schedule(value: Any) -> bool:
+    """A number, or one of SB3's schedules that gives numbers at both ends."""
+    if not isinstance(value, ConstantSchedule | FloatSchedule | LinearSchedule):
+        return is_number(value)
+    return all(is_number(value(progress)) for progress in (1.0, 0.0))
+
+
+def _is_class(base: type) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, type) and issubclass(value, base)
+
+
+def _is_a(*kinds: type) -> Callable[[Any], bool]:
+    return lambda value: type(value) in kinds
+
+
+def _or_none(check: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or check(value)
+
+
+def _is_observation(value: Any) -> bool:
+    parts = list(value.values()) if isinstance(value, dict) else [value]
+    return all(isinstance(part, np.ndarray) for part in parts)
+
+
+#: What each setting of an archive has to be, in words and as a check; what an argument may be beyond its type is
+#: checked by set-up, as for a new model. Of a subclass's own settings nothing is known.
+SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    name: entry
+    for names, entry in {
+        "num_timesteps _total_timesteps _num_timesteps_at_start _episode_num _n_updates": (
+            "a whole number >= 0",
+            _is_count,
+        ),
+        "start_time": ("a number", is_number),
+        "verbose gradient_steps sde_sample_freq": ("a whole number", _is_integer),
+        "n_steps srl_period actor_update_interval target_update_interval _action_repeat _frame_stack batch_size": (
+            "a whole number >= 1",
+            lambda value: _is_count(value) and value >= 1,
+        ),
+        "buffer_size": ("a whole number >= 1", lambda value: _is_count(value) and value >= 1),
+        "n_envs": (f"a whole number from 1 to {MAX_ENVS}", lambda value: _is_count(value) and 1 <= value <= MAX_ENVS),
+        "_stats_window_size": ("a whole number below a million", lambda value: _is_count(value) and value < 10**6),
+        "seed warmup_updates": ("a whole number >= 0 or None", _or_none(_is_count)),
+        "learning_starts tau gamma curiosity_beta curiosity_gamma encoder_tau ent_coef_lr_factor "
+        "_current_progress_remaining": (
+            "a finite number",
+            is_number,
+        ),
+        "learning_rate curiosity_prob": ("a number or one of SB3's schedules", _is_schedule),
+        "ent_coef target_entropy": (
+            "a finite number or a string",
+            lambda value: type(value) is str or is_number(value),
+        ),
+        "use_sde use_sde_at_warmup optimize_memory_usage normalize_curiosity curiosity_encoder_grad task overlap "
+        "_warmed_up _custom_logger": ("True or False", _is_a(bool)),
+        "compile": ("True, False or a string", _is_a(bool, str)),
+        "srl_schedule curiosity_target update precision": ("a string", _is_a(str)),
+        "curiosity _collector": ("a string or None", _or_none(_is_a(str))),
+        "tensorboard_log": ("a path or None", _or_none(lambda value: isinstance(value, str | pathlib.PurePath))),
+        "policy_kwargs replay_buffer_kwargs srl_kwargs": ("a dictionary", _is_a(dict)),
+        "policy_class": ("a policy", _is_class(BasePolicy)),
+        "replay_buffer_class": ("a replay buffer's class or None", _or_none(_is_class(sb3_buffers.ReplayBuffer))),
+        "srl": (
+            "a name, a head's class or None",
+            _or_none(lambda value: type(value) is str or _is_class(SRLHead)(value)),
+        ),
+        "observation_space": ("a space", lambda value: isinstance(value, spaces.Space)),
+        "action_space": ("a Box", lambda value: isinstance(value, spaces.Box)),
+        "train_freq": ("a frequency", _is_a(TrainFreq, int, tuple)),
+        "action_noise": ("an action noise or None", _or_none(lambda value: isinstance(value, ActionNoise))),
+        "_mixer": ("a mixer or None", _or_none(_is_a(CuriousMixer))),
+        "_last_obs _last_original_obs": ("observations or None", _or_none(_is_observation)),
+        "_last_episode_starts": ("an array or None", _or_none(_is_a(np.ndarray))),
+        "ep_info_buffer ep_success_buffer": ("a deque or None", _or_none(lambda value: hasattr(value, "maxlen"))),
+        "log_ent_coef ent_coef_optimizer curious_log_ent_coef curious_ent_coef_optimizer": (
+            "None",
+            lambda value: value is None,
+        ),
+    }.items()
+    for name in names.split()
+}
