@@ -173,9 +173,11 @@ def _read_frames(buffer: FrameStackReplayBuffer, state: dict[str, Any], name: st
 def _check_frames(buffer: FrameStackReplayBuffer, name: str) -> None:
     """Whether what refers to frames refers to some that are there."""
     n_rows = buffer.buffer_size if buffer.full else buffer.pos
+    valid = np.arange(buffer.pos - min(buffer._n_valid, n_rows), buffer.pos) % buffer.buffer_size
     for array, low, high in (
         (buffer.frame_slots[:n_rows], 0, min(buffer._n_frames, buffer.frame_capacity)),
         (buffer.oldest_frame[:n_rows], 0, buffer._n_frames),
+        (buffer.oldest_frame[valid], buffer._n_frames - buffer.frame_capacity, buffer._n_frames),
         (buffer._tails, -buffer.frame_capacity, buffer._n_frames),
         (np.array([buffer._n_valid]), 0, n_rows + 1),
     ):

@@ -239,7 +239,7 @@ class Decoder:
             return self._materialize(self._take(content))
         if tag == "scalar":
             name, value = content
-            (number,) = numbers = np.frombuffer(bytes.fromhex(value), dtype=_numeric_dtype(name))
+            (number,) = numbers = np.frombuffer(bytes.fromhex(value), dtype=numeric_dtype(name))
             _check_bools(numbers)
             return number
         if tag == "tensor":
@@ -288,7 +288,12 @@ def _is_numeric(dtype: np.dtype) -> bool:
     return dtype.kind in _DTYPE_KINDS and dtype.fields is None and dtype.subdtype is None
 
 
-def _numeric_dtype(name: Any) -> np.dtype:
+def numeric_dtype(name: Any) -> np.dtype:
+    """
+    :param name: Of numpy's, from a file
+    :return: The dtype
+    :raises ArchiveError: if it is not that of numbers or bool
+    """
     dtype = np.dtype(name) if isinstance(name, str) and len(name) < 8 else None
     if dtype is None or not _is_numeric(dtype):
         raise ArchiveError(f"the archive has values of the dtype {name!r:.50}, but only numbers and bool are read.")

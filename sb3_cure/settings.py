@@ -36,7 +36,7 @@ from torch.nn.modules import activation
 from sb3_cure import encoders, policies
 from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.mixers import CuriousMixer
-from sb3_cure.serialization import ArchiveError, Decoder, Encoder
+from sb3_cure.serialization import ArchiveError, Decoder, Encoder, numeric_dtype
 from sb3_cure.srl import SRL_HEADS, SRLHead
 
 if TYPE_CHECKING:
@@ -88,7 +88,13 @@ def _named() -> dict[str, Any]:
 
 _NAMED = _named()
 _NAMES = {value: name for name, value in _NAMED.items()}
-_DICT_SPACE_LIMIT = 1000
+#: Shapes of the simple spaces, by their parts
+_SHAPES: dict[str, Callable[..., Any]] = {
+    "Box": lambda low, high, shape, dtype: shape,
+    "Discrete": lambda n, start, dtype: (),
+    "MultiDiscrete": lambda nvec, start, dtype: nvec.shape,
+    "MultiBinary": lambda shape: shape,
+}
 
 
 class SettingsEncoder(Encoder):
@@ -122,6 +128,9 @@ class SettingsEncoder(Encoder):
 class SettingsDecoder(Decoder):
     """``Decoder``, and what ``SettingsEncoder`` writes besides."""
 
+    #: Numbers that further spaces may have
+    _numbers_left = 2 * MAX_SPACE_SIZE
+
     def decode_other(self, tag: str, content: Any) -> Any:
         """
         :param tag: Name of the type
@@ -133,9 +142,19 @@ class SettingsDecoder(Decoder):
             return _NAMED[content]
         if tag == "Path" and isinstance(content, str):
             return Path(content)
-        if tag in _READERS:
-            return _READERS[tag](*self.decode(content))
-        return super().decode_other(tag, content)
+        if tag not in _READERS:
+            return super().decode_other(tag, content)
+        parts = self.decode(content)
+        if tag in _SHAPES:
+            shape = _SHAPES[tag](*parts)
+            # The smallest space takes some kilobytes, too.
+            self._numbers_left -= max(math.prod(map(whole, shape)), 1000)
+            if self._numbers_left < 0:
+                raise ArchiveError(
+                    f"the archive has spaces of more than {2 * MAX_SPACE_SIZE} numbers (the last one of shape "
+                    f"{tuple(shape)!s:.50}), but no observation has so many: it was made to exhaust memory."
+                )
+        return _READERS[tag](*parts)
 
 
 def _write_box(space: spaces.Box) -> tuple:
@@ -147,55 +166,26 @@ def _write_box(space: spaces.Box) -> tuple:
 
 
 def _read_box(low: Any, high: Any, shape: list[int], dtype: str) -> spaces.Box:
-    _check_space_size(shape)
     for bound in (low, high):
         if not isinstance(bound, int | float) and (not isinstance(bound, np.ndarray) or bound.shape != tuple(shape)):
             raise ArchiveError("the archive has a Box whose bounds have another shape than the Box.")
-    return spaces.Box(low, high, tuple(shape), np.dtype(dtype).type)
+    return spaces.Box(low, high, tuple(shape), _number_type(dtype))
 
 
-def _check_space_size(shape: list[int]) -> None:
-    if any(type(length) is not int or length < 0 for length in shape) or math.prod(shape) > MAX_SPACE_SIZE:
-        raise ArchiveError(
-            f"the archive has a space of shape {shape!s:.50}, but at most {MAX_SPACE_SIZE} numbers are expected."
-        )
+def _number_type(name: Any) -> type:
+    return numeric_dtype(name).type
 
 
 def _read_discrete(n: int, start: int, dtype: str) -> spaces.Discrete:
-    return spaces.Discrete(n, start=start, dtype=np.dtype(dtype).type)
+    return spaces.Discrete(n, start=start, dtype=_number_type(dtype))
 
 
 def _read_multi_discrete(nvec: np.ndarray, start: np.ndarray, dtype: str) -> spaces.MultiDiscrete:
-    _check_space_size(list(nvec.shape))
-    return spaces.MultiDiscrete(nvec, dtype=np.dtype(dtype).type, start=start)
+    return spaces.MultiDiscrete(nvec, dtype=_number_type(dtype), start=start)
 
 
 def _read_multi_binary(shape: list[int]) -> spaces.MultiBinary:
-    _check_space_size(shape)
     return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
-
-
-def _read_dict_space(*items: tuple[str, spaces.Space]) -> spaces.Dict:
-    _check_parts([part for _, part in items])
-    return spaces.Dict(OrderedDict(items))  # in this order, where a dict would be sorted
-
-
-def _read_tuple_space(*parts: spaces.Space) -> spaces.Tuple:
-    _check_parts(list(parts))
-    return spaces.Tuple(parts)
-
-
-def _check_parts(parts: list[spaces.Space]) -> None:
-    if sum(_space_size(part) for part in parts) > MAX_SPACE_SIZE:
-        raise ArchiveError(f"the archive has spaces of more than {MAX_SPACE_SIZE} numbers together.")
-
-
-def _space_size(space: spaces.Space) -> int:
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
-        return sum(_space_size(part) for part in parts)
-    # No empty space: each takes some kilobytes.
-    return max(math.prod(space.shape or ()), MAX_SPACE_SIZE // _DICT_SPACE_LIMIT)
 
 
 def _read_mixer(n_steps: int, n_curious: int, state: dict[str, Any]) -> CuriousMixer:
@@ -213,20 +203,23 @@ def whole(value: Any) -> int:
 
 
 def _read_normal_noise(mean: Any, sigma: Any, dtype: str) -> NormalActionNoise:
-    return NormalActionNoise(mean, sigma, np.dtype(dtype).type)
+    return NormalActionNoise(mean, sigma, _number_type(dtype))
 
 
 def _read_ou_noise(
     mean: Any, sigma: Any, theta: float, dt: float, initial: Any, dtype: str, previous: Any
 ) -> OrnsteinUhlenbeckActionNoise:
-    noise = OrnsteinUhlenbeckActionNoise(mean, sigma, theta, dt, initial, np.dtype(dtype).type)
+    noise = OrnsteinUhlenbeckActionNoise(mean, sigma, theta, dt, initial, _number_type(dtype))
     noise.noise_prev = previous
     return noise
 
 
 def _read_vectorized_noise(base: ActionNoise, *noises: ActionNoise) -> VectorizedActionNoise:
     noise = VectorizedActionNoise(base, len(noises))
-    noise.noises = list(noises)
+    states = [dict(vars(part)) for part in noises]
+    noise.noises = list(noises)  # which resets them
+    for part, state in zip(noises, states, strict=True):
+        vars(part).update(state)
     return noise
 
 
@@ -256,8 +249,8 @@ _READERS: dict[str, Callable[..., Any]] = {
     "Discrete": _read_discrete,
     "MultiDiscrete": _read_multi_discrete,
     "MultiBinary": _read_multi_binary,
-    "Dict": _read_dict_space,
-    "Tuple": _read_tuple_space,
+    "Dict": lambda *items: spaces.Dict(OrderedDict(items)),  # in this order, where a dict would be sorted
+    "Tuple": lambda *parts: spaces.Tuple(parts),
     "OrderedDict": lambda *items: OrderedDict(items),
     "ConstantSchedule": ConstantSchedule,
     "FloatSchedule": FloatSchedule,
