@@ -240,7 +240,7 @@ class Guard:
         draws, self._draws = self._draws, deque(maxlen=BATCHES_REMEMBERED)
         if was_bad is None or not was_bad:
             return
-        latest = {name: Check(*check.tolist()) for name, check in self._checks.items()}  # type: ignore[union-attr]
+        latest = {name: Check(*check.tolist()) for name, check in self._checks.items() if isinstance(check, th.Tensor)}
         name, first = min(((n, c) for n, c in latest.items() if not c.is_sound), key=lambda item: item[1][:2])
         self._checks = {name: check for name, check in latest.items() if check.update == first.update}
         error = _error(name, first)
