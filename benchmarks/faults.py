@@ -13,6 +13,7 @@ import errno
 import hashlib
 import io
 import os
+import random
 import shutil
 import signal
 import tempfile
@@ -181,8 +182,10 @@ class Site:
         shutil.copytree(source, target)
         self.writer.generations.__init__(target)  # type: ignore[misc]
         reading, writing = os.pipe()
+        stream = random.getstate()
         child = os.fork()
         if child == 0:
+            random.setstate(stream)  # Python begins it anew in every forked process
             count = 0
             try:
                 with _failing(target, point, kind) as counter:

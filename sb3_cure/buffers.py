@@ -62,6 +62,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     n_resets = 0
     frames: npt.NDArray[np.uint8]  # [frame_capacity, c, height, width]
     frame_slots: npt.NDArray[np.int32]  # [buffer_size, n_envs, 2 (obs, next_obs), frame_stack], positions in `frames`
+    #: Rows and environments of the latest batch, [batch_size] each
+    last_sampled: tuple[np.ndarray, np.ndarray] | None = None
     oldest_frame: npt.NDArray[np.int64]  # [buffer_size], running number of the oldest frame that the row needs
 
     def __init__(
@@ -235,7 +237,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :return: Batch on ``device``
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
-        return self.transitions(batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),)), env)
+        self.last_sampled = batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        return self.transitions(*self.last_sampled, env)
 
     def transitions(
         self, rows: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
@@ -311,6 +314,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         if not self.full:
             state.update({name: state[name][: self.pos] for name in self._ROW_ARRAYS})
         state["frames"] = np.asarray(self.frames[: self._n_frames])
+        state.pop("last_sampled", None)
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:

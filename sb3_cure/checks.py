@@ -44,6 +44,7 @@ def check_arguments(model: "CuReSAC") -> None:
     _check_choice("curiosity", model.curiosity, ("separate", "bonus", "random", None))
     _check_choice("curiosity_target", model.curiosity_target, ("observation", "next_observation"))
     _check_choice("update", model.update, ("sequential", "joint"))
+    _check_choice("on_bad_transition", model.on_bad_transition, ("raise", "skip"))
     resolve_precision(model.precision, model.device)
     _check_choice("compile", model.compile, COMPILE)
     CuriousMixer(model.curiosity_prob)
@@ -86,6 +87,7 @@ def check_arguments(model: "CuReSAC") -> None:
             f"n_steps={model.n_steps} was given with curiosity={model.curiosity!r}, but the curious reward is known "
             "for single transitions only: set n_steps=1, or curiosity=None."
         )
+    check_skip(model)
     # Dictionaries, for which SB3 asks for 'MultiInputPolicy', are refused for themselves.
     is_dict = isinstance(model.observation_space, spaces.Dict)
     if not (model.is_plain_sac or is_dict or issubclass(model.policy_class, CuRePolicy)):
@@ -112,6 +114,18 @@ def check_curious_agent(model: "CuReSAC") -> None:
         raise ValueError(
             f"n_steps={model.n_steps} was given with a curious policy to train, but the curious reward is known "
             "for single transitions only: set n_steps=1."
+        )
+
+
+def check_skip(model: "CuReSAC") -> None:
+    """
+    :param model: The model, its arguments and environments set
+    :raises ValueError: if bad transitions are to be left out, but something takes them before
+    """
+    if model.on_bad_transition == "skip" and model.get_vec_normalize_env() is not None:
+        raise ValueError(
+            "on_bad_transition='skip' was given with VecNormalize, but its running averages take a bad value before it "
+            "can be left out: leave on_bad_transition='raise', or use environments without VecNormalize."
         )
 
 
@@ -167,20 +181,6 @@ def check_srl_error(error: th.Tensor, batch_size: int, look: bool) -> None:
         raise ValueError(
             f"the SRL head returned errors from {float(error.min())} to {float(error.max())}, but SRLOutput.error must "
             "be finite and >= 0: fix the head's loss()."
-        )
-
-
-def check_rewards(rewards: np.ndarray, timestep: int) -> None:
-    """
-    :param rewards: Rewards of one step, [n_envs]
-    :param timestep: Agent steps so far, for the message
-    :raises ValueError: if one is not finite
-    """
-    if not np.isfinite(rewards).all():
-        index = int(np.flatnonzero(~np.isfinite(rewards))[0])
-        raise ValueError(
-            f"environment {index} returned the reward {rewards[index]} at agent step {timestep}, but rewards must be "
-            "finite: it was not stored; fix the environment's reward."
         )
 
 

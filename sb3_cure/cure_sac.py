@@ -40,11 +40,12 @@ from sb3_cure.checks import (
     check_action_space,
     check_arguments,
     check_curious_agent,
-    check_rewards,
     check_shared_encoder_space,
+    check_skip,
     check_srl_error,
 )
 from sb3_cure.files import PathOrFile
+from sb3_cure.guards import Guard, TransitionGuard, check_actions
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
@@ -55,6 +56,12 @@ from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
+
+#: Made anew by `_setup_model` or `learn`
+NOT_SAVED = (
+    *("_metrics", "_guard", "_transition_guard", "_task_agent", "_curious_agent", "_overlapped"),
+    *("_checkpoint_writer", "_resumed", "_callbacks", "_leaving_learn"),
+)
 
 #: Updates between two pictures of reconstructions in TensorBoard
 RECONSTRUCTION_INTERVAL = 1000
@@ -120,6 +127,10 @@ class CuReSAC(SAC):
     update; ``encoder_tau``, ``update``, ``precision``, ``compile`` and ``actor_update_interval`` then do not apply.
     For an agent without SRL on the shared encoder add ``policy_kwargs=dict(share_encoder=True)``.
 
+    A loss or gradient that is not finite changes no parameter: ``train`` raises a ``sb3_cure.guards.NonFiniteError``
+    that names it (on a GPU when the log is written, or ``learn`` ends), with a post-mortem beside the logs. What was
+    stepped before in the same update stays stepped. With everything off the losses are SB3's own, which looks at none.
+
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
     :param learning_rate: Of everything but the temperatures; a number or a schedule of the remaining progress
@@ -158,6 +169,9 @@ class CuReSAC(SAC):
         not work), False, or ``"auto"``: eager, as it does not pay on CPUs and was not measured on GPUs
     :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: the updates of
         one step are made during the next, so that actions come from a policy that is one step behind
+    :param on_bad_transition: What to do when an environment returns a reward or an observation that is not finite:
+        ``"raise"`` a ValueError, or ``"skip"``: never sample the transition, warn, and count it in
+        ``rollout/bad_transitions``
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number; also the curious agent's
     :param ent_coef_lr_factor: Learning rate of the temperatures as a multiple of ``learning_rate``
     :param kwargs: The remaining arguments of ``stable_baselines3.SAC`` (``seed``, ``verbose``, ``policy_kwargs``, ...)
@@ -204,6 +218,7 @@ class CuReSAC(SAC):
         precision: str = "auto",
         compile: str | bool = "auto",
         overlap: bool = False,
+        on_bad_transition: str = "raise",
         ent_coef: str | float = "auto_0.1",
         ent_coef_lr_factor: float = 0.1,
         _init_setup_model: bool = True,
@@ -249,6 +264,7 @@ class CuReSAC(SAC):
         self.precision = precision
         self.compile = compile
         self.overlap = overlap
+        self.on_bad_transition = on_bad_transition
         self.ent_coef_lr_factor = ent_coef_lr_factor
 
         self.curious_log_ent_coef: th.Tensor | None = None
@@ -280,6 +296,8 @@ class CuReSAC(SAC):
     def _setup_model(self) -> None:
         check_arguments(self)
         self._metrics = Metrics()
+        self._guard = Guard(deferred=self.device.type != "cpu")
+        self._transition_guard = TransitionGuard(skip=self.on_bad_transition == "skip")
         self._read_env_attributes()
         if self.is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
@@ -308,6 +326,7 @@ class CuReSAC(SAC):
             self.policy.compile_networks()
         if self.verbose >= 1:
             print(sentence)
+        self.policy.encoder_optimizer.guard = self._guard
         self._setup_temperatures()
 
     def _policy_blueprint(self) -> dict[str, Any]:
@@ -472,8 +491,11 @@ class CuReSAC(SAC):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
+        self._check_first_observations()
         if self.is_plain_sac:
-            return super()._sample_action(learning_starts, action_noise, n_envs)
+            executed, actions = super()._sample_action(learning_starts, action_noise, n_envs)
+            check_actions(actions, self.num_timesteps)
+            return executed, actions
         # Noise is added below, once, whoever acts.
         _, actions = super()._sample_action(learning_starts, None, n_envs)
         if self.num_timesteps >= learning_starts:
@@ -482,7 +504,14 @@ class CuReSAC(SAC):
                 actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
         if action_noise is not None:
             actions = np.clip(actions + action_noise(), -1, 1)
+        check_actions(actions, self.num_timesteps)
         return self.policy.unscale_action(actions), actions
+
+    def _check_first_observations(self) -> None:
+        """Observations that no transition has brought: those of a reset."""
+        if self._last_obs is not None:
+            original = None if self._vec_normalize_env is None else self._last_original_obs
+            self._last_obs = self._transition_guard.admit_first(self._last_obs, original, self.num_timesteps)  # type: ignore[arg-type, assignment]
 
     def _second_actor_acts(self, n_envs: int) -> np.ndarray:
         """Boolean array [n_envs]: where the second (curious or random) actor acts in this step."""
@@ -509,7 +538,25 @@ class CuReSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        check_rewards(reward, self.num_timesteps)
+        try:
+            check_actions(buffer_action, self.num_timesteps)
+            if self._vec_normalize_env is not None:
+                check_skip(self)  # `set_env` may have brought it
+                # What is stored; clipped, it may look finite.
+                original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+                self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
+            new_obs, reward, infos = self._transition_guard.admit(
+                self._last_obs,  # type: ignore[arg-type]
+                new_obs,
+                reward,
+                dones,
+                infos,
+                self.num_timesteps,
+            )
+        except ValueError:
+            # The environments have gone on: another `learn` starts with a reset.
+            self._last_obs = None
+            raise
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     # -------------------------------------------------------------- learning
@@ -570,8 +617,10 @@ class CuReSAC(SAC):
             self.policy.set_training_mode(True)
             self._update_learning_rates()
             for _ in range(gradient_steps):
+                random_state = np.random.get_state(legacy=False)
                 batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                self._gradient_step(batch)
+                with self._guard.update(self, batch, random_state):
+                    self._gradient_step(batch)
                 self._n_updates += 1
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self._overlapped is not None:
@@ -636,10 +685,11 @@ class CuReSAC(SAC):
             if srl.optimizer is not None:
                 srl.optimizer.zero_grad()
             loss.backward()
+            self._guard.check("SRL loss", loss, srl.optimizer)
             if latents.grad is not None:
                 self.policy.encoder_optimizer.pull("srl", encoded.latents, latents.grad)
             if srl.optimizer is not None:
-                srl.optimizer.step()
+                self._guard.step(srl.optimizer)
         check_srl_error(error, len(batch.observations), look=self._n_updates == 0)
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
@@ -650,6 +700,7 @@ class CuReSAC(SAC):
 
     def _curious_reward(self, error: th.Tensor) -> th.Tensor:
         """r_cure of this batch, [B, 1]: computed afresh, never stored, hence never stale."""
+        self._guard.check("SRL error", error.square().mean())
         self.policy.curiosity.update(error)
         reward = self.policy.curiosity(error)
         self._log(
@@ -691,9 +742,10 @@ class CuReSAC(SAC):
         critic_loss = 0.5 * sum(F.mse_loss(q, target) for q in q_values)
         agent.critic.optimizer.zero_grad()
         critic_loss.backward()  # type: ignore[union-attr]
+        self._guard.check(f"{agent.name} critic's loss", critic_loss, agent.critic.optimizer)  # type: ignore[arg-type]
         if agent.trains_encoder:
             self.policy.encoder_optimizer.pull(agent.name, encoded.latents, latents.grad)  # type: ignore[arg-type]
-        agent.critic.optimizer.step()
+        self._guard.step(agent.critic.optimizer)
         prefix = self._prefix(agent)
         self._log({f"{prefix}critic_loss": critic_loss, f"{prefix}q_value": q_values[0].mean()})  # type: ignore[dict-item]
         if self._n_updates % self.actor_update_interval == 0:
@@ -713,7 +765,8 @@ class CuReSAC(SAC):
         actor_loss = (temperature * log_prob - q_values).mean()
         agent.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(agent.actor.parameters()))
-        agent.actor.optimizer.step()
+        self._guard.check(f"{agent.name} actor's loss", actor_loss, agent.actor.optimizer)
+        self._guard.step(agent.actor.optimizer)
 
         prefix = self._prefix(agent)
         self._log({f"{prefix}actor_loss": actor_loss, f"{prefix}ent_coef": temperature.squeeze()})
@@ -721,16 +774,17 @@ class CuReSAC(SAC):
             ent_coef_loss = -(agent.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()  # type: ignore[operator]
             agent.ent_coef_optimizer.zero_grad()
             ent_coef_loss.backward()
-            agent.ent_coef_optimizer.step()
+            self._guard.check(f"{agent.name} temperature's loss", ent_coef_loss, agent.ent_coef_optimizer)
+            self._guard.step(agent.ent_coef_optimizer)
             self._log({f"{prefix}ent_coef_loss": ent_coef_loss})
 
     def _update_targets(self) -> None:
         """Polyak step of the target encoder and the target critics."""
         policy = self.policy
-        _polyak(policy.encoder, policy.encoder_target, self.encoder_tau)
+        _polyak(policy.encoder, policy.encoder_target, self._guard.rate(self.encoder_tau))
         for agent in (self._task_agent, self._curious_agent):
             if agent is not None:
-                _polyak(agent.critic, agent.critic_target, self.tau)
+                _polyak(agent.critic, agent.critic_target, self._guard.rate(self.tau))
 
     @property
     def _in_srl_phase(self) -> bool:
@@ -788,6 +842,7 @@ class CuReSAC(SAC):
         try:
             with self._leaving_learn:
                 super().learn(*arguments)
+                self._guard.report(self)
         finally:
             self._overlapped = self._resumed = None
             self._callbacks = []
@@ -897,7 +952,10 @@ class CuReSAC(SAC):
         self.logger.record("time/environment_steps", self.num_timesteps * self._action_repeat)
         if self._mixer is not None and self._mixer.n_steps > 0:
             self.logger.record("rollout/curious_share", self._mixer.pop_share())
+        if self._transition_guard.n_bad > 0:
+            self.logger.record("rollout/bad_transitions", self._transition_guard.n_bad)
         super().dump_logs()
+        self._guard.report(self)
 
     # ---------------------------------------------------------------- saving
 
@@ -998,8 +1056,8 @@ class CuReSAC(SAC):
         else:
             name = path if isinstance(path, str | pathlib.Path) else "the file"
             raise ArchiveError(
-                f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that is "
-                "in a file: if you know where it comes from, load it with trusted=True."
+                f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
+                "is in a file: if you know where it comes from, load it with trusted=True."
             )
 
     @classmethod
@@ -1029,11 +1087,7 @@ class CuReSAC(SAC):
         return resume(cls, path, env, custom_objects, device=device, **kwargs)  # type: ignore[return-value]
 
     def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            *("_metrics", "_task_agent", "_curious_agent", "_overlapped"),
-            *("_checkpoint_writer", "_resumed", "_callbacks", "_leaving_learn"),
-        ]
+        return [*super()._excluded_save_params(), *NOT_SAVED]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -1051,8 +1105,13 @@ class CuReSAC(SAC):
 
 
 @th.no_grad()
-def _polyak(source: th.nn.Module, target: th.nn.Module, tau: float) -> None:
-    """target <- target + tau (source - target), exactly unchanged where they are equal; buffers are copied."""
-    th._foreach_lerp_(list(target.parameters()), list(source.parameters()), tau)
+def _polyak(source: th.nn.Module, target: th.nn.Module, tau: float | th.Tensor) -> None:
+    """target <- target + tau (source - target), exactly unchanged where they are equal, or tau is 0; buffers copied."""
+    parameters: list[th.Tensor] = list(target.parameters())
+    goals: list[th.Tensor] = list(source.parameters())
+    if isinstance(tau, th.Tensor):
+        th._foreach_lerp_(parameters, goals, [tau] * len(parameters))
+    else:
+        th._foreach_lerp_(parameters, goals, tau)
     for buffer, target_buffer in zip(source.buffers(), target.buffers(), strict=True):
         target_buffer.copy_(buffer)

@@ -10,6 +10,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_cure.guards import Guard
+
 #: Every how many updates the sequential mode measures how far each source moved the encoder (it costs a copy)
 SHARE_INTERVAL = 50
 
@@ -45,6 +47,8 @@ class EncoderOptimizer:
         **optimizer_kwargs: Any,
     ):
         self.parameters = list(encoder.parameters())
+        #: Looks at every gradient before it counts; the algorithm puts its own here
+        self.guard = Guard()
         self.mode = mode
         self._make_optimizer = partial(optimizer_class, self.parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
@@ -94,17 +98,21 @@ class EncoderOptimizer:
             optimizer = self.optimizers[source]
             optimizer.zero_grad()
             latents.backward(gradient)
+            self.guard.check(f"{source} loss at the encoder", None, optimizer)
             if self._n_steps % SHARE_INTERVAL == 0:
                 before = [parameter.detach().clone() for parameter in self.parameters]
-                optimizer.step()
+                self.guard.step(optimizer)
                 moved = [now.detach() - then for now, then in zip(self.parameters, before, strict=True)]
                 self._pulls[source] = th.linalg.vector_norm(th.stack(th._foreach_norm(moved)))
             else:
-                optimizer.step()
+                self.guard.step(optimizer)
         else:
+            self.guard.check(f"{source} loss at the latents", None, gradients=[gradient])
             # The policy may have moved to another device since this average was made.
             mean_square = self.mean_squares[source].to(norm.device)
-            self.mean_squares[source] = mean_square.lerp_(norm.square(), 1 - self.decay)
+            # A bad gradient counts as one of the usual size.
+            square = self.guard.choose(norm.square(), otherwise=mean_square / max(self.weights[source], 1e-30))
+            self.mean_squares[source] = mean_square.lerp_(square, 1 - self.decay)
             # Undo the bias of an average that starts at zero, as Adam does.
             self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
             size = (self.mean_squares[source] / self.weights[source]).sqrt().clamp(min=1e-30)
@@ -120,13 +128,18 @@ class EncoderOptimizer:
             self._set_rate(optimizer, self.learning_rate * len(self._pulls) ** 0.5)
             optimizer.zero_grad()
             self._latents.backward(th.stack(list(self._pulls.values())).sum(dim=0))
-            optimizer.step()
+            self.guard.check("joint loss at the encoder", None, optimizer)
+            self.guard.step(optimizer)
             self._latents = None
         if self._pulls:
             sizes = {source: pull.norm() for source, pull in self._pulls.items()}
             total = th.stack(list(sizes.values())).sum().clamp(min=1e-30)
             self.shares = {source: size / total for source, size in sizes.items()}
             self._pulls = {}
+
+    def discard(self) -> None:
+        """Forget the pulls of an update that is not brought to its end."""
+        self._pulls, self._norms, self._latents = {}, {}, None
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """

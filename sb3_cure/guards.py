@@ -1,0 +1,490 @@
+"""What is not finite reaches neither parameters nor replay buffer, and its source is named.
+
+``Guard`` stands before every step of an optimiser, ``TransitionGuard`` before the replay buffer and the policy.
+"""
+
+import contextlib
+import copy
+import inspect
+import json
+import math
+import tempfile
+import warnings
+from collections import deque
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import get_system_info
+from stable_baselines3.sac.sac import SAC
+
+from sb3_cure.buffers import transitions
+
+if TYPE_CHECKING:
+    from sb3_cure.cure_sac import CuReSAC
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+#: Gradients with a larger norm overflow float32 where Adam squares them
+LARGEST_NORM = math.sqrt(np.finfo(np.float32).max)
+#: How many of the latest batches have their indices remembered until the flag is read, where it is not read at once
+BATCHES_REMEMBERED = 4096
+
+
+class NonFiniteError(ValueError):
+    """A loss or a gradient was not finite; the step was not taken.
+
+    :param source: What it was, say ``"task critic's loss"`` or ``"gradient of the SRL loss"``
+    :param value: Its value
+    :param update: Number of the update
+    :param post_mortem: Where more about it was written
+    """
+
+    def __init__(self, source: str, value: float, update: int, post_mortem: str = ""):
+        super().__init__(source, value, update, post_mortem)
+        self.source = source
+        self.value = value
+        self.update = update
+        self.post_mortem = post_mortem
+
+    def __str__(self) -> str:
+        look = f"look at {self.post_mortem}, then " if self.post_mortem else ""
+        return (
+            f"the {self.source} was {self.value:g} in update {self.update}, but losses and gradients (their squares, "
+            f"too) must be finite: the parameters did not take it; {look}lower the learning rate, or fix the SRL head "
+            "or the rewards."
+        )
+
+
+class Check(NamedTuple):
+    """One look at a loss and its gradients.
+
+    :param update: Number of the update
+    :param order: Number of the check within the update
+    :param loss: The loss
+    :param norm: Norm of the gradients
+    """
+
+    update: float
+    order: float
+    loss: float
+    norm: float
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether all of it may go into an optimiser."""
+        return math.isfinite(self.loss) and self.norm <= LARGEST_NORM
+
+
+class Draw(NamedTuple):
+    """Where a batch came from.
+
+    :param update: Number of the update
+    :param timestep: Agent steps at that time
+    :param rows: Rows of the replay buffer, [B], if they are known
+    :param env_inds: Environment of each, [B], if they are known
+    """
+
+    update: int
+    timestep: int
+    rows: np.ndarray | None
+    env_inds: np.ndarray | None
+
+
+class Guard:
+    """Looks at losses and gradients before they are stepped along.
+
+    On a CPU it looks at once and raises before the step. Reading a value from a GPU would wait for it: there
+    (``deferred``) a flag on the device turns the bad step and the rest of its update into nothing, later updates go on,
+    and ``report``, called where values are read anyway, raises for the first source.
+
+    :param deferred: Whether to look later
+    """
+
+    def __init__(self, deferred: bool = False):
+        self.deferred = deferred
+        self._update = 0
+        self._order = 0
+        # By name, the latest check; while deferred a tensor [4], kept since the first update that went bad
+        self._checks: dict[str, Check | th.Tensor] = {}
+        # While deferred, 1.0 on the device if something in this update, or in an earlier one, was bad
+        self._bad: th.Tensor | None = None
+        self._was_bad: th.Tensor | None = None
+        self._draws: deque[Draw] = deque(maxlen=BATCHES_REMEMBERED)
+
+    def check(
+        self,
+        name: str,
+        loss: th.Tensor | None,
+        optimizer: th.optim.Optimizer | None = None,
+        gradients: Sequence[th.Tensor] = (),
+    ) -> None:
+        """
+        :param name: What is looked at, with its article left out
+        :param loss: Scalar; None: only its gradients are known
+        :param optimizer: Whose parameters' gradients are looked at
+        :param gradients: Further gradients
+        :raises NonFiniteError: if something is not finite, unless that is to be found out later
+        """
+        found = list(gradients)
+        if optimizer is not None:
+            found += [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        norm = th.linalg.vector_norm(th.stack(th._foreach_norm(found))) if found else None
+        loss = None if loss is None else loss.detach()
+        self._order += 1
+        if self.deferred:
+            self._check_later(name, loss, norm)
+            return
+        check = Check(
+            self._update, self._order, 0.0 if loss is None else float(loss), 0.0 if norm is None else float(norm)
+        )
+        self._checks[name] = check
+        if not check.is_sound:
+            raise _error(name, check)
+
+    def _check_later(self, name: str, loss: th.Tensor | None, norm: th.Tensor | None) -> None:
+        device = next(value.device for value in (loss, norm) if value is not None)
+        zero = th.zeros((), device=device)
+        loss = zero if loss is None else loss.float().reshape(())
+        norm = zero if norm is None else norm.float()
+        bad = (~(loss.isfinite() & (norm <= LARGEST_NORM))).float()
+        self._bad = bad if self._bad is None else th.maximum(self._bad, bad)
+        now = th.stack([th.full_like(zero, self._update), th.full_like(zero, self._order), loss, norm])
+        before = self._checks.get(name)
+        if self._was_bad is not None and isinstance(before, th.Tensor):
+            now = th.where(self._was_bad > 0, before, now)
+        self._checks[name] = now
+
+    def step(self, optimizer: th.optim.Optimizer) -> None:
+        """
+        :param optimizer: Makes its step, unless a check in this update has found something bad
+        """
+        if self._bad is None:
+            optimizer.step()
+        elif _is_fused_adam(optimizer):
+            # What torch's GradScaler does: the kernel itself looks at the flag.
+            optimizer.found_inf = self._bad  # type: ignore[attr-defined]
+            try:
+                optimizer.step()
+            finally:
+                del optimizer.found_inf  # type: ignore[attr-defined]
+        elif not self._bad:
+            # Other optimisers know no flag: the device is waited for.
+            optimizer.step()
+
+    def choose(self, value: th.Tensor, otherwise: th.Tensor) -> th.Tensor:
+        """
+        :param value: What the update brings
+        :param otherwise: What there is instead if something in this update was bad
+        :return: One of them
+        """
+        return value if self._bad is None else th.where(self._bad > 0, otherwise, value)
+
+    def rate(self, rate: float) -> float | th.Tensor:
+        """
+        :param rate: Rate of a moving average
+        :return: The same, or a tensor that is 0 if something in this update was bad
+        """
+        return rate if self._bad is None else rate * (1 - self._bad)
+
+    @contextlib.contextmanager
+    def update(self, model: "CuReSAC", batch: ReplayBufferSamples, random_state: dict[str, Any]) -> Iterator[None]:
+        """Within this context an update is made, which is bad as a whole if something in it is.
+
+        :param model: The model
+        :param batch: Its samples
+        :param random_state: NumPy's random state before they were drawn
+        :raises NonFiniteError: with a post-mortem; running statistics are then what they were
+        """
+        self._start(model._n_updates)
+        # What forward passes write: running statistics of the curious reward, of normalisation layers, of heads
+        statistics = [(buffer, buffer.clone()) for buffer in model.policy.buffers() if buffer.is_floating_point()]
+        if self.deferred:
+            self._draws.append(_draw(model, len(batch.rewards), random_state))
+        try:
+            yield
+        except NonFiniteError as error:
+            for buffer, before in statistics:
+                buffer.copy_(before)
+            model.policy.encoder_optimizer.discard()
+            draw = _draw(model, len(batch.rewards), random_state)
+            raise self._post_mortem(model, error, draw, batch, "as it was sampled") from None
+        for buffer, before in statistics:
+            if self._bad is not None:
+                buffer.copy_(self.choose(buffer, before))
+
+    def _start(self, update: int) -> None:
+        if self._bad is not None:
+            self._was_bad = self._bad if self._was_bad is None else th.maximum(self._was_bad, self._bad)
+        self._bad = None
+        self._update, self._order = update, 0
+        if not self.deferred:
+            self._checks = {}
+
+    def report(self, model: "CuReSAC") -> None:
+        """Read the flag, where values are read anyway.
+
+        :param model: The model
+        :raises NonFiniteError: with a post-mortem, for the first source since the last report, if there is one
+        """
+        if not self.deferred:
+            return
+        self._start(self._update)
+        was_bad, self._was_bad = self._was_bad, None
+        draws, self._draws = self._draws, deque(maxlen=BATCHES_REMEMBERED)
+        if was_bad is None or not was_bad:
+            return
+        latest = {name: Check(*check.tolist()) for name, check in self._checks.items() if isinstance(check, th.Tensor)}
+        name, first = min(((n, c) for n, c in latest.items() if not c.is_sound), key=lambda item: item[1][:2])
+        self._checks = {name: check for name, check in latest.items() if check.update == first.update}
+        error = _error(name, first)
+        draw = next((draw for draw in draws if draw.update == error.update), None)
+        batch, origin = None, "no longer known"
+        if draw is not None and draw.rows is not None and draw.env_inds is not None:
+            origin = "read again from the replay buffer when the flag was read; transitions may have been replaced"
+            with contextlib.suppress(IndexError):
+                batch = transitions(model.replay_buffer, draw.rows, draw.env_inds, model._vec_normalize_env)  # type: ignore[arg-type]
+        error = self._post_mortem(
+            model, error, draw or Draw(error.update, model.num_timesteps, None, None), batch, origin
+        )
+        self._checks = {}
+        raise error
+
+    def _post_mortem(
+        self, model: "CuReSAC", error: NonFiniteError, draw: Draw, batch: ReplayBufferSamples | None, origin: str
+    ) -> NonFiniteError:
+        """The error, which now says where the batch, the losses and the settings lie."""
+        losses = {
+            name: {"loss": _plain(check.loss), "gradient_norm": _plain(check.norm)}
+            for name, check in self._checks.items()
+            if isinstance(check, Check)
+        }
+        report = {
+            "source": error.source,
+            "value": _plain(error.value),
+            "update": error.update,
+            "agent_steps": draw.timestep,
+            "losses": losses,
+            "rows": None if draw.rows is None else draw.rows.tolist(),
+            "environments": None if draw.env_inds is None else draw.env_inds.tolist(),
+            "batch": origin,
+            "config": _settings(model),
+            "versions": {"sb3_cure": version("sb3_cure"), **get_system_info(print_info=False)[0]},
+        }
+        directory = model.logger.dir
+        if directory is not None and not Path(directory).is_dir():
+            directory = None
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=f"post_mortem_{error.update}_", dir=directory))
+            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False))
+            if batch is not None:
+                arrays = {name: value for name, value in batch._asdict().items() if isinstance(value, th.Tensor)}
+                np.savez_compressed(folder / "batch.npz", **{k: v.cpu().numpy() for k, v in arrays.items()})  # type: ignore[arg-type]
+            where = str(folder)
+        except OSError as failure:
+            where = f"the logs (a post-mortem could not be written: {failure})"
+        return NonFiniteError(error.source, error.value, error.update, where)
+
+
+def _error(name: str, check: Check) -> NonFiniteError:
+    if math.isfinite(check.loss):
+        return NonFiniteError(f"gradient of the {name}", check.norm, int(check.update))
+    return NonFiniteError(name, check.loss, int(check.update))
+
+
+def _is_fused_adam(optimizer: th.optim.Optimizer) -> bool:
+    return type(optimizer) in (th.optim.Adam, th.optim.AdamW) and all(g.get("fused") for g in optimizer.param_groups)
+
+
+def _draw(model: "CuReSAC", batch_size: int, random_state: dict[str, Any]) -> Draw:
+    """Rows and environments of the batch that was just sampled."""
+    buffer: ReplayBuffer = model.replay_buffer  # type: ignore[assignment]
+    drawn = getattr(buffer, "last_sampled", None)
+    if drawn is None:
+        # SB3's buffers do not remember: draw again, but stop at the rows. The environments are drawn next.
+        now = np.random.get_state()
+        np.random.set_state(random_state)
+        try:
+            again = copy.copy(buffer)
+            again._get_samples = lambda rows, env=None: rows  # type: ignore[method-assign, assignment, return-value, misc]
+            rows: Any = again.sample(batch_size)
+            if isinstance(rows, np.ndarray):
+                drawn = rows, np.random.randint(0, high=buffer.n_envs, size=(len(rows),))
+        finally:
+            np.random.set_state(now)
+    rows, env_inds = drawn or (None, None)
+    return Draw(model._n_updates, model.num_timesteps, rows, env_inds)
+
+
+def _settings(model: "CuReSAC") -> dict[str, Any]:
+    """Arguments of the constructor: plain ones as they are, others as they print."""
+    names = [*inspect.signature(type(model).__init__).parameters, *inspect.signature(SAC.__init__).parameters]
+    found = {name: getattr(model, name) for name in names if name != "env" and hasattr(model, name)}
+    found["policy"] = f"{model.policy_class.__module__}.{model.policy_class.__qualname__}"
+    return {name: _plain(value) for name, value in found.items()}
+
+
+def _plain(value: Any) -> Any:
+    """What strict JSON can hold."""
+    if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    return repr(value)
+
+
+# ------------------------------------------------------------------- transitions
+
+
+class TransitionGuard:
+    """Looks at what environments return before it is stored or shown to the policy.
+
+    With ``skip`` a bad transition is marked in its info (``"bad_transition"``: why), by which replay buffers know never
+    to sample it; finite numbers are stored in its place, and the policy goes on with the last good observation. The
+    transition that starts from such a stand-in is as bad.
+
+    :param skip: Whether bad transitions are left out rather than an error
+    """
+
+    def __init__(self, skip: bool):
+        self.skip = skip
+        #: How many transitions were left out
+        self.n_bad = 0
+        self._warned: set[str] = set()
+        # The latest observations that were looked at, and of which environments they are stand-ins
+        self._seen: Observations | None = None
+        self._stand_ins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
+
+    def admit_first(self, observations: Observations, original: Observations | None, timestep: int) -> Observations:
+        """
+        :param observations: What the policy is about to see, [n_envs, ...]; news after a reset only
+        :param original: The same before ``VecNormalize``, if there is one
+        :param timestep: Agent steps so far, for the message
+        :return: The same, with zeros in place of what is not finite
+        :raises ValueError: if something is not finite and must not be skipped
+        """
+        if observations is self._seen:
+            return observations
+        bad = _not_finite(observations) | (False if original is None else _not_finite(original))
+        for i in map(int, np.flatnonzero(bad)):
+            self._complain("first observation", i, (_row(observations, i), _row(original, i)), timestep)
+        if bad.any():
+            observations = _replaced(observations, bad, None)
+        self._seen, self._stand_ins = observations, bad
+        return observations
+
+    def admit(
+        self,
+        last_obs: Observations,
+        new_obs: Observations,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+        timestep: int,
+    ) -> tuple[Observations, np.ndarray, list[dict[str, Any]]]:
+        """
+        :param last_obs: Observations on which the agent acted, [n_envs, ...]
+        :param new_obs: Observations that followed; where an episode ended, the first of the next
+        :param rewards: Rewards, [n_envs]
+        :param dones: Whether the episode ended, [n_envs]
+        :param infos: One dictionary per environment
+        :param timestep: Agent steps so far, for the message
+        :return: New observations, rewards and infos that are fit to be stored
+        :raises ValueError: if something is not finite and must not be skipped
+        """
+        ends = {int(i): infos[i].get("terminal_observation") for i in np.flatnonzero(dones)}
+        bad_rewards, bad_obs = _not_finite(rewards), _not_finite(new_obs)
+        bad_ends = [i for i, end in ends.items() if end is not None and _first_bad(end) is not None]
+        stand_ins = self._stand_ins if last_obs is self._seen else np.zeros(len(dones), dtype=bool)
+        self._seen, self._stand_ins = new_obs, bad_obs
+        if not (bad_ends or (bad_rewards | bad_obs | stand_ins).any()):
+            return new_obs, rewards, infos
+
+        reasons: dict[int, str] = {}
+        for i in range(len(dones)):
+            if stand_ins[i]:
+                reasons[i] = f"environment {i} returned no finite observation before agent step {timestep}"
+            if bad_rewards[i]:
+                reasons[i] = self._complain("reward", i, rewards[i], timestep)
+            if bad_obs[i]:
+                reason = self._complain("observation", i, _row(new_obs, i), timestep)
+                if ends.get(i) is None:
+                    reasons[i] = reason
+            if i in bad_ends:
+                reasons[i] = self._complain("terminal observation", i, ends[i], timestep)
+        self.n_bad += len(reasons)
+        infos = [{**info, "bad_transition": reasons[i]} if i in reasons else info for i, info in enumerate(infos)]
+        for i in bad_ends:
+            infos[i]["terminal_observation"] = _row(last_obs, i)
+        self._seen = _replaced(new_obs, bad_obs, last_obs)
+        return self._seen, np.where(bad_rewards, 0, rewards).astype(rewards.dtype), infos
+
+    def _complain(self, kind: str, env: int, value: Any, timestep: int) -> str:
+        """Raise, or warn of the first of a kind, and return what is wrong."""
+        what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
+        reason = f"environment {env} returned {what} at agent step {timestep}, but {kind}s must be finite"
+        if not self.skip:
+            raise ValueError(
+                f"{reason}: it was not stored; fix the environment, or leave such transitions out with "
+                "on_bad_transition='skip'."
+            )
+        if kind not in self._warned:
+            self._warned.add(kind)
+            warnings.warn(
+                f"{reason}: the transition is left out (on_bad_transition='skip'), and rollout/bad_transitions counts "
+                "this and others; fix the environment.",
+                stacklevel=2,
+            )
+        return reason
+
+
+def _not_finite(values: Observations) -> npt.NDArray[np.bool_]:
+    """Rows in which a number is not finite, [n]."""
+    if isinstance(values, dict):
+        return np.logical_or.reduce([_not_finite(value) for value in values.values()])
+    if not np.issubdtype(values.dtype, np.floating):
+        return np.zeros(len(values), dtype=bool)
+    return ~np.logical_and.reduce(np.isfinite(values.reshape(len(values), -1)), axis=1)
+
+
+def _first_bad(value: Any) -> float | None:
+    """The first number that is not finite in an array, or in nested ones."""
+    if isinstance(value, dict | tuple):
+        found = map(_first_bad, value.values() if isinstance(value, dict) else value)
+        return next((bad for bad in found if bad is not None), None)
+    numbers = np.ravel([] if value is None else value)
+    bad = numbers[~np.isfinite(numbers)]
+    return float(bad[0]) if len(bad) > 0 else None
+
+
+def _row(values: Observations | None, i: int) -> Any:
+    if values is None:
+        return None
+    return {key: value[i] for key, value in values.items()} if isinstance(values, dict) else values[i]
+
+
+def _replaced(values: Observations, rows: npt.NDArray[np.bool_], by: Any) -> Any:
+    """A copy with these rows of others, or with zeros in them."""
+    if isinstance(values, dict):
+        return {key: _replaced(value, rows, None if by is None else by[key]) for key, value in values.items()}
+    values = values.copy()
+    values[rows] = 0 if by is None else by[rows]
+    return values
+
+
+def check_actions(actions: np.ndarray, timestep: int) -> None:
+    """
+    :param actions: Actions of one step, [n_envs, ...]
+    :param timestep: Agent steps so far, for the message
+    :raises ValueError: if one is not finite
+    """
+    for i in np.flatnonzero(_not_finite(actions)):
+        raise ValueError(
+            f"the agent chose the action {actions[i]} for environment {i} at agent step {timestep}, but actions must "
+            "be finite: it was not executed; check action_noise and the policy's parameters, and load an earlier model "
+            "if these are not finite."
+        )
