@@ -27,7 +27,7 @@ from stable_baselines3.sac import policies as sb3_policies
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked
 from sb3_cure.checks import (
     check_action_space,
     check_arguments,
@@ -522,6 +522,7 @@ class CuReSAC(SAC):
             # The environments have gone on: another `learn` starts with a reset.
             self._last_obs = None
             raise
+        skip_marked(replay_buffer, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     # -------------------------------------------------------------- learning

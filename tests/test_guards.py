@@ -376,8 +376,8 @@ def test_a_post_mortem_that_cannot_be_written_hides_nothing(monkeypatch: pytest.
 # ----------------------------------------------------------------- transitions
 
 
-class FlawedBox(VectorBox):
-    """``VectorBox`` with episodes of 5 steps, which says what is told at given steps, counted from the first reset.
+class Flawed(VectorBox):
+    """Episodes of 5 steps, in which what is told is returned at given steps, counted from the first reset.
 
     :param flaws: By step: ``"reward"``, ``"observation"`` or ``"reset"`` (the first observation of the episode that
         starts after this step)
@@ -385,7 +385,7 @@ class FlawedBox(VectorBox):
     """
 
     def __init__(self, flaws: dict[int, str] | None = None, value: float = NAN):
-        super().__init__(episode_length=5)
+        super().__init__(episode_length=5)  # with the defaults of the class that comes next
         self.flaws, self.value, self.total = dict(flaws or {}), value, 0
 
     def reset(self, **kwargs: Any) -> Any:
@@ -401,6 +401,14 @@ class FlawedBox(VectorBox):
         if flaw == "observation":
             observation[0] = self.value
         return observation, self.value if flaw == "reward" else reward, terminated, truncated, info
+
+
+class FlawedBox(Flawed, VectorBox):
+    """Vectors."""
+
+
+class FlawedPixels(Flawed, PixelBox):
+    """Images, which are whole numbers: only rewards can be flawed."""
 
 
 PLAIN: dict[str, Any] = dict(srl=None, curiosity=None)
@@ -443,13 +451,17 @@ def test_after_a_bad_transition_training_starts_with_a_reset() -> None:
     assert env.n_steps == 1
 
 
-def skipping(flaws: list[dict[int, str]], steps: int, value: float = NAN, **kwargs: Any) -> tuple[CuReSAC, list[Any]]:
+def skipping(
+    flaws: list[dict[int, str]], steps: int, value: float = NAN, env: type[Flawed] = FlawedBox
+) -> tuple[CuReSAC, list[Any]]:
     """A model that has collected, and what its replay buffer was given."""
-    venv = DummyVecEnv([functools.partial(FlawedBox, each, value) for each in flaws])
-    model = tiny_model("MlpPolicy", venv, on_bad_transition="skip", **{"learning_starts": 1000, **kwargs})
+    venv = DummyVecEnv([functools.partial(env, each, value) for each in flaws])
+    policy = "MlpPolicy" if env is FlawedBox else "CnnPolicy"
+    model = tiny_model(policy, venv, on_bad_transition="skip", learning_starts=1000)
     given_: list[Any] = []
-    add = model.replay_buffer.add
-    model.replay_buffer.add = lambda *args: (given_.append(copy.deepcopy(args)), add(*args))
+    buffer = model.replay_buffer
+    # Of the class that it then has: SB3's buffer becomes another one.
+    buffer.add = lambda *args: (given_.append(copy.deepcopy(args)), type(buffer).add(buffer, *args))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model.learn(steps * len(flaws))
@@ -511,13 +523,17 @@ def test_on_a_bad_observation_the_policy_acts_on_the_last_good_one() -> None:
     assert not np.array_equal(stored[8][0], stored[7][0])
 
 
-@pytest.mark.xfail(reason="replay buffers do not leave marked transitions out yet", strict=True)
-def test_skipped_transitions_are_never_sampled() -> None:
-    """Of SB3's own buffer: the rewards of all samples are positive, a skipped one's would be 0."""
-    flaws = {t: "reward" for t in range(2, 40, 3)}
-    model, _ = skipping([flaws, {}], 40)
+@pytest.mark.parametrize("env", [FlawedBox, FlawedPixels], ids=["ReplayBuffer", "FrameStackReplayBuffer"])
+def test_skipped_transitions_are_never_sampled(env: Any) -> None:
+    """Every sample has the action of a transition that was not marked."""
+    model, stored = skipping([{t: "reward" for t in range(2, 40, 3)}, {}], 40, env=env)
+    good = {row[2][i].tobytes() for row in stored for i in range(2) if "bad_transition" not in row[5][i]}
+    assert model._transition_guard.n_bad == 13 and len(good) == 67
     batch = model.replay_buffer.sample(2000)
-    assert (batch.rewards != 0).all()
+    assert {action.tobytes() for action in batch.actions.numpy()} == good
+    # The post-mortem of an update knows those that were drawn instead of bad ones.
+    rows, env_inds = model.replay_buffer.last_sampled
+    assert th.equal(transitions(model.replay_buffer, rows, env_inds).rewards, batch.rewards)
 
 
 @pytest.mark.parametrize("extras", [{}, PLAIN], ids=["all", "plain SAC"])
