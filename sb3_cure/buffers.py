@@ -5,6 +5,7 @@ import math
 import os
 import tempfile
 import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,161 @@ except ImportError:
     psutil = None  # type: ignore[assignment]
 
 
-class FrameStackReplayBuffer(ReplayBuffer):
+#: Keys of ``info`` that mark a transition which is never to be sampled: ``FaultTolerantSubprocVecEnv`` sets
+#: ``env_fault`` where an environment failed in it, ``CuReSAC(on_bad_transition="skip")`` sets ``bad_transition``.
+MARKS = ("env_fault", "bad_transition")
+
+
+def is_marked(info: Mapping[str, Any]) -> bool:
+    """
+    :param info: What an environment told of a transition
+    :return: Whether that transition is never to be sampled
+    """
+    return any(info.get(mark) is not None for mark in MARKS)
+
+
+def unmarked(buffer: ReplayBuffer, rows: np.ndarray, env_inds: np.ndarray) -> npt.NDArray[np.bool_]:
+    """
+    :param buffer: A replay buffer
+    :param rows: Row positions, [n]
+    :param env_inds: Environment of each, [n]
+    :return: Which of these transitions can be sampled, [n]
+    """
+    return ~buffer.marked[rows, env_inds] if isinstance(buffer, _SkipsMarked) else np.ones(len(rows), dtype=bool)
+
+
+class _SkipsMarked(ReplayBuffer):
+    """
+    What a replay buffer needs that never samples marked transitions (see ``MARKS``).
+
+    Rows hold the transitions of all environments, so that one of them cannot be left out: its place is kept and marked.
+    Where a marked one is drawn, another is drawn in its stead from all those that are not marked, so that sampling
+    stays uniform. As long as none is drawn, the random numbers used are SB3's.
+    """
+
+    marked: npt.NDArray[np.bool_]  # [buffer_size, n_envs]
+    #: Rows and environments of the latest batch, [batch_size] each
+    last_sampled: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _mark(self, infos: list[dict[str, Any]]) -> npt.NDArray[np.bool_]:
+        """
+        Mark what ``infos`` say of the row at ``pos``, which must not have been moved yet, and of rows before it.
+
+        :param infos: One dictionary per environment; ``env_fault_steps`` tells how many of its latest transitions,
+            this one included, are marked (by default 1)
+        :return: Which transitions of the row are marked, [n_envs]
+        """
+        marks = np.array([is_marked(info) for info in infos])
+        self.marked[self.pos] = marks
+        for i in np.flatnonzero(marks):
+            n_steps = min(infos[i].get("env_fault_steps", 1), self.buffer_size)
+            self.marked[(self.pos - np.arange(n_steps)) % self.buffer_size, i] = True
+        return marks
+
+    def _without_marked(self, rows: np.ndarray, env_inds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param rows: Row positions that were drawn, [n]
+        :param env_inds: Environment of each, [n]
+        :return: The same, but others where these are marked
+        :raises ValueError: If all transitions are marked
+        """
+        bad = self.marked[rows, env_inds]
+        if not bad.any():
+            return rows, env_inds
+        stored = (self.pos - 1 - np.arange(self.size())) % self.buffer_size
+        good_rows, good_envs = np.nonzero(~self.marked[stored])
+        if len(good_rows) == 0:
+            raise ValueError(
+                f"All {self.size() * self.n_envs} transitions in the replay buffer are marked as faulty, but at least "
+                "one good one is needed to learn from: raise learning_starts, or mend the environments."
+            )
+        drawn = np.random.randint(0, len(good_rows), size=int(bad.sum()))
+        rows, env_inds = rows.copy(), env_inds.copy()
+        rows[bad], env_inds[bad] = stored[good_rows[drawn]], good_envs[drawn]
+        return rows, env_inds
+
+
+class SkippingReplayBuffer(_SkipsMarked):
+    """
+    SB3's ``ReplayBuffer``, which never samples transitions whose ``info`` is marked (see ``MARKS``).
+
+    For SB3's algorithms on a ``FaultTolerantSubprocVecEnv``: ``SAC(..., replay_buffer_class=SkippingReplayBuffer)``.
+    ``CuReSAC`` needs no telling. Without marks it returns the same batches as ``ReplayBuffer``, bit for bit.
+
+    :param args: As of ``ReplayBuffer``
+    :param kwargs: As of ``ReplayBuffer``
+    :raises ValueError: If ``optimize_memory_usage`` is set
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._start_marking()
+
+    def _start_marking(self) -> None:
+        if self.optimize_memory_usage:
+            raise ValueError(
+                "optimize_memory_usage is True, but then a transition cannot be left out, as its observation is the "
+                "next one of another: leave it False."
+            )
+        self.marked = np.zeros((self.buffer_size, self.n_envs), dtype=bool)
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment; of marked ones nothing but the mark.
+
+        :param obs: Observations, [n_envs, ...]
+        :param next_obs: Successors
+        :param action: Actions, [n_envs, ...]
+        :param reward: Rewards, [n_envs]
+        :param done: Whether the episode ended, [n_envs]
+        :param infos: One dictionary per environment
+        """
+        row, marks = self.pos, self._mark(infos)
+        super().add(obs, next_obs, action, reward, done, infos)
+        for array in (self.observations, self.next_observations, self.actions, self.rewards):
+            array[row, marks] = 0
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        self.last_sampled = self._without_marked(batch_inds, env_inds)
+        return transitions(self, *self.last_sampled, env)
+
+
+def skip_marked(buffer: ReplayBuffer, infos: list[dict[str, Any]]) -> None:
+    """
+    Before a row is added: see to it that a replay buffer never samples what is marked in it.
+
+    SB3's ``ReplayBuffer`` becomes a ``SkippingReplayBuffer`` with the first mark that it meets.
+
+    :param buffer: A replay buffer
+    :param infos: What it is about to be given
+    :raises ValueError: If there is a mark and the buffer is of a class that cannot skip it
+    """
+    if isinstance(buffer, _SkipsMarked) or not any(is_marked(info) for info in infos):
+        return
+    if type(buffer) is not ReplayBuffer:
+        raise ValueError(
+            f"A transition is to be left out of the replay buffer ({next(_told(infos))}), which a "
+            f"{type(buffer).__name__} cannot do: train with SB3's ReplayBuffer or a FrameStackReplayBuffer."
+        )
+    # In place, as a rollout under way holds this very object.
+    buffer.__class__ = SkippingReplayBuffer
+    buffer._start_marking()  # type: ignore[attr-defined]
+
+
+def _told(infos: list[dict[str, Any]]) -> Iterator[str]:
+    return (str(info[mark]) for info in infos for mark in MARKS if info.get(mark) is not None)
+
+
+class FrameStackReplayBuffer(_SkipsMarked):
     """
     SB3's ``ReplayBuffer`` for stacks of uint8 images, in about a sixth of its memory (three stacked frames).
 
@@ -36,6 +191,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     than transitions, enough for episodes of 25 steps and more. Where streams break more often than that, the oldest
     rows (one row: the transitions of all environments at one time) are given up: they are never sampled and
     ``size()`` does not count them.
+
+    Transitions whose ``info`` is marked (see ``MARKS``) are never sampled either, and nothing of them is kept.
 
     :param buffer_size: Max number of transitions, over all environments
     :param observation_space: uint8 ``Box`` of shape (frame_stack * c, height, width), oldest frame first
@@ -56,14 +213,12 @@ class FrameStackReplayBuffer(ReplayBuffer):
     # below 1.05 frames per transition for images of 84x84.
     SPARE_FRAMES = 0.04
     # What `pos` and the frame counter index: only the used part of these is pickled.
-    _ROW_ARRAYS = ("frame_slots", "oldest_frame", "actions", "rewards", "dones", "timeouts")
+    _ROW_ARRAYS = ("frame_slots", "oldest_frame", "actions", "rewards", "dones", "timeouts", "marked")
 
     #: How often `reset` has begun the numbers of frames anew
     n_resets = 0
     frames: npt.NDArray[np.uint8]  # [frame_capacity, c, height, width]
     frame_slots: npt.NDArray[np.int32]  # [buffer_size, n_envs, 2 (obs, next_obs), frame_stack], positions in `frames`
-    #: Rows and environments of the latest batch, [batch_size] each
-    last_sampled: tuple[np.ndarray, np.ndarray] | None = None
     oldest_frame: npt.NDArray[np.int64]  # [buffer_size], running number of the oldest frame that the row needs
 
     def __init__(
@@ -108,6 +263,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.rewards = np.zeros(rows, dtype=np.float32)
         self.dones = np.zeros(rows, dtype=np.float32)
         self.timeouts = np.zeros(rows, dtype=np.float32)
+        self.marked = np.zeros(rows, dtype=bool)
         self._tails = np.zeros((n_envs, frame_stack), dtype=np.int64)
         self.reset()
 
@@ -179,7 +335,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param action: Actions, [n_envs, ...]
         :param reward: Rewards, [n_envs]
         :param done: Whether the episode ended, [n_envs]
-        :param infos: One dictionary per environment; ``TimeLimit.truncated`` is used
+        :param infos: One dictionary per environment; ``TimeLimit.truncated`` and marks are used
         :raises ValueError: If observations have another dtype or shape, or ``frames_dir`` cannot hold all frames
         """
         self.reserve_frames()
@@ -189,7 +345,10 @@ class FrameStackReplayBuffer(ReplayBuffer):
         # The row at `pos` is about to be overwritten
         self._n_valid = min(self._n_valid, self.buffer_size - 1)
         oldest_frame = self._n_frames
+        marks = self._mark(infos)
         for i, (stack, next_stack) in enumerate(zip(stacks, next_stacks, strict=True)):
+            if marks[i]:
+                continue
             numbers = self._tails[i] if self._continues_tail(i, stack) else self._store_stack(stack)
             if np.array_equal(next_stack[:-1], stack[1:]):
                 next_numbers = np.append(numbers[1:], self._store_frame(next_stack[-1]))
@@ -202,6 +361,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
         self.actions[self.pos] = action
         self.rewards[self.pos] = reward
+        self.actions[self.pos, marks] = self.rewards[self.pos, marks] = 0
         self.dones[self.pos] = done
         if self.handle_timeout_termination:
             self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
@@ -229,7 +389,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """
-        Transitions of the given rows, each of a randomly drawn environment.
+        Transitions of the given rows, each of a randomly drawn environment; other rows where these are marked.
 
         :param batch_inds: Row positions in [0, buffer_size), as for ``ReplayBuffer``: the row that ``add`` wrote when
             ``pos`` had this value, [batch_size]
@@ -237,7 +397,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :return: Batch on ``device``
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
-        self.last_sampled = batch_inds, np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        self.last_sampled = self._without_marked(batch_inds, env_inds)
         return self.transitions(*self.last_sampled, env)
 
     def transitions(
@@ -320,6 +481,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the full size of every array."""
         self.__dict__.update(state)
+        state.setdefault("marked", np.zeros((0, self.n_envs), dtype=bool))  # saved before there were marks
         for name in self._ROW_ARRAYS:
             setattr(self, name, _grown(state[name], self.buffer_size))
         stored: npt.NDArray[np.uint8] = state["frames"]

@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.buffers import transitions
+from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
@@ -367,8 +367,9 @@ class ReconstructionCallback(_PictureCallback):
 
 def _spread_over(buffer: ReplayBuffer, n: int) -> np.ndarray:
     """Observations of the replay buffer, spread over the time that it spans, oldest first, [n, *shape]."""
-    ages = np.linspace(buffer.size() - 1, 0, n).round().astype(int)
-    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+    rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
+    rows = rows[unmarked(buffer, rows, np.zeros(len(rows), int))]
+    rows = rows[np.linspace(len(rows) - 1, 0, n).round().astype(int)]
     return transitions(buffer, rows, np.zeros(n, int)).observations.cpu().numpy()
 
 

@@ -34,7 +34,7 @@ from torch.nn import functional as F
 
 from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
 from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked
 from sb3_cure.checkpoint import CheckpointWriter, Resumption, WatchedCallback, resume, watch
 from sb3_cure.checks import (
     check_action_space,
@@ -557,6 +557,7 @@ class CuReSAC(SAC):
             # The environments have gone on: another `learn` starts with a reset.
             self._last_obs = None
             raise
+        skip_marked(replay_buffer, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     # -------------------------------------------------------------- learning

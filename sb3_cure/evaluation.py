@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_cure.buffers import transitions
+from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
@@ -242,6 +242,7 @@ def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int
     n_rows = buffer.size() - int(buffer.optimize_memory_usage and buffer.full)
     ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
     rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+    ages, env_inds, rows = (each[unmarked(buffer, rows, env_inds)] for each in (ages, env_inds, rows))
 
     errors = np.zeros(len(rows), np.float32)
     for start in range(0, len(rows), chunk):

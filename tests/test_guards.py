@@ -523,7 +523,6 @@ def test_on_a_bad_observation_the_policy_acts_on_the_last_good_one() -> None:
     assert not np.array_equal(stored[8][0], stored[7][0])
 
 
-@pytest.mark.xfail(reason="replay buffers do not leave marked transitions out yet", strict=True)
 @pytest.mark.parametrize("env", [FlawedBox, FlawedPixels], ids=["ReplayBuffer", "FrameStackReplayBuffer"])
 def test_skipped_transitions_are_never_sampled(env: Any) -> None:
     """Every sample has the action of a transition that was not marked."""
