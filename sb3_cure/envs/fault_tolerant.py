@@ -559,10 +559,10 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         """
         Replace a worker that has been stopped; the next step reports it.
 
-        :raises EnvFaultError: If workers are not to be replaced, or this environment fails again and again
+        :raises EnvFaultError: If workers are not to be replaced (any more), or this environment fails again and again
         """
         index = worker.index
-        if self.on_env_fault == "raise":
+        if self.on_env_fault == "raise" or self.closed:
             raise fault
         latest, observation = fault, None
         while observation is None:
