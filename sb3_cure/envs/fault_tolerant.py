@@ -41,21 +41,20 @@ class EnvFaultError(RuntimeError):
     :param what: What happened to it, as the end of a sentence that begins with "Environment 0"
     :param fix: What to do
     :param details: The worker's traceback, or ""
-    :param n_steps: How many of its latest steps cannot be trusted, the one that failed included
     """
 
-    def __init__(self, index: int, what: str, fix: str, details: str = "", n_steps: int = 1) -> None:
+    def __init__(self, index: int, what: str, fix: str, details: str = "") -> None:
         super().__init__(f"Environment {index} {what}: {fix}")
-        self.index, self.what, self.fix, self.details, self.n_steps = index, what, fix, details, n_steps
+        self.index, self.what, self.fix, self.details = index, what, fix, details
         if details:
             self.add_note(f"Traceback of the worker:\n{details}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.index, self.what, self.fix, self.details, self.n_steps)
+        return type(self), (self.index, self.what, self.fix, self.details)
 
 
 class _FrameFault(Exception):
-    """A frame that cannot be right; arguments: what it is, number of steps that cannot be trusted."""
+    """A frame that cannot be right."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,15 @@ class _FrameWatcher:
         self._position = np.zeros(0)
         self._n_same = self._n_moving = 0
 
-    def check(self, observation: Any) -> None:
+    @property
+    def suspect(self) -> int:
+        """How many of the latest steps showed the same pixels, if anything moved meanwhile."""
+        return self._n_same if self._n_moving else 0
+
+    def check(self, observation: Any, of_step: bool) -> None:
         """
         :param observation: What the environment returned
+        :param of_step: Whether that was of a step, and not of a reset
         :raises _FrameFault: If its newest frame is black, or does not show that the physics moves
         """
         if not self.sees_images:
@@ -98,8 +103,7 @@ class _FrameWatcher:
         frame = observation if left_over else observation[(slice(None),) * axis + (slice(oldest, None),)]
         if not self.watch.allow_black_frames and not frame.any():
             raise _FrameFault(
-                "returned a black frame, so that rendering has failed (pass allow_black_frames=True if it may be dark)",
-                1,
+                "returned a black frame, so that rendering has failed (pass allow_black_frames=True if it may be dark)"
             )
         if self.patience is None or self.state is None:
             return
@@ -107,14 +111,13 @@ class _FrameWatcher:
         if self._frame is None or not np.array_equal(frame, self._frame):
             self._frame, self._n_same, self._n_moving = frame.copy(), 0, 0
         else:
-            self._n_same += 1
+            self._n_same += of_step
             self._n_moving += bool(np.abs(position - self._position).max(initial=0.0) > self.watch.frozen_motion)
         self._position = position
         if self._n_moving >= self.patience:
             raise _FrameFault(
                 f"returned the same pixels {self._n_same} times in a row while its physics moved, so that rendering is "
-                "stuck (raise frozen_steps if its camera sees so little)",
-                self._n_same,
+                "stuck (raise frozen_steps if its camera sees so little)"
             )
 
 
@@ -141,17 +144,17 @@ class _Environment:
     def reset(self, seed_and_options: tuple[int | None, dict[str, Any] | None]) -> tuple[Any, dict[str, Any]]:
         seed, options = seed_and_options
         observation, self.reset_info = self.env.reset(seed=seed, **({"options": options} if options else {}))
-        self.watcher.check(observation)
+        self.watcher.check(observation, of_step=False)
         return observation, self.reset_info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, dict[str, Any], dict[str, Any]]:
+    def step(self, action: Any) -> tuple[tuple[Any, Any, bool, dict[str, Any], dict[str, Any]], int]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.watcher.check(observation)
+        self.watcher.check(observation, of_step=True)
         info["TimeLimit.truncated"] = truncated and not terminated
         if terminated or truncated:
             info["terminal_observation"] = observation
             observation, _ = self.reset((None, None))
-        return observation, reward, terminated or truncated, info, self.reset_info
+        return (observation, reward, terminated or truncated, info, self.reset_info), self.watcher.suspect
 
     def render(self, _: None) -> Any:
         return self.env.render()
@@ -214,11 +217,11 @@ def _work(
                 environment = _Environment(env_fn.var, watch.var)
             remote.send((number, getattr(environment, command)(data), None))
         except BaseException as error:
-            frame_fault = isinstance(error, _FrameFault)
-            what, n_steps = error.args if frame_fault else (f"raised {error!r}", 1)
-            details = "" if frame_fault else traceback.format_exc()
+            is_frame_fault = isinstance(error, _FrameFault)
+            what = str(error) if is_frame_fault else f"raised {error!r}"
+            details = "" if is_frame_fault else traceback.format_exc()
             try:
-                remote.send((number, None, (what, n_steps, details, isinstance(error, AttributeError))))
+                remote.send((number, None, (what, details, isinstance(error, AttributeError))))
             except OSError:
                 break
     if environment is not None:
@@ -286,8 +289,7 @@ class _Worker:
         """
         self._number += 1
         self._request = request
-        seconds = self.owner.start_timeout if self._starting else self.owner.timeout
-        self._deadline = time.monotonic() + seconds
+        self._deadline = time.monotonic() + self._patience[1]
         if self.fault is None:
             try:
                 self.connection.send((self._number, *request))
@@ -299,52 +301,44 @@ class _Worker:
         :return: The answer to the last request; if the worker is lost, of a new one
         :raises EnvFaultError: If the worker is lost and not to be replaced, or the call failed in it
         """
-        try:
-            return self.answer()
-        except EnvFaultError as fault:
-            if self.fault is None:
-                raise
-            request = self._request
-            self.owner._restart(self, fault)
-            self.send(request)
-            return self.answer()
+        outcome = self.outcome()
+        if not isinstance(outcome, EnvFaultError):
+            return outcome
+        request = self._request
+        self.owner._restart(self, outcome)
+        self.send(request)
+        return self.answer()
 
     def answer(self) -> Any:
         """
         :return: The answer to the last request
-        :raises EnvFaultError: If there is none; the process has then been stopped unless it can go on
+        :raises EnvFaultError: If there is none
+        """
+        outcome = self.outcome()
+        if isinstance(outcome, EnvFaultError):
+            raise outcome
+        return outcome
+
+    def outcome(self) -> Any:
+        """
+        :return: The answer to the last request; or, if the worker is lost and has been stopped, the fault, which is not
+            raised because a process that is forked while an exception is handled repeats it in its own tracebacks
+        :raises EnvFaultError: If a call failed in a worker that can go on
         :raises AttributeError: If the environment lacks the attribute that was asked for
         """
         if self.fault is not None:
-            raise self.fault
+            return self.fault
+        reply = self._read()
+        if isinstance(reply, str):
+            return self._lost(reply)
+        answer, error = reply
         command = self._request[0]
-        number = -1
-        while number < self._number:  # answers to requests that were given up (by Ctrl-C, say) are dropped
-            ready = wait([self.connection, self.process.sentinel], max(0.0, self._deadline - time.monotonic()))
-            if not ready:
-                seconds = self.owner.start_timeout if self._starting else self.owner.timeout
-                name = "start_timeout" if self._starting else "timeout"
-                raise self._lost(
-                    f"did not answer {command} within {name}={seconds:g} s (rendering or the environment hangs; raise "
-                    f"{name} if it is only slow)"
-                )
-            try:
-                if not self.connection.poll():
-                    raise EOFError
-                number, answer, error = self.connection.recv()
-            except (EOFError, OSError):
-                self.process.join(KILL_SECONDS)
-                code = self.process.exitcode
-                how = (
-                    f"was killed by {signal.Signals(-code).name}" if code and code < 0 else f"ended with status {code}"
-                )
-                raise self._lost(f"is lost, as its process {how} during {command}") from None
         if error is not None:
-            what, n_steps, details, is_attribute = error
+            what, details, is_attribute = error
             if details:
                 what += " when it was made" if command == "get_spaces" else f" in {command}"
             if command in _EPISODE_COMMANDS:
-                raise self._lost(what, details, n_steps)
+                return self._lost(what, details)
             sentence = EnvFaultError(self.index, what, "ask for what the environment has and takes.", details)
             if is_attribute:
                 raise AttributeError(str(sentence)) from sentence
@@ -352,12 +346,44 @@ class _Worker:
         self._starting &= command != "reset"
         return answer
 
-    def _lost(self, what: str, details: str = "", n_steps: int = 1) -> EnvFaultError:
+    def _read(self) -> tuple[Any, Any] | str:
+        """Answer and error that belong to the last request, or what happened to the process."""
+        command = self._request[0]
+        number = 0
+        while number < self._number:  # answers to requests that were given up (by Ctrl-C, say) are dropped
+            if not wait([self.connection, self.process.sentinel], max(0.0, self._deadline - time.monotonic())):
+                name, seconds = self._patience
+                return (
+                    f"did not answer {command} within {name}={seconds:g} s (rendering or the environment hangs; raise "
+                    f"{name} if it is only slow)"
+                )
+            try:
+                # An answer may lie there although the process has ended since
+                number, answer, error = self.connection.recv() if self.connection.poll() else (0, None, None)
+                ended = number == 0
+            except (EOFError, OSError):
+                ended = True
+            if ended:
+                self.process.join(KILL_SECONDS)
+                code = self.process.exitcode
+                how = (
+                    f"was killed by {signal.Signals(-code).name}" if code and code < 0 else f"ended with status {code}"
+                )
+                return f"is lost, as its process {how} during {command}"
+        return answer, error
+
+    @property
+    def _patience(self) -> tuple[str, float]:
+        """The time-out that holds now, and its seconds."""
+        name = "start_timeout" if self._starting else "timeout"
+        return name, getattr(self.owner, name)
+
+    def _lost(self, what: str, details: str = "") -> EnvFaultError:
         if self.owner.on_env_fault == "restart":
             fix = "its worker is replaced, and training goes on without this transition."
         else:
             fix = "pass on_env_fault='restart' to replace its worker and go on, or mend the cause."
-        fault = EnvFaultError(self.index, what, fix, details, n_steps)
+        fault = EnvFaultError(self.index, what, fix, details)
         self.stop(fault)
         return fault
 
@@ -377,7 +403,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
 
     - ``env_fault``: the sentence;
     - ``env_fault_steps``: how many of the latest transitions of this environment are spoilt, this one included: more
-      than 1 where frames were stuck;
+      than 1 where pixels were the same before it while the physics moved;
     - ``terminal_observation``: the last observation before it, and ``TimeLimit.truncated``: the task did not end;
     - no ``episode``: a ``Monitor`` in the worker forgets the episode.
 
@@ -426,8 +452,11 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
             _check_positive(frozen_steps=frozen_steps)
         if on_env_fault not in ("raise", "restart"):
             raise ValueError(f"on_env_fault={on_env_fault!r} is unknown: use 'raise', or 'restart' to go on training.")
+        known = mp.get_all_start_methods()
         if start_method is None:
-            start_method = "forkserver" if "forkserver" in mp.get_all_start_methods() else "spawn"
+            start_method = "forkserver" if "forkserver" in known else "spawn"
+        if start_method not in known:
+            raise ValueError(f"start_method={start_method!r} is unknown: use one of {', '.join(known)}, or None.")
         self.context: Any = mp.get_context(start_method)
         self.timeout, self.start_timeout, self.on_env_fault = timeout, start_timeout, on_env_fault
         self.max_faults = max_faults
@@ -441,6 +470,8 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         self._last_seeds: list[int | None] = [None] * len(env_fns)
         self._last_options: list[dict[str, Any]] = [{} for _ in env_fns]
         self._last_obs: list[Any] = [None] * len(env_fns)
+        # How many of the latest steps of each showed stuck pixels, perhaps: a fault spoils these too
+        self._suspect = [0] * len(env_fns)
         # By index, the faults that the next step has to report, with the first observations of the new episodes
         self._unreported: dict[int, tuple[EnvFaultError, Any]] = {}
         self.remotes = []
@@ -482,22 +513,21 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     def _step_result(self, worker: _Worker) -> tuple[Any, Any, Any, dict[str, Any], dict[str, Any]]:
         index = worker.index
         if index not in self._unreported:
-            try:
-                result = worker.answer()
-            except EnvFaultError as fault:
-                self._restart(worker, fault)
-            else:
+            result = worker.outcome()
+            if not isinstance(result, EnvFaultError):
+                result, self._suspect[index] = result
                 self._faults_in_a_row[index] = 0
                 self._last_obs[index] = result[0]
                 return result
+            self._restart(worker, result)
         reported, observation = self._unreported.pop(index)
         info = {
             "env_fault": str(reported),
-            "env_fault_steps": reported.n_steps,
+            "env_fault_steps": 1 + self._suspect[index],
             "TimeLimit.truncated": True,
             "terminal_observation": self._last_obs[index],
         }
-        self._last_obs[index] = observation
+        self._last_obs[index], self._suspect[index] = observation, 0
         return observation, 0.0, True, info, self.reset_infos[index]
 
     def reset(self) -> VecEnvObs:
@@ -513,11 +543,12 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         self.waiting = False
         self.reset_infos = list(self.reset_infos)
         for worker in self.remotes:
-            try:
-                self._last_obs[worker.index], self.reset_infos[worker.index] = worker.answer()
-            except EnvFaultError as fault:
-                self._restart(worker, fault)
+            outcome = worker.outcome()
+            if isinstance(outcome, EnvFaultError):
+                self._restart(worker, outcome)
                 _, self._last_obs[worker.index] = self._unreported[worker.index]
+            else:
+                self._last_obs[worker.index], self.reset_infos[worker.index] = outcome
         # Nothing came before the first observation that could be told of
         self._unreported.clear()
         self._reset_seeds()
@@ -528,10 +559,10 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         """
         Replace a worker that has been stopped; the next step reports it.
 
-        :raises EnvFaultError: If workers are not to be replaced, or this environment fails again and again
+        :raises EnvFaultError: If workers are not to be replaced (any more), or this environment fails again and again
         """
         index = worker.index
-        if self.on_env_fault == "raise":
+        if self.on_env_fault == "raise" or self.closed:
             raise fault
         latest, observation = fault, None
         while observation is None:
