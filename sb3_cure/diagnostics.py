@@ -29,8 +29,8 @@ MIN_ALIKE = 30
 #: pixels are positive and of few colours, many random filters are negative everywhere
 DEAD_SHARE = 0.9
 #: Deviation of the latents between observations, as a share of their root mean square. Runs that learn well were
-#: measured at 0.15 to 0.5; in their first hundred updates some fell to 0.004 and came back
-LATENT_SPREAD = 1e-3
+#: measured at 0.3 to 0.5 after 1000 updates; in their first 500 some fell to 0.004 and came back
+LATENT_SPREAD = 0.01
 #: Share of the pixels' variance that an autoencoder must explain; the mean image explains 0
 EXPLAINED_SHARE = 0.01
 #: Nats per action dimension by which the policy's entropy must miss its target for a temperature to be running away
@@ -72,7 +72,8 @@ def look(
 ) -> Iterator[Finding]:
     """Look at a model in training.
 
-    What another fault explains is not looked for: behind a constant image or dead units all latents are alike.
+    What a fault may explain is not looked for while it lasts: behind a constant image all latents are alike, beside a
+    huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or ``CuReSAC``
     :param n_samples: Observations to look at
@@ -89,19 +90,18 @@ def look(
     model.policy.set_training_mode(False)
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    hot = temperature_at_bound(temperatures, model, temperature_bounds)
-    if hot is not None:
-        yield hot
-    if constant is not None and constant.problem:
+    found = [constant, temperature_at_bound(temperatures, model, temperature_bounds)]
+    if found[-1] is not None:
+        yield found[-1]
+    if any(finding.problem for finding in found if finding is not None):
         return
     for finding in _representation(model, batch, autoencoder_updates):
         yield finding
         if finding.problem:
             return
-    if hot is None or not hot.problem:
-        curious = curious_reward(model, batch, temperatures)
-        if curious is not None:
-            yield curious
+    curious = curious_reward(model, temperatures)
+    if curious is not None:
+        yield curious
 
 
 def _representation(model: Any, batch: ReplayBufferSamples, autoencoder_updates: int) -> Iterator[Finding]:
@@ -180,8 +180,8 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
     problem = None
     if spread < LATENT_SPREAD:
         problem = (
-            f"the encoder's latents differ by {spread:.1e} of their size between observations, but should differ by "
-            f"{LATENT_SPREAD:.0e} at least, as the agent cannot tell what it sees: try a smaller learning_rate, or "
+            f"the encoder's latents differ by {spread:.1e} of their size between observations, but should by "
+            f"{LATENT_SPREAD} at least, as the agent cannot tell what it sees: try a smaller learning_rate, or "
             "another srl head or srl_kwargs."
         )
     return Finding("collapsed_latents", spread, problem)
@@ -247,28 +247,25 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
     return Finding("temperature", len(problems), problems[0] if problems else None)
 
 
-def curious_reward(model: Any, batch: ReplayBufferSamples, temperatures: Sequence[Temperature]) -> Finding | None:
+def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding | None:
     """A curious reward so small beside the entropy term that its agent acts at random.
 
-    Value: standard deviation of the curious reward over the mean of |temperature * log-probability| (what all
-    observations earn alike steers nothing). Expected: at least ``CURIOUS_SHARE``.
+    Value: standard deviation of the curious reward in the latest update over the mean of |temperature *
+    log-probability| (what all observations earn alike steers nothing). Expected: at least ``CURIOUS_SHARE``.
 
     :param model: The model
-    :param batch: Samples of the replay buffer
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
-    :return: None without curiosity
+    :return: None without curiosity, without entropy term, or before the first update since the log was written
     """
-    if not getattr(model, "_uses_curious_reward", False) or not temperatures:
+    deviation = model.logger.name_to_value.get("train/curious_reward_std")
+    if deviation is None or not temperatures or temperatures[-1].value == 0:
         return None
-    policy = model.policy
-    reward = policy.curiosity(policy.srl.error(batch, policy.encode(batch.observations)))
-    _, temperature, _, log_prob = temperatures[-1]
-    entropy = float((temperature * log_prob).abs().mean())
-    ratio = float(reward.std()) / max(entropy, 1e-12)
+    deviation, entropy = float(deviation), float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())
+    ratio = deviation / max(entropy, 1e-12)
     problem = None
     if ratio < CURIOUS_SHARE:
         problem = (
-            f"the curious reward varies by {float(reward.std()):.1e} while the entropy term is {entropy:.1e}, but "
+            f"the curious reward varies by {deviation:.1e} while the entropy term is {entropy:.1e}, but "
             f"{CURIOUS_SHARE} of it was expected at least, as the curious policy is close to random: use "
             "normalize_curiosity=True, a larger curiosity_beta, or a smaller ent_coef."
         )
