@@ -482,7 +482,7 @@ class DiagnosticsCallback(PeriodicCallback):
     ========================  ============================================================================
     ``constant_image``        All recent observations of an environment are equal
     ``dead_units``            90 % of the ReLUs of a layer of the encoder never fire
-    ``collapsed_latents``     The encoder's latents differ by less than 0.1 % of their size
+    ``collapsed_latents``     The encoder's latents differ by less than 1 % of their size
     ``autoencoder``           Explains less than 1 % of the pixels' variance: no better than the mean image
     ``temperature``           Outside of its bounds, while the policy's entropy misses its target
     ``curious_reward``        Varies by less than 1 % of the entropy term
@@ -508,7 +508,7 @@ class DiagnosticsCallback(PeriodicCallback):
         self,
         every: int = 1000,
         n_samples: int = 128,
-        min_updates: int = 1000,
+        min_updates: int = 2000,
         autoencoder_updates: int = 5000,
         temperature_bounds: Sequence[float] = (1e-4, 1e2),
         verbose: int = 0,
