@@ -13,7 +13,6 @@ import errno
 import hashlib
 import io
 import os
-import random
 import shutil
 import signal
 import tempfile
@@ -32,7 +31,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_cure import CuReSAC
-from sb3_cure.checkpoint import CheckpointWriter
+from sb3_cure.checkpoint import CheckpointWriter, _load_random_state, _random_state
 from sb3_cure.experiments.files import describe_run, write_json
 
 #: Generations to keep, in the folder that the faults hit
@@ -170,6 +169,7 @@ class Site:
         self.former = _resume(self.before)[0]
         self.model, self.writer = model, writer
         model.learn(21, reset_num_timesteps=False)
+        self.random = _random_state(model)
         self.points = self._write(self.before, self.after, None, "")
         self.newest = _resume(self.after)[0]
 
@@ -182,10 +182,9 @@ class Site:
         shutil.copytree(source, target)
         self.writer.generations.__init__(target)  # type: ignore[misc]
         reading, writing = os.pipe()
-        stream = random.getstate()
         child = os.fork()
         if child == 0:
-            random.setstate(stream)  # Python begins it anew in every forked process
+            _load_random_state(self.model, self.random)  # resuming has changed it meanwhile
             count = 0
             try:
                 with _failing(target, point, kind) as counter:

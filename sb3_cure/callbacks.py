@@ -1,4 +1,5 @@
-"""Callbacks for ``learn``: evaluation, videos and pictures. All but the SRL errors in them serve any SB3 algorithm."""
+"""Callbacks for ``learn``: evaluation, videos, pictures and warnings. All but the SRL errors in them serve any SB3
+algorithm (warnings: any off-policy one)."""
 
 import contextlib
 import importlib
@@ -12,9 +13,11 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_cure import diagnostics
 from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
@@ -475,3 +478,90 @@ class CuriosityMapCallback(_PictureCallback):
             units=self.units,
             bins=self.bins,
         )
+
+
+class DiagnosticsCallback(PeriodicCallback):
+    """Warns, once each, of what spoils training from pixels without an error.
+
+    ========================  ============================================================================
+    ``constant_image``        All recent observations of an environment are equal
+    ``dead_units``            90 % of the ReLUs of a layer of the encoder never fire
+    ``collapsed_latents``     The encoder's latents differ by less than 1 % of their size
+    ``autoencoder``           Explains less than 1 % of the pixels' variance: no better than the mean image
+    ``temperature``           Outside of its bounds, while the policy's entropy misses its target
+    ``curious_reward``        Varies by less than 1 % of the entropy term
+    ``software_rendering``    The CPU draws the frames although there is a GPU
+    ========================  ============================================================================
+
+    Works with every off-policy algorithm of SB3; what does not apply is left out. Each number is logged as
+    ``diagnostics/<name>``; what they are and why the thresholds lie where they do stands in ``sb3_cure.diagnostics``.
+    A look takes less time than one update with a batch of ``n_samples``.
+
+    :param every: Agent steps between two looks
+    :param n_samples: Observations of the replay buffer to look at
+    :param min_updates: Updates before networks, temperatures and the curious reward are judged: in the first hundreds
+        latents may collapse and come back
+    :param autoencoder_updates: Updates before the autoencoder is judged: before a few thousand it is no better than
+        the mean image in good runs either
+    :param temperature_bounds: Least and greatest temperature that can still weigh entropy against reward
+    :param verbose: 1 prints each look
+    :raises ValueError: if an argument is out of range, or the algorithm has no replay buffer
+    """
+
+    def __init__(
+        self,
+        every: int = 1000,
+        n_samples: int = 128,
+        min_updates: int = 2000,
+        autoencoder_updates: int = 5000,
+        temperature_bounds: Sequence[float] = (1e-4, 1e2),
+        verbose: int = 0,
+    ):
+        super().__init__(every, verbose)
+        if n_samples < 2 or min(min_updates, autoencoder_updates) < 0:
+            raise ValueError(
+                f"DiagnosticsCallback got n_samples={n_samples}, min_updates={min_updates} and autoencoder_updates="
+                f"{autoencoder_updates}, but they must be at least 2, 0 and 0: change them."
+            )
+        if len(temperature_bounds) != 2 or not 0 <= temperature_bounds[0] < temperature_bounds[1]:
+            raise ValueError(
+                f"DiagnosticsCallback got temperature_bounds={temperature_bounds!r}, but they are the least and the "
+                "greatest temperature: give two numbers >= 0 in rising order, such as [0.0001, 100]."
+            )
+        self.n_samples = n_samples
+        self.min_updates = min_updates
+        self.autoencoder_updates = autoencoder_updates
+        self.temperature_bounds = temperature_bounds
+        #: What was warned of
+        self.warned: set[str] = set()
+        self._rendering: diagnostics.Finding | None = None
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise ValueError(
+                f"DiagnosticsCallback got a {type(self.model).__name__}, but it looks at what a replay buffer holds: "
+                "use it with CuReSAC, or another off-policy algorithm."
+            )
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._rendering = diagnostics.software_rendering(self.training_env)
+        if self._rendering is not None:
+            self._report(self._rendering)
+
+    def on_period(self) -> None:
+        """Look, log and warn."""
+        findings = [] if self._rendering is None else [self._rendering]
+        findings += diagnostics.look(
+            self.model, self.n_samples, self.min_updates, self.autoencoder_updates, self.temperature_bounds
+        )
+        for finding in findings:
+            self._report(finding)
+        if self.verbose >= 1:
+            print(", ".join(f"{finding.name} {finding.value:.3g}" for finding in findings))
+
+    def _report(self, finding: diagnostics.Finding) -> None:
+        self.logger.record(f"diagnostics/{finding.name}", float(finding.value))
+        if finding.problem is not None and finding.name not in self.warned:
+            self.warned.add(finding.name)
+            warnings.warn(f"After {self.num_timesteps} agent steps: {finding.problem}", stacklevel=2)

@@ -710,6 +710,7 @@ class CuReSAC(SAC):
                 "train/curious_reward_raw_max": error.max(),
                 "train/curious_reward_mean": reward.mean(),
                 "train/curious_reward_max": reward.max(),
+                "train/curious_reward_std": reward.std(correction=0),
             }
         )
         return reward
