@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from benchmarks import collection, growth, numerics, rendering, replay, update
+from benchmarks import checkpoints, collection, growth, numerics, rendering, replay, update
 from sb3_cure.allocator import tune_allocator
 
 
@@ -21,6 +21,7 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
         "replay": replay.measure,
         "rendering": rendering.measure,
         "end_to_end": collection.measure,
+        "checkpoints": checkpoints.measure,
         "growth_with_batch": growth.by_batch,
         "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,

@@ -430,7 +430,7 @@ def test_no_checkpoint_is_said(tmp_path: Path) -> None:
 
 def test_no_fault_costs_more_than_the_checkpoint_that_it_hits(tmp_path: Path) -> None:
     """The campaign of benchmarks/faults.py, with a part of its failing writes."""
-    outcomes = faults.campaign(tmp_path, points=40)
+    outcomes = faults.campaign(tmp_path, points=50)
     assert [outcome for outcome in outcomes if not outcome.expected] == []
     assert len(outcomes) >= 200
     assert {outcome.resumed for outcome in outcomes} == {"newest", "former", "without some frames"}
