@@ -614,12 +614,13 @@ def test_what_is_no_fault_of_a_picture() -> None:
 
 def test_stuck_pixels_are_noticed_across_short_episodes() -> None:
     env = made([partial(breakable_box, episode_length=2)], state=position, frozen_steps=20)
+    env.seed(0)
     env.reset()
     env.env_method("break_down", "frozen")
     infos: list[dict[str, Any]] = [{}]
     n_steps = 0
     while "env_fault" not in infos[0]:
-        infos = env.step(np.full_like(still(env), -0.5 if n_steps % 2 else 0.5))[3]
+        infos = env.step(np.full_like(still(env), -1 if n_steps % 2 else 1))[3]  # more than a pixel
         n_steps += 1
     assert "the same pixels" in infos[0]["env_fault"] and n_steps < 20
     # All but the first, whose picture is a new one; what resets returned is no step
