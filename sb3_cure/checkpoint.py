@@ -291,7 +291,7 @@ def _is_plain(value: Any) -> bool:
         return all(map(_is_plain, value))
     if isinstance(value, dict):
         return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
-    is_array = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+    is_array = isinstance(value, th.Tensor) or (isinstance(value, np.ndarray) and value.dtype.kind in "biuf")
     return value is None or is_array or isinstance(value, bool | int | float | str | np.number | np.bool_)
 
 
@@ -308,6 +308,8 @@ def _equal(one: Any, other: Any) -> bool:
         return len(one) == len(other) and all(map(_equal, one, other))
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_equal(one[key], other[key]) for key in one)
+    if isinstance(one, th.Tensor):
+        return isinstance(other, th.Tensor) and th.equal(one, other)
     return type(one) is type(other) and bool(np.array_equal(one, other))
 
 
@@ -566,13 +568,18 @@ class ExactCheckpoint(BaseCallback):
             )
 
     def _on_rollout_start(self) -> None:
-        due = self.num_timesteps // self.save_freq > self._last_tried // self.save_freq
-        if due or self._signal is not None:
+        if self.is_due() or self._signal is not None:
             self._save()
         if self._signal == signal.SIGINT:
             raise KeyboardInterrupt
         if self._signal is not None:
             raise SystemExit(128 + self._signal)
+
+    def is_due(self) -> bool:
+        """
+        :return: Whether a checkpoint is to be written now; asked before each rollout
+        """
+        return self.num_timesteps // self.save_freq > self._last_tried // self.save_freq
 
     def _on_step(self) -> bool:
         return True

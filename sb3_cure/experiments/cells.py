@@ -16,13 +16,13 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import run_episodes, trained_actors
-from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json, write_text
+from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import Cell, GridError
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
-from sb3_cure.files import flush_to_disk
 
 #: Evaluations start from the same states in all cells
 EVAL_SEED = 10_000
@@ -87,172 +87,194 @@ class _CellRun:
     """What a cell needs while it runs; ``finish`` does what is left to do."""
 
     def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool):
-        self.cell, self.folder = cell, folder
-        self.pictures = pictures
-        self.checkpoint_seconds = 60 * checkpoint_minutes
-        self.eval_env = gym.make(cell.task, **cell.env_kwargs)
-        self.action_repeat = action_repeat_of(self.eval_env)
-        # Tells whether the task's reward has been seen, and how long everything took in all attempts.
-        self.state: dict[str, Any] = {"phase": "pretrain" if cell.pretrain else "train", "seconds": 0.0, "attempts": []}
-        self.evaluations: list[Row] = []
-        self.episodes: list[Row] = []
-        self.model = self._restore() or self._begin()
-        self.state["attempts"].append({"started": _now(), **describe_run(), "device": str(self.model.device)})
-        self._resumed_at = time.monotonic()
-        self._reported_at = self._kept_at = -np.inf
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.folder / "checkpoint"
-
-    @property
-    def seconds(self) -> float:
-        """Wall-clock time of all attempts, without what a kill undid."""
-        return self.state["seconds"] + time.monotonic() - self._resumed_at
-
-    def agent_steps(self, environment_steps: int) -> int:
-        return -(-environment_steps // self.action_repeat)
-
-    # ------------------------------------------------------------------ phases
+        self.cell, self.folder, self.pictures = cell, folder, pictures
+        self.checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
+        self.record = _Record(cell, folder)
+        self.model = self._resume() or CuReSAC(env=self._make_env(), seed=cell.seed, **cell.build_arguments())
 
     def finish(self) -> None:
         try:
             self._train()
             self._keep_results()
         finally:
-            self.eval_env.close()
+            self.record.eval_env.close()
             if self.model.env is not None:
                 self.model.env.close()
 
     def _train(self) -> None:
-        cell, pretrain = self.cell, self.cell.pretrain
-        if self.state["phase"] == "pretrain" and pretrain is not None:
-            left = self.agent_steps(pretrain.budget) - self.model.num_timesteps
-            if left > 0:
-                fresh = self.model.num_timesteps == 0
-                self.model.pretrain(left, pretrain.collector, callback=_Watch(self), reset_num_timesteps=fresh)
-            # Also where the checkpoint was the last step's: then nothing was left for `pretrain` to end.
-            self.model._end_pretraining()
-            self.state["phase"] = "train"
-            self.keep()
-        left = self.agent_steps(cell.budget) - self.model.num_timesteps
-        if cell.budget > 0 and left > 0:
-            fresh = self.model.num_timesteps == 0
-            drawing = watch_reconstructions(cell, self.action_repeat, self.folder) if self.pictures else []
-            self.model.learn(left, callback=[_Watch(self), *drawing], reset_num_timesteps=fresh)
+        """The same calls whether the cell begins or goes on: a resumed model does what is left of them."""
+        cell, record = self.cell, self.record
+        callbacks = [record, self.checkpoints]
+        if cell.pretrain is not None:
+            steps = record.agent_steps(cell.pretrain.budget)
+            self.model.pretrain(steps, cell.pretrain.collector, callback=callbacks)
+        record.evaluates = True
+        if cell.budget > 0:
+            drawing = watch_reconstructions(cell, record.action_repeat, self.folder) if self.pictures else []
+            self.model.learn(record.agent_steps(cell.budget), callback=[*callbacks, *drawing])
 
     def _keep_results(self) -> None:
-        cell = self.cell
+        cell, record = self.cell, self.record
         # Not among the results until everything else is: the state from here on can be made anew.
         self.model.save(self.folder / "model.zip")
         if cell.kind == "visitation":
             measure_visits(self.model, cell, self.folder)
         if self.pictures:
             draw_cell(self.model, cell, self.folder)
-        self.write_tables()
-        self._report(force=True)
-        write_json(self.folder / "run.json", self._run_conditions())
+        record.write_tables()
+        record.report(self.model, force=True)
+        write_json(self.folder / "run.json", record.conditions(self.model))
         write_text(self.folder / DONE, "")
 
     def _make_env(self) -> Any:
         # By a function: of an id SB3 asks for render_mode="rgb_array", which not every environment knows.
         return make_vec_env(lambda: gym.make(self.cell.task, **self.cell.env_kwargs), n_envs=self.cell.n_envs)
 
-    def _begin(self) -> CuReSAC:
-        return CuReSAC(env=self._make_env(), seed=self.cell.seed, **self.cell.build_arguments())
+    def _resume(self) -> CuReSAC | None:
+        """The model of the newest whole checkpoint, or None."""
+        path = self.checkpoints.path
+        if not path.exists():
+            return None
+        try:
+            return CuReSAC.resume(path, self._make_env(), custom_objects=self.cell.custom_objects())
+        except ValueError as error:
+            print(f"{self.folder} begins anew: {error}")
+            shutil.rmtree(path)
+            return None
+
+
+class _TimedCheckpoint(ExactCheckpoint):
+    """Due by the clock, because cells differ in speed.
+
+    :param path: Folder of the checkpoints
+    :param minutes: Minutes between two checkpoints
+    """
+
+    def __init__(self, path: Path, minutes: float):
+        super().__init__(save_freq=1, path=path, keep=1)
+        self.seconds = 60 * minutes
+        self._due_at = np.inf
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._due_at = time.monotonic() + self.seconds
+
+    def is_due(self) -> bool:
+        if time.monotonic() < self._due_at:
+            return False
+        self._due_at = time.monotonic() + self.seconds
+        return super().is_due()
+
+
+class _Record(BaseCallback):
+    """Evaluates between two agent steps, when all updates are made, and reports progress.
+
+    What it has recorded stands in plain attributes, which checkpoints keep.
+
+    :param cell: The cell
+    :param folder: Its folder
+    """
+
+    def __init__(self, cell: Cell, folder: Path):
+        super().__init__()
+        self.cell, self.folder = cell, folder
+        self.eval_env = gym.make(cell.task, **cell.env_kwargs)
+        self.action_repeat = action_repeat_of(self.eval_env)
+        #: Whether the task's reward is being learned from
+        self.evaluates = False
+        self.evaluations: list[Row] = []
+        self.episodes: list[Row] = []
+        #: What each attempt ran on, this one last
+        self.attempts: list[Row] = []
+        #: Wall-clock time of all attempts, without what a kill undid
+        self.seconds = 0.0
+        self.losses: list[th.Tensor] = []
+        self._now, self._reported_at = time.monotonic(), -np.inf
+        self._is_known = False
+
+    def agent_steps(self, environment_steps: int) -> int:
+        return -(-environment_steps // self.action_repeat)
+
+    def begin_attempt(self, model: CuReSAC) -> None:
+        """Once, when what former attempts have recorded is back."""
+        if not self._is_known:
+            self._is_known = True
+            self.attempts.append({"started": _now(), **describe_run(), "device": str(model.device)})
+
+    def _on_training_start(self) -> None:
+        self.begin_attempt(self.model)  # type: ignore[arg-type]
+
+    def _on_step(self) -> bool:
+        loss = self.logger.name_to_value.get("train/srl_loss")
+        if loss is not None:
+            self.losses.append(th.as_tensor(loss))
+        self._tick()
+        self.report(self.model)  # type: ignore[arg-type]
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self._evaluate_if_due(finished=False)
+
+    def _on_training_end(self) -> None:
+        self._evaluate_if_due(finished=True)
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self.seconds += now - self._now
+        self._now = now
 
     # -------------------------------------------------------------- evaluation
 
+    def _evaluate_if_due(self, finished: bool) -> None:
+        if self.evaluates and self._is_evaluation_due(finished):
+            self.evaluate()
+        self._tick()
+
+    def _is_evaluation_due(self, finished: bool) -> bool:
+        """
+        :param finished: Whether training has ended: then the last row is due, whatever its step
+        """
+        steps = self.num_timesteps * self.action_repeat
+        if not self.evaluations:
+            return True
+        last, every = self.evaluations[-1]["environment_steps"], self.cell.eval_every
+        return steps > last and (finished or steps // every > last // every)
+
     def evaluate(self) -> None:
         """Evaluate each policy over episodes that start from the same states in all cells."""
-        steps = self.model.num_timesteps
+        model: Any = self.model
+        steps = model.num_timesteps
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")
-        row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=self.model._n_updates)
-        for actor in trained_actors(self.model):
+        row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
+        for actor in trained_actors(model):
             errors, returns = [], []
             for number, episode in enumerate(
-                run_episodes(self.model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
+                run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
             ):
-                returns.append(episode.total_reward)
+                returns.append(float(episode.total_reward))
                 errors.append(episode.srl_errors)
-                values = (row["environment_steps"], actor, number, episode.total_reward)
+                values = (row["environment_steps"], actor, number, returns[-1])
                 self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
             if actor == "task":
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
-            if getattr(self.model.policy, "srl", None) is not None:
+            if getattr(model.policy, "srl", None) is not None:
                 row[f"{actor}_srl_error"] = float(np.concatenate(errors).mean())
+        row["srl_loss"] = float(np.mean([float(loss) for loss in self.losses])) if self.losses else ""
+        self.losses.clear()
+        self._tick()
+        row["seconds"] = round(self.seconds, 1)
         self.evaluations.append(row)
-
-    def is_evaluation_due(self, finished: bool) -> bool:
-        """
-        :param finished: Whether training has ended: then the last row is due, whatever its step
-        """
-        steps = self.model.num_timesteps * self.action_repeat
-        if not self.evaluations:
-            return True
-        last = self.evaluations[-1]["environment_steps"]
-        every = self.cell.eval_every
-        return steps > last and (finished or steps // every > last // every)
+        self.write_tables()
 
     def write_tables(self) -> None:
         write_csv(self.folder / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(self.folder / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
 
-    # ------------------------------------------------------------- checkpoints
-
-    def keep(self) -> None:
-        """Write a checkpoint beside the last one, then remove that: one of them is always whole."""
-        unfinished = self.checkpoints / "unfinished"
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir(parents=True)
-        self.model.save(unfinished / "model.zip")
-        self.model.save_replay_buffer(unfinished / "replay_buffer.pkl")
-        state = {**self.state, "seconds": self.seconds, "agent_steps": self.model.num_timesteps}
-        write_json(unfinished / "state.json", state)
-        write_csv(unfinished / "eval.csv", _EVAL_COLUMNS, self.evaluations)
-        write_csv(unfinished / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
-        for path in (*unfinished.iterdir(), unfinished):
-            flush_to_disk(path)
-        older = self._generations()
-        unfinished.rename(self.checkpoints / str(older[-1] + 1 if older else 0))
-        for number in older:
-            shutil.rmtree(self.checkpoints / str(number))
-        self.write_tables()
-        self._kept_at = time.monotonic()
-
-    def is_checkpoint_due(self) -> bool:
-        since = max(self._kept_at, self._resumed_at)
-        return time.monotonic() - since > self.checkpoint_seconds
-
-    def _restore(self) -> CuReSAC | None:
-        """The newest checkpoint that can be read, or None."""
-        for number in reversed(self._generations()):
-            try:
-                return self._load(self.checkpoints / str(number))
-            except Exception as error:
-                print(f"The checkpoint {self.checkpoints / str(number)} cannot be read ({error}) and is left out.")
-        return None
-
-    def _load(self, newest: Path) -> CuReSAC:
-        model = CuReSAC.load(newest / "model.zip", env=self._make_env())
-        model.load_replay_buffer(newest / "replay_buffer.pkl")
-        self.state = json.loads((newest / "state.json").read_text())
-        self.evaluations = read_rows(newest / "eval.csv")
-        self.episodes = read_rows(newest / "episodes.csv")
-        # Loading starts all random streams from the cell's seed: without this each attempt would repeat the first's.
-        model.set_random_seed(self.cell.seed + 1000 * len(self.state["attempts"]))
-        return model
-
-    def _generations(self) -> list[int]:
-        if not self.checkpoints.exists():
-            return []
-        return sorted(int(path.name) for path in self.checkpoints.iterdir() if path.name.isdigit())
-
     # ---------------------------------------------------------------- progress
 
-    def _report(self, force: bool = False) -> None:
+    def report(self, model: CuReSAC, force: bool = False) -> None:
         """Tell a display, which may be another process, how far this is."""
         if not force and time.monotonic() - self._reported_at < _PROGRESS_SECONDS:
             return
@@ -261,66 +283,32 @@ class _CellRun:
         write_json(
             self.folder / "progress.json",
             {
-                "phase": self.state["phase"],
-                "agent_steps": self.model.num_timesteps,
-                "environment_steps": self.model.num_timesteps * self.action_repeat,
+                "phase": "train" if self.evaluates else "pretrain",
+                "agent_steps": model.num_timesteps,
+                "environment_steps": model.num_timesteps * self.action_repeat,
                 "seconds": self.seconds,
                 "best_return": max(returns, default=None),
                 "time": time.time(),
             },
         )
 
-    def report(self) -> None:
-        self._report()
-
-    def _run_conditions(self) -> dict[str, Any]:
-        attempts = self.state["attempts"]
+    def conditions(self, model: CuReSAC) -> dict[str, Any]:
+        """
+        :param model: The cell's model
+        :return: What the results were obtained under
+        """
+        self.begin_attempt(model)
         return {
             **describe_run(),
-            "device": str(self.model.device),
-            "precision": getattr(self.model, "_computed_precision", "fp32"),
-            "started": attempts[0]["started"],
+            "device": str(model.device),
+            "precision": getattr(model, "_computed_precision", "fp32"),
+            "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
-            "attempts": len(attempts),
+            "attempts": len(self.attempts),
             # Where it was interrupted: what each attempt ran on
-            **({"history": attempts} if len(attempts) > 1 else {}),
+            **({"history": self.attempts} if len(self.attempts) > 1 else {}),
         }
-
-
-class _Watch(BaseCallback):
-    """Evaluates, keeps checkpoints and reports progress between two agent steps, when all updates are made."""
-
-    def __init__(self, run: _CellRun):
-        super().__init__()
-        self.run = run
-        self._losses: list[th.Tensor] = []
-
-    def _on_step(self) -> bool:
-        loss = self.logger.name_to_value.get("train/srl_loss")
-        if loss is not None:
-            self._losses.append(th.as_tensor(loss))
-        self.run.report()
-        return True
-
-    def _on_rollout_start(self) -> None:
-        self._look(finished=False)
-
-    def _on_training_end(self) -> None:
-        self._look(finished=True)
-
-    def _look(self, finished: bool) -> None:
-        run = self.run
-        is_training = run.state["phase"] == "train"
-        evaluates = is_training and run.is_evaluation_due(finished)
-        if evaluates:
-            run.evaluate()
-            run.evaluations[-1]["srl_loss"] = float(th.stack(self._losses).mean()) if self._losses else ""
-            run.evaluations[-1]["seconds"] = round(run.seconds, 1)
-            self._losses.clear()
-            run.write_tables()
-        if run.is_checkpoint_due():
-            run.keep()
 
 
 def action_repeat_of(env: gym.Env) -> int:
