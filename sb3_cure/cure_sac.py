@@ -961,8 +961,8 @@ class CuReSAC(SAC):
         else:
             name = path if isinstance(path, str | pathlib.Path) else "the file"
             raise ArchiveError(
-                f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that is "
-                "in a file: if you know where it comes from, load it with trusted=True."
+                f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
+                "is in a file: if you know where it comes from, load it with trusted=True."
             )
 
     def _excluded_save_params(self) -> list[str]:

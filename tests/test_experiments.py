@@ -236,7 +236,8 @@ def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
         write_grid(tmp_path, budget=160, methods={"own": {"config": "zoo.yml", "overrides": overrides}})
     ).cells
     folder = run_cell(cell, tmp_path, pictures=False)
-    assert type(CuReSAC.load(folder / "model.zip").policy.srl).__name__ == "Denoising"
+    loaded = CuReSAC.load(folder / "model.zip", custom_objects=cell.custom_objects())
+    assert type(loaded.policy.srl).__name__ == "Denoising"
     assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "test_save_load.Denoising"
 
 

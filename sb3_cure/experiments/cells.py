@@ -236,8 +236,11 @@ class _CellRun:
         return None
 
     def _load(self, newest: Path) -> CuReSAC:
-        model = CuReSAC.load(newest / "model.zip", env=self._make_env())
-        model.load_replay_buffer(newest / "replay_buffer.pkl")
+        # Trusted: what an earlier version kept of an unfinished run is pickled, and lies in the run's own folder.
+        model = CuReSAC.load(
+            newest / "model.zip", env=self._make_env(), custom_objects=self.cell.custom_objects(), trusted=True
+        )
+        model.load_replay_buffer(newest / "replay_buffer.pkl", trusted=True)
         self.state = json.loads((newest / "state.json").read_text())
         self.evaluations = read_rows(newest / "eval.csv")
         self.episodes = read_rows(newest / "episodes.csv")
