@@ -269,8 +269,8 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
     policy_kwargs = settings.get("policy_kwargs")
     if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != policy_kwargs:
         raise ValueError(
-            f"the policy kwargs do not equal those of {archive.name}: load was called with {kwargs['policy_kwargs']}, but "
-            f"it was saved with {policy_kwargs}: leave them out, as the networks are those of the archive."
+            f"the policy kwargs do not equal those of {archive.name}: load got {kwargs['policy_kwargs']}, but it was "
+            f"saved with {policy_kwargs}: leave them out, as the networks are those of the archive."
         )
     return settings
 
