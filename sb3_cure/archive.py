@@ -258,8 +258,9 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
             fits = key not in NEVER_SAVED and check(value)
         if not fits:
             expected = f"but {key} is {words}" if words else "which is no setting"
-            shown = "".join(filter(str.isprintable, f"{value!r:.100}"))
-            raise ArchiveError(f"{archive.name} has {key}={shown}, {expected}: it is damaged, or another version's.")
+            raise ArchiveError(
+                f"{archive.name} has {key}={value!r:.100}, {expected}: it is damaged, or of another version."
+            )
     known = settings.keys() | archive.placeholders.keys()
     settings.update({key: value for key, value in custom_objects.items() if key in known})
     for key in ("policy_class", "observation_space", "action_space"):
@@ -268,8 +269,8 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
     policy_kwargs = settings.get("policy_kwargs")
     if "policy_kwargs" in kwargs and kwargs["policy_kwargs"] != policy_kwargs:
         raise ValueError(
-            f"load was called with policy_kwargs={kwargs['policy_kwargs']}, but {archive.name} was saved with "
-            f"{policy_kwargs}: leave them out, as the networks are those of the archive."
+            f"the policy kwargs do not equal those of {archive.name}: load got {kwargs['policy_kwargs']}, but it was "
+            f"saved with {policy_kwargs}: leave them out, as the networks are those of the archive."
         )
     return settings
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from stable_baselines3.common import buffers as sb3_buffers
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.files import PathOrFile, reading, writing
 from sb3_cure.serialization import Archive, ArchiveError, StoredArray, decode_state, sentences, write_state
 from sb3_cure.settings import whole
@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 #: Classes whose contents are written without pickle, with what is written of them: counters, and arrays of rows
 _COUNTERS = ("buffer_size", "n_envs", "pos")
-_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "marked")
 _BUFFERS = (
     FrameStackReplayBuffer,
+    SkippingReplayBuffer,
     sb3_buffers.ReplayBuffer,
     sb3_buffers.DictReplayBuffer,
     sb3_buffers.NStepReplayBuffer,
@@ -86,6 +87,8 @@ def load_buffer(model: "CuReSAC", path: PathOrFile) -> sb3_buffers.ReplayBuffer:
         archive = Archive(file, name)
         state = decode_state(archive, materialize=lambda stored: stored)
         kind = model.replay_buffer_class
+        if kind is sb3_buffers.ReplayBuffer and state.get("class") == SkippingReplayBuffer.__name__:
+            kind = SkippingReplayBuffer  # what the first mark has made of it
         if kind not in _BUFFERS or state.get("class") != kind.__name__:
             raise ArchiveError(
                 f"{name} holds a {state.get('class')!s:.50}, but this model has a {kind.__name__ if kind else None}: "

@@ -43,7 +43,13 @@ _PLAIN = (type(None), bool, str)
 
 
 class ArchiveError(ValueError):
-    """A file is not what it should be, in one sentence."""
+    """A file is not what it should be, in one sentence.
+
+    :param sentence: It may quote the file, whose control characters are left out
+    """
+
+    def __init__(self, sentence: str):
+        super().__init__("".join(filter(str.isprintable, sentence)))
 
 
 def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:

@@ -5,17 +5,21 @@ differs: the algorithm is ``cure_sac`` and the folder ``logs`` unless given, ``o
 what this module's classes say.
 """
 
+import argparse
 import importlib
 import runpy
 import sys
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+from unittest import mock
 
 try:
     import optuna
+    import yaml
     from rl_zoo3 import ALGOS, exp_manager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
     from rl_zoo3.utils import get_class_by_name
@@ -35,6 +39,9 @@ PROGRAMS = ("train", "enjoy", "record", "optimize")
 class ActingCuReSAC(CuReSAC):
     """What ``enjoy`` and ``record`` load: a CuReSAC that only acts, without the replay buffer of its training."""
 
+    #: What models hold no more of than a placeholder: the head that ``--srl`` names
+    objects: ClassVar[dict[str, Any]] = {}
+
     @classmethod
     def load(cls, *args: Any, **kwargs: Any) -> CuReSAC:  # type: ignore[override]
         """
@@ -43,7 +50,9 @@ class ActingCuReSAC(CuReSAC):
         :return: The model; its ``replay_buffer`` is None
         """
         # rl-zoo3 asks for a buffer of 1 too, but only for the off-policy algorithms that it knows by name.
-        model = CuReSAC.load(*args, **{**kwargs, "buffer_size": 1})
+        objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects}
+        kwargs.update(custom_objects=objects, buffer_size=1)
+        model = CuReSAC.load(*args, **kwargs)
         model.replay_buffer = None
         return model
 
@@ -164,23 +173,48 @@ def train() -> None:
     program.train()
 
 
+class RunLoader(yaml.SafeLoader):
+    """Reads the settings that rl-zoo3 saves with a run: plain values, tuples and ordered dictionaries, nothing else."""
+
+
+RunLoader.add_constructor(
+    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
+    lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),
+)
+RunLoader.add_constructor(
+    "tag:yaml.org,2002:python/tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True))
+)
+
+
 def enjoy() -> None:
     """rl-zoo3's ``enjoy``, on ``sys.argv``."""
-    importlib.import_module("rl_zoo3.enjoy").enjoy()
+    # rl-zoo3 would run what a run's folder names, which may come from anyone.
+    with mock.patch.object(yaml, "UnsafeLoader", RunLoader):
+        importlib.import_module("rl_zoo3.enjoy").enjoy()
 
 
 def record() -> None:
     """rl-zoo3's ``record_video``, on ``sys.argv``."""
     # It is a script, without a function to call.
-    runpy.run_module("rl_zoo3.record_video", run_name="__main__")
+    with mock.patch.object(yaml, "UnsafeLoader", RunLoader):
+        runpy.run_module("rl_zoo3.record_video", run_name="__main__")
 
 
 def run(program: str, arguments: Sequence[str]) -> None:
     """
     :param program: One of ``PROGRAMS``
-    :param arguments: Its command line
+    :param arguments: Its command line; ``enjoy`` and ``record`` also take ``--srl my_package.MyHead``, the class of a
+        head of your own, which a saved model does not hold
     """
     acts = program in ("enjoy", "record")
+    # Classes that settings and `--srl` name may lie in the working directory.
+    if "" not in sys.path:
+        sys.path.append("")
+    if acts:
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--srl")
+        own, arguments = parser.parse_known_args(arguments)
+        ActingCuReSAC.objects = {} if own.srl is None else {"srl": get_class_by_name(own.srl)}
     register(ActingCuReSAC if acts else CuReSAC)
     # argparse takes the last of repeated flags, so that these are defaults.
     defaults = ["--algo", ALGO] + (["--folder", "logs"] if acts else [])
@@ -191,9 +225,6 @@ def run(program: str, arguments: Sequence[str]) -> None:
         defaults.append("--no-render")
     if not acts:
         tune_allocator()
-    # Classes that settings and saved models name may lie in the working directory.
-    if "" not in sys.path:
-        sys.path.append("")
     programs: dict[str, Callable[[], None]] = {"train": train, "enjoy": enjoy, "record": record, "optimize": train}
     own_arguments = sys.argv
     sys.argv = [f"sb3-cure {program}", *defaults, *arguments]

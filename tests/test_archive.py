@@ -34,8 +34,7 @@ from torch import nn
 from benchmarks.fuzz import example_model, examples, fuzz, load, members_of, outcome, watching, zip_of
 from sb3_cure import CuReSAC
 from sb3_cure.encoders import VectorEncoder
-from sb3_cure.serialization import ArchiveError, dump_json
-from sb3_cure.settings import SettingsDecoder, SettingsEncoder
+from sb3_cure.serialization import ArchiveError
 from sb3_cure.zoo import ActingCuReSAC
 
 # -------------------------------------------------------------------- settings
@@ -54,32 +53,14 @@ SPACES = [
 ]
 
 
-def through_json(value: Any) -> Any:
-    """A setting as an archive without arrays gives it back."""
-    encoder = SettingsEncoder()
-    node = json.loads(dump_json(encoder.encode(value, "setting")))
-    if encoder.arrays:
-        pytest.skip("has arrays, which the test of whole models covers")
-    return SettingsDecoder([]).decode_all(node)
-
-
-@pytest.mark.parametrize("space", SPACES, ids=str)
-def test_spaces(space: spaces.Space) -> None:
-    """Every kind of space comes back equal, to the type of its numbers (arrays go by another way, below)."""
-    read = through_json(space)
-    assert read == space and read.dtype == space.dtype and type(read) is type(space)
-
-
-@pytest.mark.parametrize("space", SPACES, ids=str)
-def test_spaces_in_archives(space: spaces.Space) -> None:
-    """The same as a model's setting, with the arrays of uneven bounds in members of their own."""
+def test_spaces() -> None:
+    """Every kind of space comes back as it was, to the type of its numbers and the order of its parts."""
     model = tiny_model("MlpPolicy", VectorBox())
-    model.srl_kwargs = {"decoder_weight_decay": 0.0}
-    model.observed_space = space
+    model.spaces = SPACES
     file = io.BytesIO()
     model.save(file)
-    read = CuReSAC.load(file, trusted=True).observed_space
-    assert read == space and repr(read) == repr(space)
+    for space, read in zip(SPACES, CuReSAC.load(file, trusted=True).spaces, strict=True):
+        assert read == space and repr(read) == repr(space) and type(read) is type(space) and read.dtype == space.dtype
 
 
 NOISES = [
@@ -530,9 +511,9 @@ MODELS: dict[str, Callable[[], bytes]] = {
     "a file of torch": lambda: torch_bytes({"w": th.zeros(3)}),
     # zip
     "compressed": lambda: raw_zip(list(members_of(examples()["model"]).items()), zipfile.ZIP_DEFLATED),
-    "a zip bomb": lambda: raw_zip([("data", b" " * 10**8)], zipfile.ZIP_DEFLATED),
+    "a zip bomb": lambda: raw_zip([("data", b" " * 10**7)], zipfile.ZIP_DEFLATED),
     "a bomb within": lambda: changed_model(
-        **{"policy.pth": raw_zip([("archive/data.pkl", bytes(10**8))], zipfile.ZIP_LZMA)}
+        **{"policy.pth": raw_zip([("archive/data.pkl", bytes(10**7))], zipfile.ZIP_LZMA)}
     ),
     "a member above": lambda: changed_model(**{"../evil": b"x"}),
     "a member at the root": lambda: changed_model(**{"/etc/evil": b"x"}),
@@ -674,7 +655,7 @@ BUFFERS: dict[str, Callable[[], bytes]] = {
     "half a file": lambda: examples()["buffer"][: len(examples()["buffer"]) // 2],
     "a model": lambda: examples()["model"],
     "a state": lambda: examples()["state"],
-    "a zip bomb": lambda: raw_zip([("state.json", b" " * 10**8)], zipfile.ZIP_DEFLATED),
+    "a zip bomb": lambda: raw_zip([("state.json", b" " * 10**7)], zipfile.ZIP_DEFLATED),
     "another class": changed_buffer(lambda state: state.update({"class": "ReplayBuffer"})),
     "other environments": changed_buffer(lambda state: state.update(n_envs=10**9)),
     "a huge size": changed_buffer(lambda state: state.update(buffer_size=10**15)),

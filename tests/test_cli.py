@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -139,12 +140,16 @@ def test_train_enjoy_record(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
         return models[-1]
 
     monkeypatch.setattr(zoo.ActingCuReSAC, "load", load_and_keep)
-    assert cli.main(["enjoy", "--env", TASK, "-n", "20", "--no-render"]) == 0
+    enjoy = ["enjoy", "--env", TASK, "-n", "20", "--no-render"]
+    with pytest.raises(ValueError, match=r"srl is the class my_heads.Gentle"):
+        cli.main(enjoy)
+    assert cli.main([*enjoy, "--srl", "my_heads.Gentle"]) == 0
     assert "2 Episodes" in capsys.readouterr().out
     (model,) = models
     assert model.replay_buffer is None and type(model.policy.srl).__name__ == "Gentle"
 
     record = [sys.executable, "-m", "sb3_cure.zoo", "record", "--env", TASK, "-n", "5", "--load-best"]
+    record += ["--srl", "my_heads.Gentle"]
     finish(start(record))
     (video,) = run.glob("videos/*.mp4")
     assert video.stat().st_size > 1000
@@ -280,3 +285,11 @@ def test_versions_are_compared_with_the_requirements() -> None:
     assert {"torch", "mujoco", "gymnasium"} <= {requirement.name for requirement in doctor.requirements()}
     extra = {requirement.name for requirement in doctor.requirements("experiments")}
     assert {"rliable", "matplotlib"} <= extra and ("rl_zoo3" in extra or "rl-zoo3" in extra) and "torch" not in extra
+
+
+def test_a_runs_settings_cannot_run_code(tmp_path: Path) -> None:
+    """What rl-zoo3 writes beside a model is read as data: the kinds that it has come back, an object is refused."""
+    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5))])
+    assert yaml.load(yaml.dump(settings), Loader=zoo.RunLoader) == settings
+    with pytest.raises(yaml.YAMLError, match="could not determine a constructor"):
+        yaml.load("!!python/object/apply:os.system ['true']", Loader=zoo.RunLoader)

@@ -18,11 +18,12 @@ import pytest
 import yaml
 from envs_for_tests import PixelBox, differences, state_of
 
-from sb3_cure import CuReSAC
+from sb3_cure import CuReSAC, files, generations
 from sb3_cure.experiments import cells, run, visitation, yardsticks
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
+from sb3_cure.generations import Generations
 
 GRIDS = Path(__file__).parent.parent / "zoo_configs" / "experiments"
 TASK = "tests/PixelBox-v0"
@@ -37,7 +38,8 @@ DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale":
 def _pixel_box(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The tiny task under an id: 20 steps per episode, an action repeat of 4. Checkpoints do not wait for the disk."""
     gym.register(TASK, PixelBox)
-    monkeypatch.setattr(cells, "flush_to_disk", lambda path: None)
+    for module in (files, generations):
+        monkeypatch.setattr(module, "flush_to_disk", lambda path: None)
     yield
     del gym.registry[TASK]
 
@@ -236,7 +238,8 @@ def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
         write_grid(tmp_path, budget=160, methods={"own": {"config": "zoo.yml", "overrides": overrides}})
     ).cells
     folder = run_cell(cell, tmp_path, pictures=False)
-    assert type(CuReSAC.load(folder / "model.zip").policy.srl).__name__ == "Denoising"
+    loaded = CuReSAC.load(folder / "model.zip", custom_objects=cell.custom_objects())
+    assert type(loaded.policy.srl).__name__ == "Denoising"
     assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "test_save_load.Denoising"
 
 
@@ -332,10 +335,10 @@ def test_a_damaged_checkpoint_is_left_out(
     with pytest.raises(ZeroDivisionError):
         run_cell(cell, tmp_path, 0, pictures=False)
     monkeypatch.setattr(cells, "write_text", write)
-    (newest,) = (tmp_path / cell.folder / "checkpoint").iterdir()
+    (newest,) = (tmp_path / cell.folder / "checkpoint").glob("generation-*")
     (newest / "model.zip").write_bytes((newest / "model.zip").read_bytes()[:1000])
     folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "cannot be read" in capsys.readouterr().out
+    assert "begins anew: no checkpoint in" in capsys.readouterr().out
     assert steps_of(folder / "eval.csv") == [0, 160] and (folder / "DONE").exists()
 
 
@@ -525,7 +528,8 @@ def wait_for(what: Any, seconds: float = 400) -> Any:
 
 
 def has_checkpoint(folder: Path) -> bool:
-    return any(path.name.isdigit() for path in (folder / "checkpoint").glob("*"))
+    """One that training has written, after that of its start."""
+    return max(Generations(folder / "checkpoint").numbers(), default=0) > 0
 
 
 def test_a_killed_grid_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
@@ -539,9 +543,8 @@ def test_a_killed_grid_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     wait_for(lambda: has_checkpoint(folder))
     process.send_signal(signal.SIGKILL)
     process.wait()
-    generations = [int(each.name) for each in (folder / "checkpoint").iterdir() if each.name.isdigit()]
-    kept = json.loads((folder / "checkpoint" / str(max(generations)) / "state.json").read_text())
-    assert kept["agent_steps"] > 0 and not (folder / "DONE").exists()
+    kept = Generations(folder / "checkpoint")
+    assert kept.read(kept.numbers()[-1]).about["num_timesteps"] > 0 and not (folder / "DONE").exists()
     process = launch(path, out)
     assert process.wait(timeout=300) == 0
     assert steps_of(folder / "eval.csv") == [0, 800, 1600, 2400, 3200, 4000]

@@ -87,6 +87,11 @@ class Cell:
             arguments["srl"] = pkgutil.resolve_name(arguments["srl"])
         return arguments
 
+    def custom_objects(self) -> dict[str, Any]:
+        """What ``CuReSAC.load`` needs besides the archive: a head that is named like a module's."""
+        arguments = self.build_arguments()
+        return {"srl": arguments["srl"]} if "srl" in arguments else {}
+
     def config(self) -> dict[str, Any]:
         """What its ``config.json`` holds."""
         return asdict(self)

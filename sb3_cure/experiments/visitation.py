@@ -125,7 +125,8 @@ def _roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool
 
 def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
     """The episodes of ``measure_visits`` again, by policy."""
-    model = CuReSAC.load(results / cell.folder / "model.zip", custom_objects={"buffer_size": 1})
+    objects = {**cell.custom_objects(), "buffer_size": 1}
+    model = CuReSAC.load(results / cell.folder / "model.zip", custom_objects=objects)
     env = gym.make(cell.task, **cell.env_kwargs)
     for actor in visiting_actors(model, cell):
         yield actor, _roll_out(model, cell, env, actor)
