@@ -283,7 +283,8 @@ def watch(callback: BaseCallback) -> list[WatchedCallback]:
 
 def _plain_attributes(callback: BaseCallback) -> dict[str, Any]:
     given = ("locals", "globals", "num_timesteps", "verbose")
-    return {name: value for name, value in vars(callback).items() if name not in given and _is_plain(value)}
+    public = {name: value for name, value in vars(callback).items() if not name.startswith("_")}
+    return {name: value for name, value in public.items() if name not in given and _is_plain(value)}
 
 
 def _is_plain(value: Any) -> bool:
@@ -296,7 +297,7 @@ def _is_plain(value: Any) -> bool:
 
 
 def _changed(watched: WatchedCallback) -> dict[str, Any]:
-    """A callback's counters and the like: plain attributes that differ from those at the start of ``learn``."""
+    """A callback's counters and the like: public plain attributes that differ from those at the start of ``learn``."""
     now = _plain_attributes(watched.callback)
     missing = object()
     changed = {name: value for name, value in now.items() if not _equal(watched.before.get(name, missing), value)}
