@@ -7,7 +7,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
@@ -29,12 +28,15 @@ from torch.nn import functional as F
 
 from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.checks import (
-    check_action_space,
     check_arguments,
+    check_construction,
     check_curious_agent,
+    check_learning,
+    check_parts,
     check_rewards,
     check_shared_encoder_space,
     check_srl_error,
+    make_env,
 )
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
@@ -198,9 +200,8 @@ class CuReSAC(SAC):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
-        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
-        if env is not None:
-            check_action_space(env.action_space)
+        env = make_env(env, kwargs.get("verbose", 0))
+        check_construction(self, policy, env, kwargs)
         if kwargs.get("policy_kwargs") is not None:
             kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
         super().__init__(
@@ -268,10 +269,12 @@ class CuReSAC(SAC):
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
+            check_parts(self)
             super()._setup_model()
             return
         check_shared_encoder_space(self.observation_space, self.policy_class)
         self._choose_replay_buffer()
+        check_parts(self)
         # The policy also needs to know what this algorithm's own arguments ask of it; `policy_kwargs` stays the user's.
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_blueprint()}
@@ -741,6 +744,7 @@ class CuReSAC(SAC):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
+        check_learning(self, total_timesteps, callback, log_interval)
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
         self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -793,6 +797,7 @@ class CuReSAC(SAC):
             )
         if collector == "curious":
             check_curious_agent(self)
+        check_learning(self, total_timesteps, callback, log_interval)
         self._collector = collector
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
