@@ -181,7 +181,7 @@ class _PictureCallback(PeriodicCallback):
     def _check_actors(self, actors: Sequence[str] | None) -> list[str]:
         """The actors asked for, or all that are trained, when the model is known."""
         trained = trained_actors(self.model)  # type: ignore[arg-type]
-        asked = list(actors or trained) if isinstance(actors, list | tuple | None) else [actors]
+        asked: list[Any] = list(actors or trained) if isinstance(actors, list | tuple | None) else [actors]
         wrong = [actor for actor in asked if actor not in (*trained, "random")]
         if wrong:
             raise ValueError(
@@ -462,8 +462,8 @@ class CuriosityMapCallback(_PictureCallback):
             )
         if state is not None and not callable(state):
             raise ValueError(
-                f"CuriosityMapCallback got state={state!r}, but it must be a function of the environment that returns its "
-                "true state: give one, or leave it out for tasks of dm_control."
+                f"CuriosityMapCallback got state={state!r}, but it must be a function of the environment that returns "
+                "its true state: give one, or leave it out for tasks of dm_control."
             )
         self.state = state or physics_state
         self.names = list(physics_state_names(eval_env) if names is None else names)
