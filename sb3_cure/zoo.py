@@ -210,7 +210,7 @@ def _explained(error: Exception) -> str:
     """The same, with what to do where Python does not say it."""
     if isinstance(error, NameError | SyntaxError):
         return (
-            f"a text that is to be evaluated is no Python ({_one_line(error)}): correct it; text within it needs quotes "
+            f"a text that is to be evaluated is no Python ({_one_line(error)}): correct it; text in it needs quotes "
             """of its own, such as -params "srl:'curl'\""""
         )
     if isinstance(error, ImportError):
