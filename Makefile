@@ -73,9 +73,10 @@ demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten mi
 test: gl  ## run the tests (options for pytest: make test PYTEST_ARGS="-x -k buffer")
 	$(RUN) pytest $(PYTEST_ARGS)
 
-# What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits, wrong
-# arguments, the replay buffer, and the pixels of dm_control.
-SMOKE := tests/test_sb3_parity.py tests/test_compatibility.py tests/test_bad_input.py tests/test_buffers.py \
+# What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
+# the replay buffer, wrong arguments, and the pixels of dm_control.
+SMOKE := tests/test_sb3_parity.py tests/test_compatibility.py tests/test_buffers.py \
+	tests/test_bad_input.py::test_constructor tests/test_bad_input.py::test_unknown_keywords \
 	tests/test_envs.py::test_frames_and_rewards_are_those_of_dm_control
 
 .venv-oldest/.installed: .venv/.installed setup.cfg constraints-oldest.txt
