@@ -97,6 +97,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 raise
             raise SettingsError(f"{_explained(error)} (settings: {self.config}).") from error
 
+    def learn(self, model: Any) -> None:
+        if self.log_interval == 0:  # the constructor's own default, by which SB3 divides
+            self.log_interval = -1
+        super().learn(model)
+
     def _open_storage(self, storage: str) -> None:
         try:
             if not storage.endswith(".log"):
