@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl chromium demo test check bench notebooks clean help
+.PHONY: .venv gl chromium demo test test-oldest check bench notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -73,6 +73,22 @@ demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten mi
 test: gl  ## run the tests (options for pytest: make test PYTEST_ARGS="-x -k buffer")
 	$(RUN) pytest $(PYTEST_ARGS)
 
+# What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
+# the replay buffer, wrong arguments, and the pixels of dm_control.
+SMOKE := tests/test_sb3_parity.py tests/test_compatibility.py tests/test_buffers.py \
+	tests/test_bad_input.py::test_constructor tests/test_bad_input.py::test_unknown_keywords \
+	tests/test_envs.py::test_frames_and_rewards_are_those_of_dm_control
+
+.venv-oldest/.installed: .venv/.installed setup.cfg constraints-oldest.txt
+	@rm -rf .venv-oldest
+	$(RUN) venv .venv-oldest
+	echo "Installing the oldest supported versions into .venv-oldest ..."
+	.venv-oldest/bin/python -m pip install -q --disable-pip-version-check -c constraints-oldest.txt -e . pytest hypothesis
+	touch $@
+
+test-oldest: gl .venv-oldest/.installed  ## run some tests with the oldest versions that are supported (.venv-oldest)
+	.venv-oldest/bin/python -m pytest $(PYTEST_ARGS) $(SMOKE)
+
 check: .venv/.installed  ## lint, formatting and types
 	$(RUN) ruff check
 	$(RUN) ruff format --check
@@ -85,8 +101,8 @@ notebooks: gl  ## execute the notebooks in place
 	$(RUN) nbconvert --to notebook --execute --inplace notebooks/*.ipynb
 
 clean:  ## remove .venv, caches and build products
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-oldest build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 help:  ## list the targets
-	@sed -nE 's/^([a-z.]+):[^#]*##/\1:/p' Makefile
+	@sed -nE 's/^([a-z.-]+):[^#]*##/\1:/p' Makefile

@@ -250,7 +250,9 @@ class Site:
         if resumed == "another state" and any("are lost with their frames" in sentence for sentence in said):
             resumed = "without some frames"
         # It goes on from there as from any other: the next checkpoint is whole.
-        model = CuReSAC.resume(self.work, _Dots(), device="cpu")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            model = CuReSAC.resume(self.work, _Dots(), device="cpu")
         model.set_logger(Logger(None, []))
         assert model._checkpoint_writer is not None
         model._checkpoint_writer.write(model, KEEP)

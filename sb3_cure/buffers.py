@@ -17,6 +17,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_cure.values import check_folder, is_integer
+
 try:
     import psutil
 except ImportError:
@@ -235,6 +237,13 @@ class FrameStackReplayBuffer(_SkipsMarked):
         frames_dir: str | Path | None = None,
     ):
         _check_arguments(observation_space, frame_stack, optimize_memory_usage)
+        if not (is_integer(buffer_size, 1) and is_integer(n_envs, 1)):
+            raise ValueError(
+                f"buffer_size is {buffer_size!r} and n_envs {n_envs!r}, but both must be whole numbers of at least 1: "
+                "change them."
+            )
+        if frames_dir is not None:
+            check_folder("frames_dir", frames_dir)
         # As SB3's DictReplayBuffer does: ReplayBuffer's constructor would allocate what this class avoids
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         self.buffer_size = max(buffer_size // n_envs, 1)
@@ -556,7 +565,7 @@ def _check_arguments(observation_space: spaces.Space, frame_stack: int, optimize
             f"observation_space has shape {shape}, which looks like channels last, but FrameStackReplayBuffer expects "
             "(frame_stack * c, height, width): wrap the environment in VecTransposeImage."
         )
-    if not isinstance(frame_stack, int | np.integer) or frame_stack < 1:
+    if not is_integer(frame_stack, 1):
         raise ValueError(
             f"frame_stack is {frame_stack!r}, but it must be an integer of at least 1: pass the number of frames that "
             "one observation stacks."

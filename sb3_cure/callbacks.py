@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -24,6 +25,7 @@ from sb3_cure.envs import physics_state, physics_state_names, physics_state_unit
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
 from sb3_cure.metrics import newest_frames
+from sb3_cure.values import check_folder, is_integer, is_number
 
 
 class PeriodicCallback(BaseCallback):
@@ -39,8 +41,10 @@ class PeriodicCallback(BaseCallback):
 
     def __init__(self, every: int, verbose: int = 0):
         super().__init__(verbose)
-        if every < 1:
-            raise ValueError(f"{type(self).__name__} got every={every}, but it counts agent steps: give a number >= 1.")
+        if not is_integer(every, 1):
+            raise ValueError(
+                f"{type(self).__name__} got every={every!r}, but it counts agent steps: give a whole number >= 1."
+            )
         self.every = every
         self._last_period = 0
 
@@ -94,12 +98,14 @@ class EvalBothCallback(PeriodicCallback):
         seed: int | None = None,
         verbose: int = 0,
     ):
-        if eval_freq < 1 or n_episodes < 1:
+        if not (is_integer(eval_freq, 1) and is_integer(n_episodes, 1)):
             raise ValueError(
-                f"EvalBothCallback got eval_freq={eval_freq} and n_episodes={n_episodes}, but each must be at least 1: "
-                "give numbers >= 1."
+                f"EvalBothCallback got eval_freq={eval_freq!r} and n_episodes={n_episodes!r}, but each must be at "
+                "least 1: give whole numbers >= 1."
             )
         super().__init__(eval_freq, verbose)
+        _check_env("EvalBothCallback", eval_env)
+        _check_seed("EvalBothCallback", seed)
         self.eval_env = eval_env
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
@@ -107,6 +113,9 @@ class EvalBothCallback(PeriodicCallback):
         self.seed = seed
         #: One row per evaluation: agent steps and the logged values
         self.history: list[dict[str, float]] = []
+
+    def _init_callback(self) -> None:
+        _check_spaces("EvalBothCallback", self.eval_env, self.model)
 
     def on_period(self) -> None:
         """Evaluate."""
@@ -154,6 +163,7 @@ class _PictureCallback(PeriodicCallback):
 
     def __init__(self, folder: str | Path, every: int, room: str, verbose: int):
         super().__init__(every, verbose)
+        check_folder("folder", folder)
         self.folder = Path(folder)
         self._import_room(room)
 
@@ -177,13 +187,30 @@ class _PictureCallback(PeriodicCallback):
     def _check_actors(self, actors: Sequence[str] | None) -> list[str]:
         """The actors asked for, or all that are trained, when the model is known."""
         trained = trained_actors(self.model)  # type: ignore[arg-type]
-        wrong = [actor for actor in actors or trained if actor not in (*trained, "random")]
+        asked: list[Any] = list(actors or trained) if isinstance(actors, list | tuple | None) else [actors]
+        wrong = [actor for actor in asked if actor not in (*trained, "random")]
         if wrong:
             raise ValueError(
                 f"{type(self).__name__} got actors={actors!r}, but of {', '.join(map(repr, ACTORS))} this model has "
                 f"{', '.join(map(repr, (*trained, 'random')))}: choose of these."
             )
-        return list(actors or trained)
+        return asked
+
+
+def _check_seed(user: str, seed: Any) -> None:
+    if seed is not None and not is_integer(seed, 0):
+        raise ValueError(f"{user} got seed={seed!r}, but it must be None or a whole number >= 0: change seed.")
+
+
+def _check_spaces(user: str, eval_env: gym.Env, model: BaseAlgorithm) -> None:
+    """Else the first evaluation would end the training."""
+    observations, actions = eval_env.observation_space, eval_env.action_space
+    # Of images SB3 may have moved the channels to the front.
+    if actions != model.action_space or sorted(observations.shape or ()) != sorted(model.observation_space.shape or ()):
+        raise ValueError(
+            f"{user} got an eval_env with observations {observations} and actions {actions}, but the model was made "
+            f"for {model.observation_space} and {model.action_space}: make eval_env as the training environment."
+        )
 
 
 def _check_env(user: str, eval_env: gym.Env) -> None:
@@ -230,8 +257,9 @@ class PolicyVideoCallback(_PictureCallback):
                 f"PolicyVideoCallback got an environment with render_mode={eval_env.render_mode!r}, which gives no "
                 "frames: make it with render_mode='rgb_array'."
             )
-        if fps is not None and fps < 1:
-            raise ValueError(f"PolicyVideoCallback got fps={fps}, but a video needs at least 1: give a number >= 1.")
+        if fps is not None and not is_number(fps, low=1):
+            raise ValueError(f"PolicyVideoCallback got fps={fps!r}, but a video needs at least 1: give a number >= 1.")
+        _check_seed("PolicyVideoCallback", seed)
         self.eval_env = eval_env
         self.actors = actors
         self.deterministic = deterministic
@@ -240,6 +268,7 @@ class PolicyVideoCallback(_PictureCallback):
 
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
+        _check_spaces("PolicyVideoCallback", self.eval_env, self.model)
 
     def on_period(self) -> None:
         """Film an episode of each policy."""
@@ -292,10 +321,19 @@ class ReconstructionCallback(_PictureCallback):
         verbose: int = 0,
     ):
         super().__init__(folder, every, "plots", verbose)
-        if columns < 1 or probe_updates < 0 or max_rows < 2:
+        if not (is_integer(columns, 1) and is_integer(probe_updates, 0) and is_integer(max_rows, 2)):
             raise ValueError(
-                f"ReconstructionCallback got columns={columns}, probe_updates={probe_updates} and max_rows={max_rows}, "
-                "but they must be at least 1, 0 and 2: change them."
+                f"ReconstructionCallback got columns={columns!r}, probe_updates={probe_updates!r} and "
+                f"max_rows={max_rows!r}, but they must be whole numbers of at least 1, 0 and 2: change them."
+            )
+        if observations is not None and getattr(observations, "dtype", None) != np.uint8:
+            raise ValueError(
+                f"ReconstructionCallback got observations of {getattr(observations, 'dtype', type(observations))}, but "
+                "it draws images of uint8: give them as the environment returns them, stacked."
+            )
+        if frame_stack is not None and not is_integer(frame_stack, 1):
+            raise ValueError(
+                f"ReconstructionCallback got frame_stack={frame_stack!r}, but it counts frames: give a number >= 1."
             )
         self.observations = observations
         self.columns = columns
@@ -417,16 +455,22 @@ class CuriosityMapCallback(_PictureCallback):
     ):
         super().__init__(folder, every, "plots", verbose)
         _check_env("CuriosityMapCallback", eval_env)
-        if n_episodes < 1 or bins < 1:
+        if not (is_integer(n_episodes, 1) and is_integer(bins, 1)):
             raise ValueError(
-                f"CuriosityMapCallback got n_episodes={n_episodes} and bins={bins}, but each must be at least 1: give "
-                "numbers >= 1."
+                f"CuriosityMapCallback got n_episodes={n_episodes!r} and bins={bins!r}, but each must be at least "
+                "1: give whole numbers >= 1."
             )
+        _check_seed("CuriosityMapCallback", seed)
         if (state is None) != (names is None):
             given, missing = ("names", "state") if state is None else ("state", "names")
             raise ValueError(
                 f"CuriosityMapCallback got {given} without {missing}, but a state of your own needs both: a function "
                 "of the environment and the names of what it returns."
+            )
+        if state is not None and not callable(state):
+            raise ValueError(
+                f"CuriosityMapCallback got state={state!r}, but it must be a function of the environment that returns "
+                "its true state: give one, or leave it out for tasks of dm_control."
             )
         self.state = state or physics_state
         self.names = list(physics_state_names(eval_env) if names is None else names)
@@ -444,6 +488,7 @@ class CuriosityMapCallback(_PictureCallback):
 
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
+        _check_spaces("CuriosityMapCallback", self.eval_env, self.model)
 
     def on_period(self) -> None:
         """Roll out each policy and draw."""

@@ -40,14 +40,19 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         return importlib.import_module("sb3_cure.experiments.run").main(arguments) or 0
     if command == "report":
         return importlib.import_module("sb3_cure.experiments.report").main(arguments) or 0
-    importlib.import_module("sb3_cure.zoo").run(command, arguments)
+    zoo = importlib.import_module("sb3_cure.zoo")
+    try:
+        zoo.run(command, arguments)
+    except zoo.SettingsError as error:
+        print(f"sb3-cure {command}: {error}", file=sys.stderr)
+        return 2
     return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     :param argv: Command line without the program's name, ``sys.argv[1:]`` by default
-    :return: Exit status
+    :return: Exit status, 2 for what cannot work as it was written
     """
     command, *arguments = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if command in ("-h", "--help", "help"):

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
@@ -37,12 +36,15 @@ from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
 from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked
 from sb3_cure.checkpoint import CheckpointWriter, Resumption, WatchedCallback, resume, watch
 from sb3_cure.checks import (
-    check_action_space,
     check_arguments,
+    check_construction,
     check_curious_agent,
+    check_learning,
+    check_parts,
     check_shared_encoder_space,
     check_skip,
     check_srl_error,
+    make_env,
 )
 from sb3_cure.files import PathOrFile
 from sb3_cure.guards import Guard, TransitionGuard, check_actions
@@ -224,9 +226,8 @@ class CuReSAC(SAC):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
-        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
-        if env is not None:
-            check_action_space(env.action_space)
+        env = make_env(env, kwargs.get("verbose", 0))
+        check_construction(self, policy, env, kwargs)
         if kwargs.get("policy_kwargs") is not None:
             kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
         super().__init__(
@@ -303,10 +304,12 @@ class CuReSAC(SAC):
             self.policy_kwargs.pop("share_encoder", None)
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
+            check_parts(self)
             super()._setup_model()
             return
         check_shared_encoder_space(self.observation_space, self.policy_class)
         self._choose_replay_buffer()
+        check_parts(self)
         # The policy also needs to know what this algorithm's own arguments ask of it; `policy_kwargs` stays the user's.
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_blueprint()}
@@ -832,6 +835,7 @@ class CuReSAC(SAC):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
+        check_learning(self, total_timesteps, callback, log_interval)
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
         self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -887,6 +891,7 @@ class CuReSAC(SAC):
             )
         if collector == "curious":
             check_curious_agent(self)
+        check_learning(self, total_timesteps, callback, log_interval)
         if self._resumed is not None and self._collector != collector:
             if self._collector is not None:
                 raise ValueError(
@@ -1085,7 +1090,7 @@ class CuReSAC(SAC):
         :return: The model
         :raises CheckpointError: if there is no whole checkpoint, or the environments do not fit
         """
-        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
+        env = make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
         return resume(cls, path, env, custom_objects, device=device, **kwargs)  # type: ignore[return-value]
 
     def _excluded_save_params(self) -> list[str]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_cure.layers import FlattenImage, Projection, conv_sizes, init_weights
+from sb3_cure.values import is_integer
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -63,9 +64,9 @@ class PixelEncoder(Encoder):
                 f"PixelEncoder got observations of shape {shape}, but needs images (channels, height, width): "
                 "use 'MlpPolicy' for vectors."
             )
-        if min(features_dim, n_filters, n_layers) < 1:
+        if not all(is_integer(size, 1) for size in (features_dim, n_filters, n_layers)):
             raise ValueError(
-                f"PixelEncoder got features_dim={features_dim}, n_filters={n_filters}, n_layers={n_layers}, "
+                f"PixelEncoder got features_dim={features_dim!r}, n_filters={n_filters!r}, n_layers={n_layers!r}, "
                 "but each must be at least 1: change features_extractor_kwargs."
             )
         height, width = conv_sizes(shape[1], shape[2], n_layers)[-1]
@@ -90,11 +91,17 @@ class VectorEncoder(Encoder):
     :param features_dim: Size of the latent state
     :param hidden_dim: Width of the hidden layer
     :param tanh: Whether latents end in a tanh
+    :raises ValueError: if a size is below 1
     """
 
     def __init__(
         self, observation_space: spaces.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True
     ):
+        if not (is_integer(features_dim, 1) and is_integer(hidden_dim, 1)):
+            raise ValueError(
+                f"VectorEncoder got features_dim={features_dim!r} and hidden_dim={hidden_dim!r}, but each must be at "
+                "least 1: change features_extractor_kwargs."
+            )
         super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
         inputs = get_flattened_obs_dim(observation_space)
         self.trunk = nn.Sequential(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())

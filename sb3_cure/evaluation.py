@@ -14,6 +14,7 @@ from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
+from sb3_cure.values import is_integer
 
 ACTORS = ("task", "curious", "random")
 
@@ -154,6 +155,10 @@ def run_episodes(
     :return: The episodes
     :raises ValueError: if the actor is unknown, the model has no curious policy, or the environment no known state
     """
+    if not is_integer(n_episodes, 1):
+        raise ValueError(
+            f"n_episodes is {n_episodes!r}, but it must be a whole number of at least 1: change n_episodes."
+        )
     state_of = physics_state if states is True else states
     choose = _actor(model, env, actor, deterministic)
     if seed is not None:
@@ -230,8 +235,10 @@ def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int
     :return: The observations, worst first, with their errors
     :raises ValueError: if an argument is below 1, or the model has no SRL head or nothing in its replay buffer
     """
-    if k < 1 or gap < 1 or chunk < 1:
-        raise ValueError(f"k is {k}, gap {gap} and chunk {chunk}, but each must be at least 1: give numbers >= 1.")
+    if not all(is_integer(value, 1) for value in (k, gap, chunk)):
+        raise ValueError(
+            f"k is {k!r}, gap {gap!r} and chunk {chunk!r}, but each must be at least 1: give numbers >= 1."
+        )
     if getattr(model.policy, "srl", None) is None:
         raise ValueError("the model has no SRL head, so no SRL error: train it with srl='rae' or 'curl', for example.")
     buffer = getattr(model, "replay_buffer", None)

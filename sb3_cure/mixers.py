@@ -1,9 +1,9 @@
 """Which actor acts: at every step of every environment the curious one with probability p_c (Algorithm 1)."""
 
-from numbers import Real
-
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_cure.values import is_number
 
 
 class CuriousMixer:
@@ -29,7 +29,7 @@ class CuriousMixer:
         """
         schedule = self.probability
         probability = schedule(progress_remaining) if callable(schedule) else schedule
-        if not (isinstance(probability, Real) and 0 <= probability <= 1):
+        if not is_number(probability, 0, 1):
             raise ValueError(
                 f"curiosity_prob is {probability!r} (progress remaining {progress_remaining:.2f}), but it is the "
                 "probability p_c with which the curious actor acts: give a number, or a schedule, within [0, 1]."

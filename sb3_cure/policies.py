@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -285,6 +287,23 @@ class CuRePolicy(SACPolicy):
         :return: Latents as the acting agent sees them, [B, features_dim]
         """
         return self.encoder(self.center(observations))
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """SB3's, which would divide images that are floats by 255 once more.
+
+        :param observation: One observation or a batch
+        :return: The batch as a tensor, and whether it was a batch
+        :raises ValueError: if it is not made of numbers, or of floats where images are bytes
+        """
+        dtype = None if isinstance(observation, dict) else np.asarray(observation).dtype
+        images = is_image_space(self.observation_space)
+        if dtype is None or not np.issubdtype(dtype, np.integer if images else np.number):
+            given = "a dictionary" if dtype is None else f"values of type {dtype}"
+            raise ValueError(
+                f"the observation has {given}, but the policy reads {self.observation_space}: give it as the "
+                "environment returns it."
+            )
+        return super().obs_to_tensor(observation)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actor = getattr(self, self._acting)

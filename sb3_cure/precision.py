@@ -8,6 +8,8 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_cure.values import is_one_of
+
 PRECISIONS = ("auto", "fp32", "bf16")
 COMPILE = ("auto", True, False)
 
@@ -33,7 +35,7 @@ def resolve_precision(precision: str, device: th.device) -> str:
     :return: ``"fp32"`` or ``"bf16"``; auto chooses bf16 where the device computes it natively
     :raises ValueError: if the name is unknown
     """
-    if precision not in PRECISIONS:
+    if not is_one_of(precision, PRECISIONS):
         raise ValueError(
             f"precision is {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}: choose one of them."
         )

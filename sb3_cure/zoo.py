@@ -7,7 +7,9 @@ what this module's classes say.
 
 import argparse
 import importlib
+import re
 import runpy
+import shutil
 import sys
 import time
 from collections import OrderedDict
@@ -16,6 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 from unittest import mock
+
+import gymnasium as gym
 
 try:
     import optuna
@@ -30,10 +34,26 @@ except ModuleNotFoundError as missing:
 
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.envs.rendering import is_headless
+from sb3_cure.envs.rendering import GLUnavailableError, is_headless
+from sb3_cure.values import arguments_of, check_keywords, is_integer, is_number
 
 ALGO = "cure_sac"
 PROGRAMS = ("train", "enjoy", "record", "optimize")
+#: Keys of rl-zoo3's YAML files that are no arguments of the algorithm
+_ZOO_KEYS = {
+    "n_timesteps", "n_envs", "env_kwargs", "normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "callback",
+    "monitor_kwargs", "noise_type", "noise_std",
+}  # fmt: skip
+#: What wrong settings make others raise, where that is raised by one of these packages (and not by a user's own code)
+_OF_INPUT = (
+    ValueError, TypeError, KeyError, AttributeError, AssertionError, NameError, SyntaxError, ImportError, OSError,
+    ZeroDivisionError, gym.error.Error, GLUnavailableError,
+)  # fmt: skip
+_PACKAGES = ("sb3_cure", "rl_zoo3", "gymnasium", "importlib", "os", "pathlib")
+
+
+class SettingsError(ValueError):
+    """A command line or a settings file that cannot work; the message is for its author."""
 
 
 class ActingCuReSAC(CuReSAC):
@@ -65,19 +85,110 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``optimize`` samples only the hyper-parameters that the chosen kind of curiosity uses, and several processes may
       start at once on a database that does not exist yet;
     - ``--trial-id 0`` is the first trial, where rl-zoo3 takes 0 for none;
-    - a missing file of settings is explained.
+    - settings that cannot work are one sentence, and leave no folder behind.
     """
 
+    def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
+        save_path = Path(self.save_path)
+        fresh = [path for path in (save_path, *save_path.parents) if not path.exists()]
+        try:
+            if self.optimize_hyperparameters and self.storage is not None:
+                self._open_storage(self.storage)
+            return super().setup_experiment()
+        except Exception as error:
+            if save_path in fresh:
+                shutil.rmtree(save_path, ignore_errors=True)
+                for folder in fresh[1:]:
+                    if folder.is_dir() and not any(folder.iterdir()):
+                        folder.rmdir()
+            if isinstance(error, SettingsError) or not _is_about_input(error):
+                raise
+            raise SettingsError(f"{_explained(error)} (settings: {self.config}).") from error
+
+    def learn(self, model: Any) -> None:
+        if self.log_interval == 0:  # the constructor's own default, by which SB3 divides
+            self.log_interval = -1
+        super().learn(model)
+
+    def _open_storage(self, storage: str) -> None:
+        try:
+            if not storage.endswith(".log"):
+                _create_tables(storage)
+        except Exception as error:  # of the database's driver, whichever that is
+            raise SettingsError(
+                f"--storage is {storage!r}, which cannot be opened ({_one_line(error)}): give a database such as "
+                "sqlite:///study.db."
+            ) from error
+
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        if self.config.endswith((".yml", ".yaml", ".py")) and not Path(self.config).is_file():
-            raise ValueError(
-                f"The settings file {self.config} does not exist: give one with --conf-file, such as "
-                "zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
-            )
-        if self.storage and self.study_name and self.trial_id == 0:
-            trial = self.load_trial(self.storage, self.study_name, 0)
+        self._check_file()
+        if self.trial_id is not None:
+            trial = self._trial()
+            self.trial_id = None
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
-        return super().read_hyperparameters()
+        hyperparams, saved = super().read_hyperparameters()
+        if self.algo == ALGO:
+            self._check_values(hyperparams)
+        return hyperparams, saved
+
+    def _trial(self) -> dict[str, Any]:
+        """Arguments of the trial that the command line names."""
+        where = f"--trial-id {self.trial_id} of --study-name {self.study_name!r} in --storage {self.storage!r}"
+        database = re.fullmatch(r"sqlite:///(.+)", self.storage or "")
+        try:
+            if not self.storage or not self.study_name or (database and not Path(database[1]).is_file()):
+                raise FileNotFoundError("there is no such study")
+            return self.load_trial(self.storage, self.study_name, self.trial_id)
+        except Exception as error:  # of Optuna or of the database's driver, whichever that is
+            raise SettingsError(f"{where} cannot be read ({_one_line(error)}): name a trial that is there.") from error
+
+    def _check_file(self) -> None:
+        path = Path(self.config)
+        if (self.config.endswith((".yml", ".yaml", ".py")) and not path.is_file()) or path.is_dir():
+            given = f"the settings file {path} is no file"
+            if "rl_zoo3" in path.parts:  # where rl-zoo3 has those of its own algorithms
+                given = "cure_sac needs a settings file"
+            raise SettingsError(
+                f"{given}: give one with --conf-file, such as zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
+            )
+        if not self.config.endswith((".yml", ".yaml")):
+            return
+        try:
+            entries = yaml.safe_load(path.read_text())
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise SettingsError(f"{path} is no YAML ({_one_line(error)}): correct it.") from error
+        if not isinstance(entries, dict):
+            raise SettingsError(f"{path} holds {entries!r}, but it must map environments to settings: correct it.")
+        task = self.env_name.gym_id
+        if task not in entries and "default" not in entries:
+            raise SettingsError(f"{path} has neither {task!r} nor 'default': add one of them.")
+        if not isinstance(entries.get(task, entries.get("default")), dict):
+            raise SettingsError(f"the settings of {task!r} in {path} are no mapping (key: value): correct them.")
+
+    def _check_values(self, hyperparams: dict[str, Any]) -> None:
+        known = arguments_of(ALGOS[ALGO])
+        check_keywords("the settings file", hyperparams, known and known | _ZOO_KEYS, CuReSAC.__name__)
+        if not is_number(hyperparams.get("n_timesteps"), low=1):
+            raise SettingsError(
+                f"n_timesteps in {self.config} is {hyperparams.get('n_timesteps')!r}, but it must be a number of agent "
+                "steps of at least 1: write for example n_timesteps: 12500."
+            )
+        if not is_integer(hyperparams.get("n_envs", 1), 1):
+            raise SettingsError(
+                f"n_envs in {self.config} is {hyperparams['n_envs']!r}, but it must be a whole number of at least 1: "
+                "change n_envs."
+            )
+        if not isinstance(hyperparams.get("env_kwargs") or {}, dict):
+            raise SettingsError(
+                f"env_kwargs in {self.config} is {hyperparams['env_kwargs']!r}, but it must be a mapping (key: value): "
+                "change env_kwargs."
+            )
+        rate = hyperparams.get("learning_rate", 0.0)
+        if isinstance(rate, str) and not re.fullmatch(r"lin_\d*\.?\d+(e-?\d+)?", rate):
+            raise SettingsError(
+                f"learning_rate in {self.config} is {rate!r}, but it must be a number, or 'lin_<number>' for one that "
+                "falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 as a number)."
+            )
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
         if hyperparams.get("env_kwargs"):
@@ -86,16 +197,52 @@ class ExperimentManager(exp_manager.ExperimentManager):
             if self._eval_env_kwargs_args is None:
                 self.eval_env_kwargs = self.args.env_kwargs
         if "." in str(hyperparams.get("srl")):
-            hyperparams["srl"] = get_class_by_name(hyperparams["srl"])
+            try:
+                hyperparams["srl"] = get_class_by_name(hyperparams["srl"])
+            except (ImportError, AttributeError) as error:
+                raise SettingsError(
+                    f"srl is {hyperparams['srl']!r}, which cannot be imported ({_one_line(error)}): name a class as "
+                    "module.Class, in a module of the working directory or an installed one."
+                ) from error
         return super()._preprocess_hyperparams(hyperparams)
 
     def hyperparameters_optimization(self) -> None:
         if self.algo == ALGO:
             curiosity = self._hyperparams.get("curiosity", "separate")
             HYPERPARAMS_SAMPLER[ALGO] = partial(sample_cure_sac_params, curiosity=curiosity)
-        if self.storage is not None and not self.storage.endswith(".log"):
-            _create_tables(self.storage)
         super().hyperparameters_optimization()
+
+
+def _one_line(error: Exception) -> str:
+    """What an error says, without the full stop or question mark at its end."""
+    text = error.args[0] if isinstance(error, KeyError) and error.args else error
+    return " ".join(str(text).split()).rstrip(".?")
+
+
+def _explained(error: Exception) -> str:
+    """The same, with what to do where Python does not say it."""
+    if isinstance(error, NameError | SyntaxError):
+        return (
+            f"a text that is to be evaluated is no Python ({_one_line(error)}): correct it; text in it needs quotes "
+            """of its own, such as -params "srl:'curl'\""""
+        )
+    if isinstance(error, ImportError):
+        return f"what is named cannot be imported ({_one_line(error)}): correct the name, or install it"
+    if isinstance(error, OSError):
+        return f"{error.filename} cannot be used ({error.strerror}): name another folder or file"
+    return _one_line(error)
+
+
+def _is_about_input(error: BaseException) -> bool:
+    """Whether it was raised where settings are read, by rl-zoo3 or by us, and not in somebody's own code."""
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    if frame is None or not isinstance(error, _OF_INPUT):
+        return False
+    package = str(frame.tb_frame.f_globals.get("__name__")).partition(".")[0]
+    # What rl-zoo3 evaluates of the file or of the command line is of no package.
+    return package in _PACKAGES or frame.tb_frame.f_code.co_filename == "<string>" or isinstance(error, SyntaxError)
 
 
 def _create_tables(storage: str, attempts: int = 5) -> None:
@@ -230,8 +377,26 @@ def run(program: str, arguments: Sequence[str]) -> None:
     sys.argv = [f"sb3-cure {program}", *defaults, *arguments]
     try:
         programs[program]()
+    except (AssertionError, ValueError, NameError, SyntaxError, ImportError) as error:
+        if isinstance(error, SettingsError) or not _is_of_zoo(error):
+            raise
+        fix = ""
+        if isinstance(error, AssertionError | ValueError):
+            fix = ": correct the command line"
+            if acts:
+                fix = ": give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
+        raise SettingsError(f"{_explained(error)}{fix}.") from error
     finally:
         sys.argv = own_arguments
+
+
+def _is_of_zoo(error: BaseException) -> bool:
+    """Whether rl-zoo3 itself complains, about the command line, and not what it runs."""
+    frames, frame = [], error.__traceback__
+    while frame is not None:
+        frames.append(str(frame.tb_frame.f_globals.get("__name__")).partition(".")[0])
+        frame = frame.tb_next
+    return _is_about_input(error) and "stable_baselines3" not in frames and frames[-1] != "sb3_cure"
 
 
 if __name__ == "__main__":

@@ -8,7 +8,15 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
-from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
+from sb3_cure.envs.wrappers import (
+    ActionRepeat,
+    NormalizeActions,
+    PixelObservation,
+    StackFrames,
+    check_at_least_one,
+    check_flag,
+)
+from sb3_cure.values import is_integer, is_one_of
 
 # PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
 ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}
@@ -107,17 +115,23 @@ def make_dmc_env(
     :raises ValueError: If there is no such task or an argument is out of range
     :raises GLUnavailableError: If OpenGL is missing
     """
-    if task not in DMC_TASKS.get(domain, ()):
+    if not (isinstance(domain, str) and task in DMC_TASKS.get(domain, ())):
         known = [f"{known_domain}-{known_task}" for known_domain in DMC_TASKS for known_task in DMC_TASKS[known_domain]]
         close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
         raise ValueError(
             f"'{domain}-{task}' is not a task of the DeepMind Control suite; the closest are {close} "
             "(sb3_cure.envs.DMC_TASKS has all)."
         )
-    if renderer not in RENDER_FLAGS:
+    if not is_one_of(renderer, RENDER_FLAGS):
         raise ValueError(f"renderer={renderer!r} is unknown; use 'dmc', or 'fast' for no shadows and reflections.")
-    if render_mode not in (None, "rgb_array"):
+    if not is_one_of(render_mode, (None, "rgb_array")):
         raise ValueError(f"render_mode={render_mode!r} is not supported; use 'rgb_array', or None for no videos.")
+    check_flag("grayscale", grayscale)
+    if seed is not None and not (is_integer(seed, 0) and seed < 2**32):
+        raise ValueError(f"seed={seed!r} is not None or an integer from 0 to 2**32 - 1; use seed=0, for example.")
+    # Before the physics are built, although the wrappers check them too
+    check_at_least_one("image_size", image_size, usual=84)
+    check_at_least_one("frame_stack", frame_stack, usual=3)
     action_repeat = ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat
     camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id
 

@@ -110,7 +110,7 @@ def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
     :param names: Names of all coordinates
     :raises ValueError: if they are not two of these
     """
-    if len(coordinates) != 2 or not set(coordinates) <= set(names):
+    if not isinstance(coordinates, Sequence) or len(coordinates) != 2 or not set(coordinates) <= set(names):
         raise ValueError(
-            f"coordinates are {tuple(coordinates)!r}, but a map needs two of the state's: choose of {', '.join(names)}."
+            f"coordinates are {coordinates!r}, but a map needs two of the state's: choose of {', '.join(names)}."
         )

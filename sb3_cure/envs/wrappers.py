@@ -10,6 +10,8 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
+from sb3_cure.values import is_integer
+
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
 
@@ -22,9 +24,19 @@ def check_at_least_one(name: str, value: Any, usual: int) -> int:
     :return: The value as a plain integer
     :raises ValueError: If it is not an integer of at least 1
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_integer(value, 1):
         raise ValueError(f"{name}={value!r} is not an integer of at least 1; use {name}={usual}, for example.")
     return int(value)
+
+
+def check_flag(name: str, value: Any) -> None:
+    """
+    :param name: What the value is, for the message
+    :param value: The value to check
+    :raises ValueError: If it is neither True nor False
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name}={value!r} is neither True nor False; use {name}=False, for example.")
 
 
 class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -89,6 +101,7 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
         RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale)
         super().__init__(env)
         self.image_size = check_at_least_one("image_size", image_size, usual=84)
+        check_flag("grayscale", grayscale)
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
@@ -174,7 +187,15 @@ def make_pixel_env(
     :raises ValueError: If an argument is out of range or ``env`` cannot render RGB frames
     """
     if isinstance(env, str):
-        env = gym.make(env, render_mode="rgb_array")
+        try:
+            env = gym.make(env, render_mode="rgb_array")
+        except gym.error.Error as error:
+            raise ValueError(
+                f"{env!r} cannot be made ({' '.join(str(error).split())}); give the id of an environment that renders "
+                "'rgb_array'."
+            ) from error
+    if not isinstance(env, gym.Env):
+        raise ValueError(f"{env!r} is no Gymnasium environment; give one that is not vectorised, or an id.")
     if env.render_mode is None:
         raise ValueError(
             f"{env} was made with render_mode=None; make it with render_mode='rgb_array' to see its pixels."

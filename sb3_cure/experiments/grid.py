@@ -1,11 +1,10 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
-import inspect
 import math
 import pkgutil
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,10 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
+from sb3_cure.checks import check_arguments, check_parts
 from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.envs.rendering import GLUnavailableError
+from sb3_cure.values import arguments_of, is_integer
 
 KINDS = ("curves", "visitation", "pretraining")
 COLLECTORS = ("curious", "random")
@@ -21,11 +23,7 @@ _GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "m
 _METHOD_KEYS = {"config", "overrides", "pretrain", "train"}
 # Of a zoo entry: what is no argument of CuReSAC. `n_timesteps` is rl-zoo's; here the grid's budget says how long.
 _ENTRY_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
-_ARGUMENTS = (set(inspect.signature(CuReSAC).parameters) | set(inspect.signature(CuReSAC.__mro__[1]).parameters)) - {
-    "env",
-    "kwargs",
-    "seed",
-}
+_ARGUMENTS = (arguments_of(CuReSAC) or set()) - {"env", "seed", "_init_setup_model"}
 
 
 class GridError(ValueError):
@@ -159,11 +157,13 @@ def load_grid(
     all_tasks = _tasks(content["tasks"], path)
     chosen_tasks = _choose(tasks, all_tasks, "task", path)
     arms = _mapping("methods", content["methods"], path)
+    if not arms:
+        raise GridError(f"methods in {path} are none, but a grid compares at least one: name some.")
     for arm in arms:
         _check_name("a method", arm, path)
     chosen_arms = _choose(methods, {name: name for name in arms}, "method", path)
-    baseline = content.get("baseline", next(iter(arms), ""))
-    if baseline not in arms:
+    baseline = content.get("baseline", next(iter(arms)))
+    if not isinstance(baseline, str) or baseline not in arms:
         raise GridError(f"baseline in {path} is {baseline!r}, but the methods are {', '.join(arms)}: name one of them.")
 
     resolved = {
@@ -204,6 +204,43 @@ def load_grid(
         "evaluation": {"every": every, "episodes": episodes},
     }
     return Grid(content["experiment"], content["kind"], baseline, cells, complete, description)
+
+
+def check_arms(cells: Iterable[Cell]) -> None:
+    """Whether environments and arguments of the arms exist, before the first of them is trained.
+
+    :param cells: Cells that are to be run
+    :raises GridError: for the first that cannot be
+    """
+    envs: dict[str, gym.Env] = {}
+    try:
+        for task, arm, cell in {(cell.task, cell.method): (cell.task, cell.method, cell) for cell in cells}.values():
+            try:
+                key = f"{task} {cell.env_kwargs}"
+                if key not in envs:
+                    envs[key] = _make(task, cell.env_kwargs)
+                model = CuReSAC(env=envs[key], _init_setup_model=False, **cell.build_arguments())
+                check_arguments(model)
+                check_parts(model)
+            except GLUnavailableError:  # with Ray other machines may have what this one has not
+                return
+            except GridError:
+                raise
+            except (ValueError, TypeError, gym.error.Error) as error:
+                raise GridError(f"method {arm!r} on {task} cannot work: {' '.join(str(error).split())}") from error
+    finally:
+        for env in envs.values():
+            env.close()
+
+
+def _make(task: str, env_kwargs: dict[str, Any]) -> gym.Env:
+    try:
+        return gym.make(task, **env_kwargs)
+    except (ValueError, TypeError) as error:
+        reason = " ".join(str(error).split()).removesuffix(".")
+        raise GridError(
+            f"env_kwargs of {task} are {env_kwargs}, which it does not take ({reason}): correct them."
+        ) from error
 
 
 def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[str, Any]:
@@ -299,7 +336,7 @@ def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
 def _seeds(value: Any, path: Path) -> list[int]:
     numbers = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
     valid = isinstance(numbers, Sequence) and not isinstance(numbers, str) and len(numbers) > 0
-    if not valid or not all(isinstance(number, int) and number >= 0 for number in numbers):
+    if not valid or not all(is_integer(number, 0) and number < 2**32 for number in numbers):
         raise GridError(f"seeds in {path} is {value!r}, but it must be how many (1 or more) or a list of seeds.")
     return list(dict.fromkeys(numbers))
 

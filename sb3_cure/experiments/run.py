@@ -19,8 +19,9 @@ from rich.table import Table
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import DONE, ERROR, CellIsRunning, check_settings, run_cell
 from sb3_cure.experiments.files import write_json, write_text
-from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
+from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid
 from sb3_cure.experiments.visitation import measure_common_heads
+from sb3_cure.values import check_folder, is_integer, is_number
 
 ENGINES = ("local", "ray")
 
@@ -49,13 +50,22 @@ def run_grid(
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card
     :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
     :return: The cells that failed; each has its traceback in ``error.txt``
+    :raises GridError: with one sentence, before anything is written, for what cannot be run
     """
     results = Path(results).resolve()
-    # Before anything is written: finished cells too, as they are to be compared with those that are run now.
+    _check_run(engine, checkpoint_minutes, cpus_per_cell, gpus_per_cell, retries)
+    # Finished cells too, as they are to be compared with those that are run now.
     for cell in grid.complete:
         check_settings(cell, results)
-    _keep_grid(grid, results / grid.experiment)
     left = [cell for cell in grid.cells if not (results / cell.folder / DONE).exists()]
+    check_arms(left)
+    try:
+        check_folder("--out", results)
+        _keep_grid(grid, results / grid.experiment)
+    except OSError as error:
+        raise GridError(f"--out is {results}, which cannot be written to ({error.strerror}): give another.") from error
+    except ValueError as error:
+        raise error if isinstance(error, GridError) else GridError(str(error)) from error
     with _live_progress(grid.cells, results):
         if engine == "ray":
             resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
@@ -66,6 +76,17 @@ def run_grid(
         for sentence in measure_common_heads(grid, results):
             print(f"No common heads for {sentence}.")
     return failed
+
+
+def _check_run(engine: str, checkpoint_minutes: float, cpus: float, gpus: float, retries: int) -> None:
+    if engine not in ENGINES:
+        raise GridError(f"engine is {engine!r}, but it must be one of {', '.join(ENGINES)}: choose one.")
+    numbers = {"checkpoint-minutes": checkpoint_minutes, "cpus-per-cell": cpus, "gpus-per-cell": gpus}
+    for name, value in numbers.items():
+        if not is_number(value, low=0):
+            raise GridError(f"--{name} is {value!r}, but it must be a number of at least 0: change it.")
+    if not is_integer(retries, -1):
+        raise GridError(f"--retries is {retries!r}, but it must be at least 0, or -1 for no limit: change it.")
 
 
 def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:

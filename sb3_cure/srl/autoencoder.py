@@ -12,6 +12,7 @@ from sb3_cure.augmentations import random_shift
 from sb3_cure.encoders import Encoder
 from sb3_cure.layers import ConvTranspose2d, conv_sizes, full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
+from sb3_cure.values import is_integer, is_number, is_one_of
 
 
 class PixelDecoder(nn.Module):
@@ -122,21 +123,21 @@ class RAE(SRLHead):
         pad: int = 4,
     ):
         super().__init__(encoder, observation_space)
-        if bits not in range(1, 9):
-            raise ValueError(f"srl_kwargs got bits={bits}, but a pixel has 8: give a whole number from 1 to 8.")
-        if latent_penalty < 0 or decoder_weight_decay < 0:
+        if not is_integer(bits, 1) or bits > 8:
+            raise ValueError(f"srl_kwargs got bits={bits!r}, but a pixel has 8: give a whole number from 1 to 8.")
+        if not (is_number(latent_penalty, low=0) and is_number(decoder_weight_decay, low=0)):
             raise ValueError(
-                f"srl_kwargs got latent_penalty={latent_penalty} and decoder_weight_decay={decoder_weight_decay}, "
+                f"srl_kwargs got latent_penalty={latent_penalty!r} and decoder_weight_decay={decoder_weight_decay!r}, "
                 "but both are penalties: give numbers >= 0."
             )
         self.pixels = is_image_space(observation_space)
-        if augmentation not in ("none", "shift") or (augmentation == "shift" and not self.pixels):
+        if not is_one_of(augmentation, ("none", "shift")) or (augmentation == "shift" and not self.pixels):
             raise ValueError(
                 f"srl_kwargs got augmentation={augmentation!r} for observations of shape {observation_space.shape}, "
                 "but srl='rae' knows 'none', and for images 'shift': choose one of them."
             )
-        if pad < 1:
-            raise ValueError(f"srl_kwargs got pad={pad}, but a shift needs at least 1 pixel: change pad.")
+        if not is_integer(pad, 1):
+            raise ValueError(f"srl_kwargs got pad={pad!r}, but a shift needs at least 1 pixel: change pad.")
         self.shifts = augmentation == "shift"
         self.pad = pad
         self.latent_penalty = latent_penalty

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from sb3_cure.augmentations import center_crop, random_crop, random_shift
 from sb3_cure.encoders import Encoder
 from sb3_cure.srl.base import SRLHead, SRLOutput
+from sb3_cure.values import is_integer, is_one_of
 
 
 class CURL(SRLHead):
@@ -42,9 +43,10 @@ class CURL(SRLHead):
         bank_size: int = 64,
     ):
         super().__init__(encoder, observation_space)
-        if pad < 1 or bank_size < 1:
+        if not (is_integer(pad, 1) and is_integer(bank_size, 1)):
             raise ValueError(
-                f"srl_kwargs got pad={pad} and bank_size={bank_size}, but each must be at least 1: change srl_kwargs."
+                f"srl_kwargs got pad={pad!r} and bank_size={bank_size!r}, but each must be at least 1: change "
+                "srl_kwargs."
             )
         self.crops = self._resolve(observation_space, augmentation, crop_size) == "crop"
         self.crop_size = crop_size
@@ -71,9 +73,11 @@ class CURL(SRLHead):
                 "vectors have none: use srl='rae', or a head of your own, with 'MlpPolicy'."
             )
         size = min(observation_space.shape[1:])  # type: ignore[index]
+        if not is_integer(crop_size, 0):
+            raise ValueError(f"srl_kwargs got crop_size={crop_size!r}, but it counts pixels: give a whole number.")
         if augmentation == "auto":
             augmentation = "crop" if size > crop_size else "shift"
-        if augmentation not in ("crop", "shift"):
+        if not is_one_of(augmentation, ("crop", "shift")):
             raise ValueError(
                 f"srl_kwargs got augmentation={augmentation!r}, but srl='curl' knows 'crop', 'shift' and 'auto': "
                 "choose one of them."

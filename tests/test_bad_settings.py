@@ -1,0 +1,473 @@
+"""Settings files, grids and command lines that cannot work: one sentence, the status 2, and nothing left behind."""
+
+import copy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import yaml
+from envs_for_tests import PixelBox
+from test_bad_input import files_in, is_one_sentence
+
+from sb3_cure import cli
+
+TASK = "tests/PixelBox-v0"
+SETTINGS: dict[str, Any] = {
+    "default": {
+        "policy": "CnnPolicy",
+        "n_timesteps": 20,
+        "buffer_size": 50,
+        "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2, "n_layers": 2}},
+    }
+}
+GRID: dict[str, Any] = {
+    "experiment": "tiny",
+    "kind": "curves",
+    "budget": 40,
+    "tasks": [TASK],
+    "methods": {"cure": {"config": "settings.yml"}},
+}
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The working directory, and the tiny task under an id."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    gym.register(TASK, PixelBox)
+    yield
+    del gym.registry[TASK]
+
+
+def refusal(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command line says that must change nothing."""
+    before = files_in(Path.cwd())
+    try:
+        status = cli.main(command.split())
+    except SystemExit as stop:  # as argparse does
+        status = stop.code if isinstance(stop.code, int) else 1
+    usage_and_sentence = capsys.readouterr().err
+    assert status in (1, 2) and files_in(Path.cwd()) == before
+    assert "Traceback" not in usage_and_sentence
+    said = usage_and_sentence.splitlines()[-1]
+    assert is_one_sentence(said)
+    return said
+
+
+TRAIN = f"train --env {TASK} --conf-file settings.yml"
+#: what is wrong -> (settings that differ, or the file's text; the whole sentence)
+ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
+    "no YAML": (
+        "default: [1",
+        'sb3-cure train: settings.yml is no YAML (while parsing a flow sequence in "<unicode '
+        "string>\", line 1, column 10: default: [1 ^ expected ',' or ']', but got '<stream "
+        'end>\' in "<unicode string>", line 1, column 12: default: [1 ^): correct it.',
+    ),
+    "a list": (
+        "- default",
+        "sb3-cure train: settings.yml holds ['default'], but it must map environments to settings: correct it.",
+    ),
+    "nothing": ("", "sb3-cure train: settings.yml holds None, but it must map environments to settings: correct it."),
+    "another task": (
+        "other: {policy: CnnPolicy}",
+        "sb3-cure train: settings.yml has neither 'tests/PixelBox-v0' nor 'default': add one of them.",
+    ),
+    "a list of settings": (
+        "default: [1]",
+        "sb3-cure train: the settings of 'tests/PixelBox-v0' in settings.yml are no mapping "
+        "(key: value): correct them.",
+    ),
+    "a misspelt argument": (
+        {"curiousity": None},
+        "sb3-cure train: the settings file has 'curiousity', but CuReSAC has no such "
+        "argument: write 'curiosity' (settings: settings.yml).",
+    ),
+    "a number as text": (
+        {"batch_size": "8"},
+        "sb3-cure train: batch_size is '8', but it must be a whole number of at least 1: "
+        "change batch_size (settings: settings.yml).",
+    ),
+    "no length": (
+        {"n_timesteps": None},
+        "sb3-cure train: n_timesteps in settings.yml is None, but it must be a number of "
+        "agent steps of at least 1: write for example n_timesteps: 12500.",
+    ),
+    "a length in words": (
+        {"n_timesteps": "long"},
+        "sb3-cure train: n_timesteps in settings.yml is 'long', but it must be a number of "
+        "agent steps of at least 1: write for example n_timesteps: 12500.",
+    ),
+    "a negative length": (
+        {"n_timesteps": -5},
+        "sb3-cure train: n_timesteps in settings.yml is -5, but it must be a number of agent "
+        "steps of at least 1: write for example n_timesteps: 12500.",
+    ),
+    "no environments": (
+        {"n_envs": 0},
+        "sb3-cure train: n_envs in settings.yml is 0, but it must be a whole number of at least 1: change n_envs.",
+    ),
+    "environments in words": (
+        {"n_envs": "two"},
+        "sb3-cure train: n_envs in settings.yml is 'two', but it must be a whole number of at least 1: change n_envs.",
+    ),
+    "an unknown policy": (
+        {"policy": "Cnn"},
+        "sb3-cure train: policy is 'Cnn', but it must be one of 'MlpPolicy', 'CnnPolicy', "
+        "'MultiInputPolicy', or a class of policies: choose one (settings: settings.yml).",
+    ),
+    "a learning rate in words": (
+        {"learning_rate": "lin"},
+        "sb3-cure train: learning_rate in settings.yml is 'lin', but it must be a number, or "
+        "'lin_<number>' for one that falls to 0: write for example lin_0.001 (YAML reads "
+        "1e-3 as text, 1.0e-3 as a number).",
+    ),
+    "a negative learning rate": (
+        {"learning_rate": -1.0},
+        "sb3-cure train: learning_rate is -1.0, but it must be a float of at least 0, or a "
+        "schedule of the remaining progress: change learning_rate (settings: settings.yml).",
+    ),
+    "a list for the environment": (
+        {"env_kwargs": [1]},
+        "sb3-cure train: env_kwargs in settings.yml is [1], but it must be a mapping (key: value): change env_kwargs.",
+    ),
+    "an argument that the environment does not take": (
+        {"env_kwargs": {"imagesize": 36}},
+        "sb3-cure train: VectorBox.__init__() got an unexpected keyword argument 'imagesize' "
+        "was raised from the environment creator for tests/PixelBox-v0 with kwargs "
+        "({'imagesize': 36}) (settings: settings.yml).",
+    ),
+    "a misspelt argument of the policy": (
+        {"policy_kwargs": {"net_ach": [8]}},
+        "sb3-cure train: policy_kwargs has 'net_ach', but CnnPolicy has no such argument: "
+        "write 'net_arch' (settings: settings.yml).",
+    ),
+    "text that is no Python": (
+        {"policy_kwargs": "dict(net_arch=["},
+        "sb3-cure train: a text that is to be evaluated is no Python ('[' was never closed "
+        "(<string>, line 1)): correct it; text in it needs quotes of its own, such as "
+        "-params \"srl:'curl'\" (settings: settings.yml).",
+    ),
+    "an unknown head": (
+        {"srl": "vae"},
+        "sb3-cure train: srl is 'vae', but it must be one of 'rae', 'curl', None, or a "
+        "subclass of sb3_cure.srl.SRLHead (the class itself, not an instance) (settings: "
+        "settings.yml).",
+    ),
+    "a head of no module": (
+        {"srl": "no_such_heads.Mine"},
+        "sb3-cure train: srl is 'no_such_heads.Mine', which cannot be imported (No module "
+        "named 'no_such_heads'): name a class as module.Class, in a module of the working "
+        "directory or an installed one.",
+    ),
+    "a module as head": (
+        {"srl": "os.path"},
+        "sb3-cure train: srl is <module 'posixpath' (frozen)>, but it must be one of 'rae', "
+        "'curl', None, or a subclass of sb3_cure.srl.SRLHead (the class itself, not an "
+        "instance) (settings: settings.yml).",
+    ),
+    "a wrapper of no module": (
+        {"env_wrapper": "no_such_wrappers.Mine"},
+        "sb3-cure train: what is named cannot be imported (No module named "
+        "'no_such_wrappers'): correct the name, or install it (settings: settings.yml).",
+    ),
+    "an unknown unit": (
+        {"train_freq": [1, "steps"]},
+        "sb3-cure train: train_freq is (1, 'steps'), but it must be a whole number of steps "
+        "of at least 1, or a pair such as (1, 'episode') or (4, 'step'): change train_freq "
+        "(settings: settings.yml).",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_settings(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """``sb3-cure train``."""
+    changes, sentence = ZOO[name]
+    settings = copy.deepcopy(SETTINGS)
+    settings["default"].update(changes if isinstance(changes, dict) else {})
+    Path("settings.yml").write_text(changes if isinstance(changes, str) else yaml.safe_dump(settings))
+    assert refusal(TRAIN, capsys) == sentence
+
+
+#: command line -> the whole sentence
+COMMANDS: dict[str, str] = {
+    "fly": ("sb3-cure has no command 'fly'; it has train, enjoy, record, optimize, experiment, report, doctor."),
+    f"train --env {TASK}": (
+        "sb3-cure train: cure_sac needs a settings file: give one with --conf-file, such as "
+        "zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
+    ),
+    f"train --env {TASK} --conf-file .": (
+        "sb3-cure train: the settings file . is no file: give one with --conf-file, such as "
+        "zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
+    ),
+    f"train --env {TASK} --conf-file no.yml": (
+        "sb3-cure train: the settings file no.yml is no file: give one with --conf-file, "
+        "such as zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
+    ),
+    "train --env tests/PixelBo-v0 --conf-file settings.yml": (
+        "sb3-cure train: tests/PixelBo-v0 not found in gym registry, you maybe meant "
+        "tests/PixelBox-v0: correct the command line."
+    ),
+    f"{TRAIN} -params srl:vae": (
+        "sb3-cure train: a text that is to be evaluated is no Python (name 'vae' is not "
+        "defined): correct it; text in it needs quotes of its own, such as -params "
+        "\"srl:'curl'\"."
+    ),
+    f"{TRAIN} -params srl": (
+        "sb3-cure train: a text that is to be evaluated is no Python (invalid syntax "
+        "(<string>, line 0)): correct it; text in it needs quotes of its own, such as "
+        "-params \"srl:'curl'\"."
+    ),
+    f"{TRAIN} --device gpu": (
+        "sb3-cure train: device is 'gpu', which PyTorch cannot use here: use 'auto', 'cpu', "
+        "or 'cuda' on a machine with a GPU (settings: settings.yml)."
+    ),
+    f"{TRAIN} --seed one": "sb3-cure train: error: argument --seed: invalid int value: 'one'",
+    f"{TRAIN} -i no.zip": (
+        "sb3-cure train: The trained_agent must be a valid path to a .zip file: correct the command line."
+    ),
+    f"{TRAIN} -f settings.yml": (
+        "sb3-cure train: settings.yml/cure_sac cannot be used (Not a directory): name "
+        "another folder or file (settings: settings.yml)."
+    ),
+    f"{TRAIN} --gym-packages no_such_envs": (
+        "sb3-cure train: what is named cannot be imported (No module named 'no_such_envs'): "
+        "correct the name, or install it."
+    ),
+    f"{TRAIN} --storage sqlite:///no.db --study-name mine --trial-id 3": (
+        "sb3-cure train: --trial-id 3 of --study-name 'mine' in --storage 'sqlite:///no.db' "
+        "cannot be read (there is no such study): name a trial that is there."
+    ),
+    f"optimize --env {TASK} --conf-file settings.yml --storage nosql:///no --study-name mine": (
+        "sb3-cure optimize: --storage is 'nosql:///no', which cannot be opened (Can't load "
+        "plugin: sqlalchemy.dialects:nosql): give a database such as sqlite:///study.db."
+    ),
+    f"enjoy --env {TASK} --no-render": (
+        "sb3-cure enjoy: The logs/cure_sac folder was not found: give the run's --env, with "
+        "-f the folder that it was trained into, and perhaps --exp-id."
+    ),
+    f"enjoy --env {TASK} --no-render -f nowhere --exp-id 4": (
+        "sb3-cure enjoy: The nowhere/cure_sac/tests-PixelBox-v0_4 folder was not found: give "
+        "the run's --env, with -f the folder that it was trained into, and perhaps --exp-id."
+    ),
+    f"record --env {TASK}": (
+        "sb3-cure record: The logs/cure_sac folder was not found: give the run's --env, with "
+        "-f the folder that it was trained into, and perhaps --exp-id."
+    ),
+    "doctor --fast": "sb3-cure doctor: error: unrecognized arguments: --fast",
+    "report nowhere": ("sb3-cure report: nowhere is no folder: give the one that `sb3-cure experiment` wrote."),
+    "report .": (
+        "sb3-cure report: . holds no experiment (no grid.json in it, nor in a folder of it): "
+        "give the folder that `sb3-cure experiment` wrote."
+    ),
+    "report . --thresholds many": (
+        "sb3-cure report: error: argument --thresholds: 'many' is no list of returns such as 250,500,750"
+    ),
+    "experiment no.yml": (
+        "sb3-cure experiment: error: no.yml cannot be read (No such file or directory): give the path of a YAML file."
+    ),
+    "experiment .": ("sb3-cure experiment: error: . cannot be read (Is a directory): give the path of a YAML file."),
+    "experiment settings.yml": (
+        "sb3-cure experiment: error: 'default' in settings.yml is unknown, but the keys are "
+        "baseline, budget, evaluation, experiment, kind, methods, seeds, tasks: correct it."
+    ),
+    "experiment grid.yml --tasks finger": (
+        "sb3-cure experiment: error: task 'finger' is not in grid.yml, which has PixelBox, "
+        "tests/PixelBox-v0: choose among these."
+    ),
+    "experiment grid.yml --methods none": (
+        "sb3-cure experiment: error: method 'none' is not in grid.yml, which has cure: choose among these."
+    ),
+    "experiment grid.yml --budget 10m": (
+        "sb3-cure experiment: error: argument --budget: '10m' is no number of steps: write "
+        "for example 100000, 100k or 1M"
+    ),
+    "experiment grid.yml --seeds x": (
+        "sb3-cure experiment: error: argument --seeds: 'x' names no seeds: write how many (5), or which (0,3,4)"
+    ),
+    "experiment grid.yml --seeds 0": (
+        "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or a list of seeds."
+    ),
+    "experiment grid.yml --retries 1": "sb3-cure experiment: error: --retries is of Ray: add --engine ray.",
+    "experiment grid.yml --engine ray --cpus-per-cell -1": (
+        "sb3-cure experiment: error: --cpus-per-cell is -1.0, but it must be a number of at least 0: change it."
+    ),
+    "experiment grid.yml --engine ray --retries -3": (
+        "sb3-cure experiment: error: --retries is -3, but it must be at least 0, or -1 for no limit: change it."
+    ),
+    "experiment grid.yml --checkpoint-minutes nan": (
+        "sb3-cure experiment: error: --checkpoint-minutes is nan, but it must be a number of at least 0: change it."
+    ),
+    "experiment grid.yml --out grid.yml": (
+        "sb3-cure experiment: error: --out is grid.yml, which is a file: give a folder."
+    ),
+    "experiment grid.yml --out grid.yml/results": (
+        "sb3-cure experiment: error: --out is '{folder}/grid.yml/results', but "
+        "{folder}/grid.yml is a file: name a folder, or remove the file."
+    ),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_lines(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    Path("grid.yml").write_text(yaml.safe_dump(GRID))
+    assert refusal(command, capsys) == COMMANDS[command].replace("{folder}", str(tmp_path))
+
+
+def arm(**method: Any) -> dict[str, Any]:
+    return {"methods": {"a": {"config": "settings.yml", **method}}}
+
+
+#: what is wrong -> (what differs in the grid, the whole sentence)
+GRIDS: dict[str, tuple[dict[str, Any], str]] = {
+    "kind": (
+        {"kind": ["curves"]},
+        "sb3-cure experiment: error: kind in grid.yml is ['curves'], but it must be one of "
+        "curves, visitation, pretraining: change it.",
+    ),
+    "experiment": (
+        {"experiment": "../elsewhere"},
+        "sb3-cure experiment: error: experiment in grid.yml is '../elsewhere', but it names "
+        "a folder: use letters, digits, '-', '_' and '.' only.",
+    ),
+    "budget in words": (
+        {"budget": "100k"},
+        "sb3-cure experiment: error: budget in grid.yml is '100k', but it must be a whole "
+        "number, 0 or more: change it.",
+    ),
+    "a key": (
+        {"budgets": 3},
+        "sb3-cure experiment: error: 'budgets' in grid.yml is unknown, but the keys are "
+        "baseline, budget, evaluation, experiment, kind, methods, seeds, tasks: correct it.",
+    ),
+    "no seeds": (
+        {"seeds": 0},
+        "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or a list of seeds.",
+    ),
+    "a negative seed": (
+        {"seeds": [1, -2]},
+        "sb3-cure experiment: error: seeds in grid.yml is [1, -2], but it must be how many "
+        "(1 or more) or a list of seeds.",
+    ),
+    "a seed that is too large": (
+        {"seeds": [2**32]},
+        "sb3-cure experiment: error: seeds in grid.yml is [4294967296], but it must be how "
+        "many (1 or more) or a list of seeds.",
+    ),
+    "no list of tasks": (
+        {"tasks": "all"},
+        "sb3-cure experiment: error: tasks in grid.yml is 'all', but it must be a list of Gymnasium ids: write some.",
+    ),
+    "an unknown task": (
+        {"tasks": ["dmc_pixels/cartpole-swing-v0"]},
+        "sb3-cure experiment: error: task 'dmc_pixels/cartpole-swing-v0' in grid.yml is not "
+        "registered with Gymnasium: correct it (sb3_cure registers "
+        "dmc_pixels/<domain>-<task>-v0).",
+    ),
+    "a list of methods": (
+        {"methods": ["a"]},
+        "sb3-cure experiment: error: methods in grid.yml is ['a'], but it must be a mapping (key: value): change it.",
+    ),
+    "no methods": (
+        {"methods": {}},
+        "sb3-cure experiment: error: methods in grid.yml are none, but a grid compares at least one: name some.",
+    ),
+    "a method that is no folder": (
+        {"methods": {"a/b": {"config": "settings.yml"}}},
+        "sb3-cure experiment: error: a method in grid.yml is 'a/b', but it names a folder: "
+        "use letters, digits, '-', '_' and '.' only.",
+    ),
+    "a file that is missing": (
+        {"methods": {"a": {"config": "no.yml"}}},
+        "sb3-cure experiment: error: no.yml cannot be read (No such file or directory): give the path of a YAML file.",
+    ),
+    "no file": (
+        {"methods": {"a": {}}},
+        "sb3-cure experiment: error: methods.a in grid.yml has no 'config', which it needs: add it.",
+    ),
+    "a key of a method": (
+        arm(override={}),
+        "sb3-cure experiment: error: 'override' in methods.a in grid.yml is unknown, but the "
+        "keys are config, overrides, pretrain, train: correct it.",
+    ),
+    "an argument": (
+        arm(overrides={"prob": 1}),
+        "sb3-cure experiment: error: 'prob' in settings.yml or the overrides of methods.a in "
+        "grid.yml is no argument of CuReSAC: correct or remove it (grids know n_envs and "
+        "env_kwargs besides, but no other key of rl-zoo).",
+    ),
+    "a list of overrides": (
+        arm(overrides=[1]),
+        "sb3-cure experiment: error: overrides in grid.yml is [1], but it must be a mapping (key: value): change it.",
+    ),
+    "an argument that is a text": (
+        arm(overrides={"policy_kwargs": "dict(net_arch=[1])"}),
+        "sb3-cure experiment: error: policy_kwargs in settings.yml is 'dict(net_arch=[1])', "
+        "but grids evaluate no strings: write a YAML mapping.",
+    ),
+    "a number as text": (
+        arm(overrides={"batch_size": "8"}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: batch_size "
+        "is '8', but it must be a whole number of at least 1: change batch_size.",
+    ),
+    "an unknown head": (
+        arm(overrides={"srl": "vae"}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: srl is "
+        "'vae', but it must be one of 'rae', 'curl', None, or a subclass of "
+        "sb3_cure.srl.SRLHead (the class itself, not an instance).",
+    ),
+    "a head of no module": (
+        arm(overrides={"srl": "no_such_heads.Mine"}),
+        "sb3-cure experiment: error: srl of methods.a in grid.yml is 'no_such_heads.Mine', "
+        "which cannot be imported (No module named 'no_such_heads'): name a class as "
+        "module.Class, in a module of the working directory or an installed one.",
+    ),
+    "a misspelt argument of the head": (
+        arm(overrides={"srl_kwargs": {"pd": 1}}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: srl_kwargs "
+        "has 'pd', but RAE has no such argument: write 'pad'.",
+    ),
+    "an argument that the environment does not take": (
+        arm(overrides={"env_kwargs": {"imagesize": 36}}),
+        "sb3-cure experiment: error: env_kwargs of tests/PixelBox-v0 are {'imagesize': 36}, "
+        "which it does not take (VectorBox.__init__() got an unexpected keyword argument "
+        "'imagesize' was raised from the environment creator for tests/PixelBox-v0 with "
+        "kwargs ({'imagesize': 36})): correct them.",
+    ),
+    "a collector": (
+        arm(pretrain={"collector": "task", "budget": 8}),
+        "sb3-cure experiment: error: pretrain.collector of methods.a in grid.yml is 'task', "
+        "but it must be 'curious' or 'random': choose one of them.",
+    ),
+    "no pretraining": (
+        arm(pretrain={"collector": "random", "budget": 0}),
+        "sb3-cure experiment: error: pretrain.budget in grid.yml is 0, but it must be a "
+        "whole number, 1 or more: change it.",
+    ),
+    "train": (
+        arm(train="yes"),
+        "sb3-cure experiment: error: train of methods.a in grid.yml is 'yes', but it must be true or false: change it.",
+    ),
+    "baseline": (
+        {"baseline": ["cure"]},
+        "sb3-cure experiment: error: baseline in grid.yml is ['cure'], but the methods are cure: name one of them.",
+    ),
+    "evaluation": (
+        {"evaluation": {"every": 0}},
+        "sb3-cure experiment: error: evaluation.every in grid.yml is 0, but it must be a "
+        "whole number, 1 or more: change it.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_grids(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """``sb3-cure experiment``: before the first cell of any arm is begun."""
+    changes, sentence = GRIDS[name]
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    Path("grid.yml").write_text(yaml.safe_dump({**GRID, **changes}))
+    assert refusal("experiment grid.yml", capsys) == sentence
