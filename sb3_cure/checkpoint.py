@@ -321,6 +321,10 @@ def resume(
     model_class: type["CuReSAC"], path: str | Path, env: GymEnv, custom_objects: dict[str, Any] | None, **kwargs: Any
 ) -> "CuReSAC":
     """See ``CuReSAC.resume``."""
+    if not isinstance(path, str | Path):
+        raise CheckpointError(f"resume got path={path!r}, but it must be the folder of an ExactCheckpoint: give it.")
+    if env is None:
+        raise CheckpointError("resume got no environment: give those of the training, made as they were then.")
     generations = Generations(path)
     generation, lost = _newest(generations)
     model = model_class.load(
@@ -494,6 +498,8 @@ class ExactCheckpoint(BaseCallback):
                 raise ValueError(
                     f"ExactCheckpoint got {name}={value!r}, but it must be a whole number of at least 1: change {name}."
                 )
+        if not isinstance(path, str | Path):
+            raise ValueError(f"ExactCheckpoint got path={path!r}, but it must be the path of a folder: give one.")
         self.save_freq = int(save_freq)
         self.path = Path(path)
         self.keep = int(keep)

@@ -1061,7 +1061,7 @@ class CuReSAC(SAC):
         elif trusted:
             super().load_replay_buffer(path, truncate_last_traj)
         else:
-            name = path if isinstance(path, str | pathlib.Path) else "the file"
+            name = f"'{path}'" if isinstance(path, str | pathlib.Path) else "the file"
             raise ArchiveError(
                 f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
                 "is in a file: if you know where it comes from, load it with trusted=True."

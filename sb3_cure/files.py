@@ -54,9 +54,11 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
     :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: Path to write under meanwhile, or the file
+    :raises ValueError: if it is neither
+    :raises OSError: if the folder cannot be one
     """
     if not isinstance(path, str | pathlib.Path):
-        yield open_path(path, "w")
+        yield open_path(_binary_file(path), "w")
         return
     path = Path(path)
     if path.suffix == "":
@@ -67,6 +69,8 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
     if not path.parent.exists():
         warnings.warn(f"Path '{path.parent}' does not exist. Will create it.", stacklevel=4)
         path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.parent.is_dir():
+        raise NotADirectoryError(f"cannot write '{path}', as '{path.parent}' is a file: choose another path.")
     with replacing(path) as beside:
         yield beside
 
@@ -77,7 +81,17 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     :param path: Path, with or without its suffix, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: The open file, at its start, and what to call it
+    :raises ValueError: if it is neither
+    :raises OSError: if there is no such file
     """
+    if not isinstance(path, str | pathlib.Path):
+        _binary_file(path)
+    elif not any(map(os.path.exists, (path, f"{path}.{suffix}"))):
+        raise FileNotFoundError(
+            f"there is neither a file '{path}' nor '{path}.{suffix}': give the path that it was saved to."
+        )
+    elif os.path.isdir(path):
+        raise IsADirectoryError(f"'{path}' is a folder: give the path of a file in it.")
     file = open_path(path, "r", suffix=suffix)
     try:
         file.seek(0)
@@ -85,3 +99,9 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     finally:
         if isinstance(path, str | pathlib.Path):
             file.close()
+
+
+def _binary_file(file: Any) -> io.BufferedIOBase:
+    if not isinstance(file, io.BufferedWriter | io.BufferedReader | io.BytesIO | io.BufferedRandom):
+        raise ValueError(f"got {file!r:.100} for a file, but expected a path, or a file that is open in binary mode.")
+    return file

@@ -11,7 +11,7 @@ import stable_baselines3.sac.policies as sb3_policies
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
-from stable_baselines3 import HerReplayBuffer
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
@@ -19,7 +19,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.callbacks import CuriosityMapCallback, EvalBothCallback, PolicyVideoCallback, ReconstructionCallback
+from sb3_cure.callbacks import (
+    CuriosityMapCallback,
+    EvalBothCallback,
+    ExactCheckpoint,
+    PolicyVideoCallback,
+    ReconstructionCallback,
+)
 from sb3_cure.envs import make_pixel_env
 from sb3_cure.evaluation import most_uncomfortable, run_episodes
 from sb3_cure.srl import RAE, SRLOutput
@@ -1358,7 +1364,88 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: CuriosityMapCallback(PixelBox(), "new", coordinates=3, **MAP),
         "coordinates are 3, but a map needs two of the state's: choose of x, y.",
     ),
-    # Archives: rows of load, of resume and of their folders belong here.
+    "load: missing": (
+        lambda: CuReSAC.load("missing"),
+        "there is neither a file 'missing' nor 'missing.zip': give the path that it was saved to.",
+    ),
+    "load: no archive": (
+        lambda: CuReSAC.load("there"),
+        "'there' is no zip file, or the end of it is missing: it was not written by this package, or was damaged "
+        "since.",
+    ),
+    "load: folder": (lambda: CuReSAC.load("."), "'.' is a folder: give the path of a file in it."),
+    "load: number": (
+        lambda: CuReSAC.load(3),
+        "got 3 for a file, but expected a path, or a file that is open in binary mode.",
+    ),
+    "load: custom_objects": (
+        lambda: CuReSAC.load("there", custom_objects=3),
+        "custom_objects is a int, but it must be a dict or None.",
+    ),
+    "save: folder is a file": (
+        lambda: model_of().save("there/model"),
+        "cannot write 'there/model.zip', as 'there' is a file: choose another path.",
+    ),
+    "save: number": (
+        lambda: model_of().save(3),
+        "got 3 for a file, but expected a path, or a file that is open in binary mode.",
+    ),
+    "set_parameters: missing": (
+        lambda: model_of().set_parameters("missing"),
+        "there is neither a file 'missing' nor 'missing.zip': give the path that it was saved to.",
+    ),
+    "load_replay_buffer: missing": (
+        lambda: model_of().load_replay_buffer("missing"),
+        "there is neither a file 'missing' nor 'missing.pkl': give the path that it was saved to.",
+    ),
+    "load_replay_buffer: no buffer": (
+        lambda: model_of().load_replay_buffer("there"),
+        "'there' is no replay buffer that this package saved without pickle, and unpickling runs any code that is in "
+        "a file: if you know where it comes from, load it with trusted=True.",
+    ),
+    "resume: missing": (
+        lambda: CuReSAC.resume("missing", PixelBox()),
+        "there is no checkpoint in missing: give the path of an ExactCheckpoint that has begun a training, or start "
+        "one.",
+    ),
+    "resume: file": (
+        lambda: CuReSAC.resume("there", PixelBox()),
+        "there is no checkpoint in there: give the path of an ExactCheckpoint that has begun a training, or start one.",
+    ),
+    "resume: number": (
+        lambda: CuReSAC.resume(3, PixelBox()),
+        "resume got path=3, but it must be the folder of an ExactCheckpoint: give it.",
+    ),
+    "resume: no environment": (
+        lambda: CuReSAC.resume("there", None),
+        "resume got no environment: give those of the training, made as they were then.",
+    ),
+    "resume: environment": (
+        lambda: CuReSAC.resume("there", 3),
+        "env is 3, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for example "
+        "make_dmc_env('cartpole', 'swingup').",
+    ),
+    "ExactCheckpoint: save_freq": (
+        lambda: ExactCheckpoint(0, "new"),
+        "ExactCheckpoint got save_freq=0, but it must be a whole number of at least 1: change save_freq.",
+    ),
+    "ExactCheckpoint: keep": (
+        lambda: ExactCheckpoint(10, "new", keep=1.5),
+        "ExactCheckpoint got keep=1.5, but it must be a whole number of at least 1: change keep.",
+    ),
+    "ExactCheckpoint: path": (
+        lambda: ExactCheckpoint(10, 3),
+        "ExactCheckpoint got path=3, but it must be the path of a folder: give one.",
+    ),
+    "ExactCheckpoint: path is a file": (
+        lambda: model_of().learn(3, callback=ExactCheckpoint(10, "there")),
+        "ExactCheckpoint cannot write to there (File exists): choose another path.",
+    ),
+    "ExactCheckpoint: algorithm": (
+        lambda: SAC("MlpPolicy", VectorBox(), buffer_size=10).learn(3, callback=ExactCheckpoint(10, "new")),
+        "ExactCheckpoint got a SAC, but only CuReSAC can resume exactly: use SB3's CheckpointCallback, or CuReSAC "
+        "(with srl=None, curiosity=None it is SB3's SAC).",
+    ),
 }
 
 
@@ -1368,7 +1455,7 @@ def test_uses(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.chdir(tmp_path)
     Path("there").write_text("a file")
     do, sentence = USES[name]
-    with pytest.raises(ValueError) as error:
+    with pytest.raises((ValueError, OSError)) as error:
         do()
     assert (str(error.value), files_in(tmp_path)) == (sentence.replace("{folder}", str(tmp_path)), ["there"])
     assert is_one_sentence(str(error.value))

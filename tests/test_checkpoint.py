@@ -35,6 +35,7 @@ from benchmarks import faults
 from sb3_cure import CuReSAC, files, generations, make_dmc_env
 from sb3_cure.callbacks import ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
+from sb3_cure.envs import FaultTolerantSubprocVecEnv
 from sb3_cure.generations import Generations
 
 
@@ -77,6 +78,11 @@ def in_workers() -> VecEnv:
     return SubprocVecEnv([lambda: Monitor(PixelBox(episode_length=7))] * 2, start_method="fork")
 
 
+def in_watched_workers() -> VecEnv:
+    environments = [lambda: Monitor(PixelBox(episode_length=7))] * 2
+    return FaultTolerantSubprocVecEnv(environments, on_env_fault="restart", start_method="fork")
+
+
 CASES = {
     "rae, joint": Case(pixels()),
     "curl, sequential": Case(pixels(), {"srl": "curl", "srl_kwargs": {"crop_size": 32}, "update": "sequential"}),
@@ -96,6 +102,7 @@ CASES = {
     "plain SAC": Case(pixels(), {"srl": None, "curiosity": None}),
     "pretraining": Case(pixels(), {"curiosity": None}, pretrain=25),
     "workers": Case(in_workers),
+    "watched workers": Case(in_watched_workers),
 }
 
 

@@ -38,6 +38,7 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cure.envs.dmc import DMCPixels
+from sb3_cure.envs.fault_tolerant import FaultTolerantSubprocVecEnv
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
 from sb3_cure.overlap import OverlappedVecEnv
 
@@ -95,6 +96,7 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
     # The buffers of DummyVecEnv are overwritten by every step.
     DummyVecEnv: ("_seeds", "_options"),
     SubprocVecEnv: ("_seeds", "_options"),
+    FaultTolerantSubprocVecEnv: ("_seeds", "_options"),
     VecFrameStack: ("stacked_obs",),
     VecMonitor: ("episode_count", "episode_returns", "episode_lengths"),
     VecNormalize: ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward"),
