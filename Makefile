@@ -70,8 +70,8 @@ chromium:
 demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten minutes on two cores)
 	$(RUN) sb3_cure.experiments.demo --out demo
 
-test: gl  ## run the tests (options for pytest: make test PYTEST_ARGS="-x -k buffer")
-	$(RUN) pytest $(PYTEST_ARGS)
+test: gl  ## run the tests in two processes (options for pytest: make test PYTEST_ARGS="-x -k buffer")
+	$(RUN) pytest -n 2 --dist worksteal $(PYTEST_ARGS)
 
 # What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
 # the replay buffer, wrong arguments, and the pixels of dm_control.

@@ -506,6 +506,14 @@ class ExactCheckpoint(BaseCallback):
         self._last_saved = self._last_tried = 0
         self._signal: int | None = None
 
+    @staticmethod
+    def exists(path: str | Path) -> bool:
+        """
+        :param path: Folder for checkpoints
+        :return: Whether there is one, from which ``CuReSAC.resume`` can go on
+        """
+        return bool(Generations(path).numbers())
+
     def _init_callback(self) -> None:
         from sb3_cure.cure_sac import CuReSAC
 

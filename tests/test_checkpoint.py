@@ -244,7 +244,7 @@ SCRIPT = textwrap.dedent(
     torch.set_num_threads(1)
     folder = Path(sys.argv[1])
     env = make_dmc_env("cartpole", "swingup", image_size=24, renderer="fast")
-    if (folder / "checkpoints").exists():
+    if ExactCheckpoint.exists(folder / "checkpoints"):
         model = CuReSAC.resume(folder / "checkpoints", env)
     else:
         model = CuReSAC(
