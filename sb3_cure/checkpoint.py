@@ -634,6 +634,11 @@ class ExactCheckpoint(BaseCallback):
 
         def note(number: int, _: Any) -> None:
             self._signal = number
+            print(
+                f"{signal.Signals(number).name}: when the updates under way are done, a checkpoint is written and "
+                "training ends; once more to end it at once.",
+                file=sys.stderr,
+            )
             signal.signal(number, former[signal.Signals(number)])
 
         for number in former:
