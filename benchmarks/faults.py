@@ -134,7 +134,7 @@ def _digest(model: CuReSAC) -> str:
             digest.update(repr(value).encode())
 
     buffer: Any = model.replay_buffer
-    resumed: Any = model._resumed
+    resumed: Any = model._run.resumed
     take(model.get_parameters())
     rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
     take([np.asarray(each) for each in buffer.transitions(rows, np.zeros(len(rows), int))[:5] if each is not None])
@@ -162,7 +162,6 @@ class Site:
         model = _make_model()
         self.before.mkdir(parents=True)
         writer = CheckpointWriter(self.before)
-        model._checkpoint_writer = writer
         for _ in range(3):
             model.learn(21, reset_num_timesteps=False)
             writer.write(model, KEEP)
@@ -254,8 +253,7 @@ class Site:
             warnings.simplefilter("ignore")
             model = CuReSAC.resume(self.work, _Dots(), device="cpu")
         model.set_logger(Logger(None, []))
-        assert model._checkpoint_writer is not None
-        model._checkpoint_writer.write(model, KEEP)
+        model._run.writers[self.work.absolute()].write(model, KEEP)
         _, again, later = _resume(self.work)
         if again != steps or later:
             return f"{resumed}, and then {again} instead of {steps} steps, saying {later}"

@@ -578,7 +578,7 @@ class DiagnosticsCallback(PeriodicCallback):
         self.autoencoder_updates = autoencoder_updates
         self.temperature_bounds = temperature_bounds
         #: What was warned of
-        self.warned: set[str] = set()
+        self.warned: list[str] = []
         self._rendering: diagnostics.Finding | None = None
 
     def _init_callback(self) -> None:
@@ -608,5 +608,5 @@ class DiagnosticsCallback(PeriodicCallback):
     def _report(self, finding: diagnostics.Finding) -> None:
         self.logger.record(f"diagnostics/{finding.name}", float(finding.value))
         if finding.problem is not None and finding.name not in self.warned:
-            self.warned.add(finding.name)
+            self.warned.append(finding.name)
             warnings.warn(f"After {self.num_timesteps} agent steps: {finding.problem}", stacklevel=2)

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,22 +21,20 @@ from stable_baselines3.common.logger import (
     HumanOutputFormat,
     JSONOutputFormat,
     KVWriter,
-    Logger,
     TensorBoardOutputFormat,
 )
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_cure.buffer_files import can_be_kept, frame_rows, load_frame_rows
 from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.envs.state import load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.generations import CHUNK, CheckpointError, Draft, Entry, Generation, Generations
-from sb3_cure.serialization import read_state, write_state
+from sb3_cure.serialization import ArchiveError, read_state, sentences, write_state
 
 if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC
 
 MODEL, STATE, BUFFER = "model.zip", "state.zip", "replay_buffer.pkl"
-#: What of a FrameStackReplayBuffer is neither frames nor given by its constructor
-_BUFFER_COUNTERS = ("pos", "full", "_n_valid", "_n_frames")
 
 
 class FrameSegment(NamedTuple):
@@ -68,26 +66,29 @@ class CheckpointWriter:
         :param generation: The checkpoint from which the model was just restored, frames and all
         :param model: The model
         """
-        self._segments = _frame_segments(generation)
+        self._segments = _frame_segments(generation, model.replay_buffer)
         self._n_resets = getattr(model.replay_buffer, "n_resets", None)
 
-    def write(self, model: "CuReSAC", keep: int) -> Generation:
+    def write(self, model: "CuReSAC", keep: int, environments_may_be_gone: bool = False) -> Generation:
         """
         :param model: The model, between an update and the next step of the environments
         :param keep: Number of latest checkpoints to keep
+        :param environments_may_be_gone: Whether to do without the environments' state if they do not answer
         :return: What was written
         :raises OSError: if it could not be; the checkpoints are then as before
         """
         segments = list(self._segments)
+        state = training_state(model, environments_may_be_gone)
 
         def fill(draft: Draft) -> dict[str, Any]:
             model.save(draft.path(MODEL))
-            state = training_state(model)
             if isinstance(model.replay_buffer, FrameStackReplayBuffer):
                 segments[:] = self._write_frames(draft, model.replay_buffer)
-                state["buffer"] = _rows(model.replay_buffer)
+                state["buffer"] = frame_rows(model.replay_buffer)
             else:
                 model.save_replay_buffer(draft.path(BUFFER))
+            for number, output in enumerate(_log_files(model)):
+                shutil.copyfile(output.file.name, draft.path(f"log-{number}"))  # type: ignore[attr-defined]
             write_state(draft.path(STATE), state)
             frames = [[segment.entry.name, segment.first, segment.last] for segment in segments]
             return {"num_timesteps": model.num_timesteps, "n_updates": model._n_updates, "frames": frames}
@@ -111,9 +112,18 @@ class CheckpointWriter:
         return segments
 
 
-def _frame_segments(generation: Generation) -> list[FrameSegment]:
+def _frame_segments(generation: Generation, buffer: Any) -> list[FrameSegment]:
+    """Those of a generation, whose manifest may be a stranger's."""
     entries = {entry.name: entry for entry in generation.segments}
-    return [FrameSegment(entries[name], first, last) for name, first, last in generation.about["frames"]]
+    segments = [FrameSegment(entries[name], first, last) for name, first, last in generation.about["frames"]]
+    for segment in segments:
+        size = (segment.last - segment.first) * int(np.prod(buffer.frame_shape))
+        if segment.first < 0 or segment.last > buffer._n_frames or segment.entry.size != size or size == 0:
+            raise CheckpointError(
+                f"{segment.entry.name} of {generation.folder} has {segment.entry.size} bytes, which are not the frames "
+                f"{segment.first} to {segment.last} of {buffer._n_frames}: the checkpoint is damaged."
+            )
+    return segments
 
 
 def _frame_runs(buffer: FrameStackReplayBuffer, first: int, last: int) -> Iterator[np.ndarray]:
@@ -126,29 +136,29 @@ def _frame_runs(buffer: FrameStackReplayBuffer, first: int, last: int) -> Iterat
         first += count
 
 
-def _rows(buffer: FrameStackReplayBuffer) -> dict[str, Any]:
-    """All but the frames, as far as it is used."""
-    stored = buffer.buffer_size if buffer.full else buffer.pos
-    arrays = {name: getattr(buffer, name)[:stored] for name in buffer._ROW_ARRAYS}
-    counters = {name: getattr(buffer, name) for name in _BUFFER_COUNTERS}
-    return {"arrays": arrays, "counters": counters, "tails": buffer._tails}
-
-
 # --------------------------------------------------------------- the state beside networks and replay buffer
 
 
-def training_state(model: "CuReSAC") -> dict[str, Any]:
+def training_state(model: "CuReSAC", environments_may_be_gone: bool = False) -> dict[str, Any]:
     """What training depends on, beside what ``CuReSAC.save`` and the replay buffer hold.
 
     :param model: The model, between an update and the next step of the environments
+    :param environments_may_be_gone: Whether to do without the environments' state if they do not answer
     :return: Plain values and arrays
     """
     assert model.env is not None
+    try:
+        environments = vec_env_state(model.env)
+    except (OSError, EOFError, RuntimeError) as error:
+        if not environments_may_be_gone:
+            raise RuntimeError(f"the environments do not tell their state ({error or type(error).__name__})") from error
+        environments = None
     return {
-        "collector": model._collector,
+        "calls": list(model._run.calls),
         "n_envs": model.n_envs,
         "random": _random_state(model),
-        "environments": vec_env_state(model.env),
+        "environments": environments,
+        "transition_guard": model._transition_guard.state_dict(),
         "metrics": {
             "sums": dict(model._metrics._sums),
             "counts": dict(model._metrics._counts),
@@ -156,7 +166,7 @@ def training_state(model: "CuReSAC") -> dict[str, Any]:
             "shares": {} if model.is_plain_sac else dict(model.policy.encoder_optimizer.shares),
         },
         "logger": _logger_state(model),
-        "callbacks": [_changed(callback) for callback in model._callbacks],
+        "callbacks": [_changed(watched) for watched in model._run.watched],
     }
 
 
@@ -180,77 +190,63 @@ def _load_random_state(model: "CuReSAC", state: dict[str, Any]) -> None:
 
 
 def _logger_state(model: "CuReSAC") -> dict[str, Any]:
-    """What was recorded and not yet written, and the files as they are now."""
+    """What was recorded and not yet written, and which files there are; their content is copied beside."""
     logger = model.logger
     recorded = {
         key: [value, logger.name_to_count[key] if key in logger.name_to_count else None, logger.name_to_excluded[key]]
         for key, value in logger.name_to_value.items()
         if isinstance(value, bool | int | float | str | np.number | th.Tensor)
     }
-    outputs = [_output_state(output) for output in logger.output_formats if output is not model._metrics]
-    return {
-        "custom": model._custom_logger,
-        "folder": logger.dir,
-        "recorded": recorded,
-        "outputs": [output for output in outputs if output is not None],
-    }
+    files = []
+    for output in _log_files(model):
+        output.file.flush()  # type: ignore[attr-defined]
+        name = Path(output.file.name).name  # type: ignore[attr-defined]
+        files.append({"name": name, "keys": list(getattr(output, "keys", []))})
+    boards = [each for each in logger.output_formats if isinstance(each, TensorBoardOutputFormat)]
+    return {"recorded": recorded, "files": files, "boards": [Path(board.writer.log_dir).name for board in boards]}
 
 
-_FILES: dict[type[KVWriter], str] = {CSVOutputFormat: "csv", JSONOutputFormat: "json", HumanOutputFormat: "log"}
+def _log_files(model: "CuReSAC") -> list[KVWriter]:
+    """The outputs of the logger that write to a file of their own."""
+    kinds = (CSVOutputFormat, JSONOutputFormat, HumanOutputFormat)
+    outputs = [output for output in model.logger.output_formats if isinstance(output, kinds)]
+    return [output for output in outputs if getattr(output, "own_file", True)]
 
 
-def _output_state(output: KVWriter) -> dict[str, Any] | None:
-    if isinstance(output, TensorBoardOutputFormat):
-        return {"kind": "tensorboard", "path": output.writer.log_dir}
-    if isinstance(output, HumanOutputFormat) and not output.own_file:
-        return {"kind": "stdout", "path": ""}
-    kind = _FILES.get(type(output))
-    if kind is None:
-        return None
-    output.file.flush()  # type: ignore[attr-defined]
-    path = Path(output.file.name).absolute()  # type: ignore[attr-defined]
-    return {"kind": kind, "path": str(path), "content": path.read_bytes(), "keys": list(getattr(output, "keys", []))}
-
-
-def _make_logger(state: dict[str, Any]) -> Logger:
-    """A logger that writes where that of the killed run wrote."""
-    outputs: list[KVWriter] = []
-    kinds = {kind: output_format for output_format, kind in _FILES.items()}
-    for output in state["outputs"]:
-        if output["kind"] == "stdout":
-            outputs.append(HumanOutputFormat(sys.stdout))
-        elif output["kind"] == "tensorboard":
-            outputs.append(TensorBoardOutputFormat(output["path"]))
-        else:
-            Path(output["path"]).parent.mkdir(parents=True, exist_ok=True)
-            outputs.append(kinds[output["kind"]](output["path"]))  # type: ignore[call-arg]
-    return Logger(state["folder"], outputs)
-
-
-def _continue_logger(logger: Logger, state: dict[str, Any], step: int) -> None:
-    """Files become what they were at the checkpoint; what came after is dropped."""
+def _continue_logger(model: "CuReSAC", generation: Generation, state: dict[str, Any]) -> None:
+    """Files that the logger has open become what those of the same name were; what came after is dropped."""
+    logger = model.logger
     for key, (value, count, excluded) in state["recorded"].items():
         logger.name_to_value[key] = value
         logger.name_to_excluded[key] = excluded
         if count is not None:
             logger.name_to_count[key] = count
-    for output in logger.output_formats:
-        if isinstance(output, TensorBoardOutputFormat):
-            from torch.utils.tensorboard import SummaryWriter
-
-            output.writer.close()
-            output.writer = SummaryWriter(log_dir=output.writer.log_dir, purge_step=step + 1)
-        kind = _FILES.get(type(output))
-        saved = [other for other in state["outputs"] if other["kind"] == kind]
-        if kind is None or not saved or (isinstance(output, HumanOutputFormat) and not output.own_file):
+    outputs: dict[str, Any] = {Path(output.file.name).name: output for output in _log_files(model)}  # type: ignore[attr-defined]
+    for number, saved in enumerate(state["files"]):
+        output = outputs.get(saved["name"])
+        if output is None:
+            warnings.warn(
+                f"the training that is resumed wrote the log {saved['name']}, which nothing goes on with: before "
+                "learn, call set_logger as it did.",
+                stacklevel=4,
+            )
             continue
-        file: io.TextIOWrapper = output.file  # type: ignore[attr-defined]
-        file.seek(0)
-        file.truncate()
-        file.write(saved[0]["content"].decode())
-        file.flush()
+        output.file.seek(0)
+        output.file.truncate()
+        with (generation.folder / f"log-{number}").open("rb") as content:
+            shutil.copyfileobj(content, output.file.buffer, CHUNK)
+        output.file.seek(0, io.SEEK_END)
         if isinstance(output, CSVOutputFormat):
-            output.keys = list(saved[0]["keys"])
+            output.keys = [str(key) for key in saved["keys"]]
+    boards = [output for output in logger.output_formats if isinstance(output, TensorBoardOutputFormat)]
+    for board, name in zip(boards, state["boards"], strict=False):
+        from torch.utils.tensorboard import SummaryWriter
+
+        # The folder of the killed run, beside that which SB3 has chosen, if it is there.
+        folder = Path(board.writer.log_dir).parent / Path(name).name
+        if folder.is_dir():
+            board.writer.close()
+            board.writer = SummaryWriter(log_dir=str(folder), purge_step=model.num_timesteps + 1)
 
 
 # ----------------------------------------------------------------------------------------------- callbacks
@@ -301,7 +297,26 @@ def _changed(watched: WatchedCallback) -> dict[str, Any]:
     now = _plain_attributes(watched.callback)
     missing = object()
     changed = {name: value for name, value in now.items() if not _equal(watched.before.get(name, missing), value)}
-    return {"class": type(watched.callback).__name__, "changed": changed}
+    kept = {name: value for name, value in changed.items() if _can_be_kept(watched.callback, name, value)}
+    return {"class": type(watched.callback).__name__, "changed": kept}
+
+
+def _can_be_kept(callback: BaseCallback, name: str, value: Any) -> bool:
+    try:
+        write_state(io.BytesIO(), {name: value})
+    except (TypeError, ValueError) as error:
+        warnings.warn(f"checkpoints do not keep {name} of {type(callback).__name__}: {error}", stacklevel=2)
+        return False
+    return True
+
+
+def _take_back(callback: BaseCallback, changed: dict[str, Any]) -> None:
+    """What was saved of a callback, perhaps by a stranger: values of plain attributes that it has, of their types."""
+    now = _plain_attributes(callback)
+    for name, value in changed.items():
+        same_type = name in now and (type(now[name]) is type(value) or now[name] is None) and _is_plain(value)
+        if same_type and not isinstance(value, str):
+            setattr(callback, name, value)
 
 
 def _equal(one: Any, other: Any) -> bool:
@@ -326,43 +341,64 @@ def resume(
     if env is None:
         raise CheckpointError("resume got no environment: give those of the training, made as they were then.")
     generations = Generations(path)
-    generation, lost = _newest(generations)
+    errors: list[CheckpointError | ArchiveError] = []
+    for generation, lost in _usable(generations):
+        try:
+            with sentences(str(generation.folder), "resume on a machine with more"):
+                return _restore(model_class, generation, lost, env, custom_objects, kwargs)
+        except ArchiveError as error:
+            # What is amiss with the settings that were given is amiss with all of them: the newest tells best.
+            errors.append(error)
+            warnings.warn(f"{generation.folder.name} cannot be resumed from: {error}", stacklevel=3)
+    raise errors[0]
+
+
+def _restore(
+    model_class: type["CuReSAC"],
+    generation: Generation,
+    lost: list[Path],
+    env: GymEnv,
+    custom_objects: dict[str, Any] | None,
+    kwargs: dict[str, Any],
+) -> "CuReSAC":
+    """The model of a generation, ready to learn on."""
     model = model_class.load(
         generation.folder / MODEL, env=env, custom_objects=custom_objects, force_reset=False, **kwargs
     )
     state = read_state(generation.folder / STATE)
     if model.n_envs != state["n_envs"]:
-        raise CheckpointError(
-            f"resume got {model.n_envs} environments, but the checkpoint in {path} is of a training with "
+        raise ArchiveError(
+            f"resume got {model.n_envs} environments, but the checkpoint {generation.folder} is of a training with "
             f"{state['n_envs']}: give as many."
         )
     _load_buffer(model, generation, state, lost)
-    model._resumed = Resumption(generation, state)
-    model._checkpoint_writer = CheckpointWriter(path)
-    if not lost:
-        model._checkpoint_writer.continue_from(generation, model)
+    writer = CheckpointWriter(generation.folder.parent)
+    if not lost and isinstance(model.replay_buffer, FrameStackReplayBuffer):
+        writer.continue_from(generation, model)
+    model._run.writers[generation.folder.parent.absolute()] = writer
+    *model._run.calls, _ = *model._run.done, _ = [str(call) for call in state["calls"]]
     if state["environments"] is None:
         assert model.env is not None
         # The interrupted episode cannot be gone on with; other first states than those that this run has seen.
         model._last_obs = None
         model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)
-    if state["logger"]["custom"]:
-        model.set_logger(_make_logger(state["logger"]))
-        _continue_logger(model.logger, state["logger"], model.num_timesteps)
+    model._run.resumed = Resumption(generation, state, model)
     if model.verbose >= 1:
         print(f"Resumed from {generation.folder}, after {model.num_timesteps} agent steps")
     return model
 
 
-def _newest(generations: Generations) -> tuple[Generation, list[Path]]:
-    """The newest generation that is whole, or else the newest that lacks nothing but frames; and what it lacks."""
+def _usable(generations: Generations) -> Iterator[tuple[Generation, list[Path]]]:
+    """The generations that are whole, newest first, then those that lack nothing but frames; and what they lack."""
     numbers = generations.numbers()
     if not numbers:
         raise CheckpointError(
             f"there is no checkpoint in {generations.path}: give the path of an ExactCheckpoint that has begun a "
             "training, or start one."
         )
-    reasons, without_frames = [], []
+    reasons: list[str] = []
+    without_frames = []
+    found = False
     for number in reversed(numbers):
         try:
             generation = generations.read(number)
@@ -372,19 +408,26 @@ def _newest(generations: Generations) -> tuple[Generation, list[Path]]:
         damaged = generations.damaged(generation)
         if not damaged:
             _tell(reasons, generation)
-            return generation, []
+            found = True
+            yield generation, []
+            continue
         reasons += [f"{path} is damaged: {fault}" for path, fault in damaged]
         if all(path.parent == generations.segments for path, _ in damaged):
             without_frames.append((generation, [path for path, _ in damaged]))
-    if without_frames:
-        _tell(list(dict.fromkeys(reasons)), without_frames[0][0])
-        return without_frames[0]
-    raise CheckpointError(f"no checkpoint in {generations.path} is whole ({'; '.join(reasons)}): start anew.")
+    for generation, lost in without_frames:
+        _tell(reasons, generation)
+        found = True
+        yield generation, lost
+    if not found:
+        told = "; ".join(dict.fromkeys(reasons))
+        raise CheckpointError(f"no checkpoint in {generations.path} is whole ({told}): start anew.")
 
 
 def _tell(reasons: list[str], taken: Generation) -> None:
     if reasons:
-        warnings.warn(f"{'; '.join(reasons)}. Resuming from {taken.folder.name} instead.", stacklevel=4)
+        told = "; ".join(dict.fromkeys(reasons))
+        warnings.warn(f"{told}. Resuming from {taken.folder.name} instead.", stacklevel=4)
+        reasons.clear()
 
 
 def _load_buffer(model: "CuReSAC", generation: Generation, state: dict[str, Any], lost: list[Path]) -> None:
@@ -397,14 +440,11 @@ def _load_buffer(model: "CuReSAC", generation: Generation, state: dict[str, Any]
             f"the checkpoint {generation.folder} has single frames, but the replay buffer of this model is a "
             f"{type(buffer).__name__}: resume with environments that tell the same frame_stack."
         )
-    for name, array in state["buffer"]["arrays"].items():
-        getattr(buffer, name)[: len(array)] = array
-    vars(buffer).update(state["buffer"]["counters"])
-    buffer._tails[:] = state["buffer"]["tails"]
+    load_frame_rows(buffer, state["buffer"], str(generation.folder))
     if len(buffer.frames) == 0 and buffer._n_frames > 0:
         buffer.frames = buffer._file_for_frames()
     lost_names = {path.name for path in lost}
-    for segment in _frame_segments(generation):
+    for segment in _frame_segments(generation, buffer):
         first = max(segment.first, buffer._n_frames - buffer.frame_capacity)
         if segment.entry.name in lost_names:
             _forget_frames_before(buffer, segment.last)
@@ -433,30 +473,38 @@ class Resumption:
 
     :param generation: The checkpoint
     :param state: Its training state
+    :param model: The model
     """
 
-    def __init__(self, generation: Generation, state: dict[str, Any]):
+    def __init__(self, generation: Generation, state: dict[str, Any], model: "CuReSAC"):
         self.generation = generation
         self.state = state
+        kept = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_num_timesteps_at_start", "action_noise")
+        self._kept = {name: copy.deepcopy(getattr(model, name)) for name in kept}
 
     def set_up(self, model: "CuReSAC") -> None:
         """Counters of callbacks, files of the logger and what was not yet logged.
 
         :param model: The model, at the end of its ``_setup_learn``
         """
-        saved = list(self.state["callbacks"])
-        for watched in model._callbacks:
-            entry = next((entry for entry in saved if entry["class"] == type(watched.callback).__name__), None)
-            if entry is not None:
-                saved.remove(entry)
-                vars(watched.callback).update(entry["changed"])
-        _continue_logger(model.logger, self.state["logger"], model.num_timesteps)
-        metrics = self.state["metrics"]
-        model._metrics._sums = {key: value.to(model.device) for key, value in metrics["sums"].items()}
-        model._metrics._counts = dict(metrics["counts"])
-        if not model.is_plain_sac:
-            shares = {key: value.to(model.device) for key, value in metrics["shares"].items()}
-            model.policy.encoder_optimizer.shares = shares
+        # `learn` begins noises anew, and takes its start for now.
+        model.action_noise = self._kept["action_noise"]
+        model._num_timesteps_at_start = self._kept["_num_timesteps_at_start"]
+        with sentences(str(self.generation.folder), "resume on a machine with more"):
+            saved = list(self.state["callbacks"])
+            for watched in model._run.watched:
+                name = type(watched.callback).__name__
+                entry = next((entry for entry in saved if entry["class"] == name), None)
+                if entry is not None:
+                    saved.remove(entry)
+                    _take_back(watched.callback, entry["changed"])
+            _continue_logger(model, self.generation, self.state["logger"])
+            metrics = self.state["metrics"]
+            model._metrics._sums = {key: value.to(model.device) for key, value in metrics["sums"].items()}
+            model._metrics._counts = dict(metrics["counts"])
+            if not model.is_plain_sac:
+                shares = {key: value.to(model.device) for key, value in metrics["shares"].items()}
+                model.policy.encoder_optimizer.shares = shares
 
     def enter(self, model: "CuReSAC") -> None:
         """Environments and random streams, last of all, so that nothing can disturb them.
@@ -464,9 +512,61 @@ class Resumption:
         :param model: The model, before its next step
         """
         assert model.env is not None
-        if self.state["environments"] is not None:
-            load_vec_env_state(model.env, self.state["environments"])
-        _load_random_state(model, self.state["random"])
+        with sentences(str(self.generation.folder), "resume on a machine with more"):
+            if self.state["environments"] is not None:
+                load_vec_env_state(model.env, self.state["environments"])
+                for name in ("_last_obs", "_last_episode_starts", "_last_original_obs"):
+                    setattr(model, name, self._kept[name])
+            model._transition_guard.load_state_dict(self.state["transition_guard"])
+            _load_random_state(model, self.state["random"])
+
+
+class Run:
+    """What a model knows of the training that it is in, beside what it saves."""
+
+    def __init__(self) -> None:
+        #: By folder
+        self.writers: dict[Path, CheckpointWriter] = {}
+        #: What a resumed model has yet to restore
+        self.resumed: Resumption | None = None
+        #: Callbacks of the running ``learn``
+        self.watched: list[WatchedCallback] = []
+        #: Called before each rollout, between an update and the next step
+        self.before_rollout: list[Callable[[], None]] = []
+        #: What is to be undone when the running ``learn`` ends
+        self.leaving = contextlib.ExitStack()
+        #: Calls of ``learn`` and ``pretrain`` so far, the running one last
+        self.calls: list[str] = []
+        #: Of these, calls that were over when the checkpoint was taken, and that the script will make again
+        self.done: list[str] = []
+
+    def skips(self, call: str) -> bool:
+        """
+        :param call: ``"learn"`` or ``"pretrain"``, which is being called
+        :return: Whether the checkpoint that was resumed from was taken after it
+        """
+        if self.resumed is not None and self.done[:1] == [call]:
+            self.done.pop(0)
+            print(f"{call} number {len(self.calls) - len(self.done)} of this training was over: skipped")
+            return True
+        self.done = []
+        return False
+
+    @contextlib.contextmanager
+    def calling(self, call: str) -> Iterator[None]:
+        """The running call.
+
+        :param call: ``"learn"`` or ``"pretrain"``
+        """
+        self.calls.append(call)
+        try:
+            with self.leaving:
+                yield
+        except BaseException:
+            self.calls.pop()
+            raise
+        finally:
+            self.watched, self.before_rollout = [], []
 
 
 class ExactCheckpoint(BaseCallback):
@@ -474,14 +574,15 @@ class ExactCheckpoint(BaseCallback):
 
     A checkpoint holds networks, optimisers, SRL head, temperatures, running statistics, schedules, counters, the
     replay buffer, all random streams, the state of the environments where they offer it, what was logged, and the
-    counters of the callbacks. The frames of a ``FrameStackReplayBuffer`` are written once: a checkpoint adds the new
-    ones. It is written aside, flushed to the disk, checksummed and renamed; until then the former ones count. One is
-    written when training starts and one when it ends.
+    public attributes of the callbacks. The frames of a ``FrameStackReplayBuffer`` are written once: a checkpoint adds
+    the new ones. It is written aside, flushed to the disk, checksummed and renamed; until then the former ones count.
+    One is written when training starts and one when it ends.
 
     On the CPU with ``precision="fp32", compile=False`` the resumed run equals one without interruption bit for bit
     (with ``overlap=True``, whose updates lag behind, it does not). Environments that cannot tell their state begin a
     new episode instead, which is said when training starts. On SIGTERM and SIGINT a checkpoint is written before the
-    next step, then the process leaves with the status that the signal asks for.
+    next rollout (with ``train_freq=1``: the next step), then the process leaves with the status that the signal asks
+    for. Workers of SB3's ``SubprocVecEnv`` die of a Ctrl-C in a terminal: their episodes then begin anew.
 
     :param save_freq: Agent steps between two checkpoints (of all environments together)
     :param path: Folder for the checkpoints of this training, made if missing
@@ -505,6 +606,7 @@ class ExactCheckpoint(BaseCallback):
         self.keep = int(keep)
         self._last_saved = self._last_tried = 0
         self._signal: int | None = None
+        self._writer = CheckpointWriter(self.path)
 
     @staticmethod
     def exists(path: str | Path) -> bool:
@@ -522,9 +624,16 @@ class ExactCheckpoint(BaseCallback):
                 f"ExactCheckpoint got a {type(self.model).__name__}, but only CuReSAC can resume exactly: use SB3's "
                 "CheckpointCallback, or CuReSAC (with srl=None, curiosity=None it is SB3's SAC)."
             )
-        writer = self.model._checkpoint_writer
-        if writer is None or writer.generations.path.absolute() != self.path.absolute():
-            if Generations(self.path).numbers():
+        buffer = self.model.replay_buffer
+        if not can_be_kept(buffer):
+            raise ValueError(
+                f"ExactCheckpoint got a model whose replay buffer is a {type(buffer).__name__}, which it cannot read "
+                "back without pickle: train with a FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
+            )
+        run = self.model._run
+        writer = run.writers.get(self.path.absolute())
+        if writer is None:
+            if self.exists(self.path):
                 raise CheckpointError(
                     f"{self.path} holds checkpoints of another training: go on with it by "
                     f"CuReSAC.resume({str(self.path)!r}, env), or choose another path, or remove that folder."
@@ -532,17 +641,29 @@ class ExactCheckpoint(BaseCallback):
             writer = CheckpointWriter(self.path)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            leaving = self.model._leaving_learn
-            leaving.enter_context(writer.generations.locked())
+            run.leaving.enter_context(writer.generations.locked())
         except OSError as error:
             raise CheckpointError(
                 f"ExactCheckpoint cannot write to {self.path} ({error.strerror}): choose another path."
             ) from error
-        self.model._checkpoint_writer = writer
-        leaving.enter_context(self._signals_noted())
+        self._writer = run.writers[self.path.absolute()] = writer
+        run.leaving.enter_context(self._signals_noted())
+        # Before any callback hears of the rollout: when it is resumed, all of them do.
+        run.before_rollout.append(self._look)
 
     def _on_training_start(self) -> None:
         model: Any = self.model
+        inexact = {
+            "overlap=True": model.overlap,
+            "use_sde=True": model.use_sde,
+        }
+        for setting, is_set in inexact.items():
+            if is_set:
+                warnings.warn(
+                    f"ExactCheckpoint with {setting}: a resumed training goes on, but not bit for bit as without the "
+                    "interruption.",
+                    stacklevel=2,
+                )
         reason = why_not_restorable(model.env)
         if reason is not None:
             warnings.warn(
@@ -550,45 +671,38 @@ class ExactCheckpoint(BaseCallback):
                 "with a new episode.",
                 stacklevel=2,
             )
-        if model.overlap:
-            warnings.warn(
-                "ExactCheckpoint with overlap=True: a resumed training goes on, but not bit for bit as without the "
-                "interruption; for that set overlap=False.",
-                stacklevel=2,
-            )
         self._last_saved = self._last_tried = self.num_timesteps
-        if model._resumed is None:
+        if model._run.resumed is None:
+            self._check_room()
             try:
-                self._check_room(model._checkpoint_writer.write(model, self.keep))
+                self._writer.write(model, self.keep)
             except OSError as error:
                 raise CheckpointError(
                     f"ExactCheckpoint cannot write to {self.path} ({error.strerror}): choose another path."
                 ) from error
 
-    def _check_room(self, first: Generation) -> None:
-        buffer = self.model.replay_buffer  # type: ignore[attr-defined]
-        arrays = {name: value.nbytes for name, value in vars(buffer).items() if isinstance(value, np.ndarray)}
-        if isinstance(buffer, FrameStackReplayBuffer):
-            shared = buffer.frame_capacity * int(np.prod(buffer.frame_shape))
-            own = sum(arrays.values()) - arrays["frames"]
-        else:
-            shared, own = 0, sum(arrays.values())
-        own += sum(entry.size for entry in first.files)
+    def _check_room(self) -> None:
+        model: Any = self.model
+        arrays = {name: each.nbytes for name, each in vars(model.replay_buffer).items() if isinstance(each, np.ndarray)}
+        shared = 0
+        if isinstance(model.replay_buffer, FrameStackReplayBuffer):
+            arrays.pop("frames")
+            shared = model.replay_buffer.frame_capacity * int(np.prod(model.replay_buffer.frame_shape))
+        # Adam keeps two more numbers for each parameter.
+        networks = 3 * sum(value.nbytes for value in model.policy.state_dict().values())
         # While one is written, the one that it will replace is still there.
-        needed, free = shared + (self.keep + 1) * own, shutil.disk_usage(self.path).free
+        needed = shared + (self.keep + 1) * (sum(arrays.values()) + networks)
+        free = shutil.disk_usage(self.path).free
         if needed > free:
             raise CheckpointError(
                 f"checkpoints in {self.path} will need up to {needed / 1e9:.2f} GB, but only {free / 1e9:.2f} GB are "
                 "free there: choose another path, a smaller keep, or a smaller buffer_size."
             )
 
-    def _on_rollout_start(self) -> None:
+    def _look(self) -> None:
         if self.is_due() or self._signal is not None:
             self._save()
-        if self._signal == signal.SIGINT:
-            raise KeyboardInterrupt
-        if self._signal is not None:
-            raise SystemExit(128 + self._signal)
+        self._leave_if_told()
 
     def is_due(self) -> bool:
         """
@@ -602,20 +716,22 @@ class ExactCheckpoint(BaseCallback):
     def _on_training_end(self) -> None:
         # Where another callback stopped it, the last step was not stored: the checkpoint before stays the last one.
         model: Any = self.model
-        if self.num_timesteps >= model._total_timesteps and self.num_timesteps > self._last_saved:
+        if self.model.num_timesteps >= model._total_timesteps and self.model.num_timesteps > self._last_saved:
             self._save()
 
     def _save(self) -> None:
         model: Any = self.model
-        self._last_tried = self.num_timesteps
+        self.num_timesteps = self._last_tried = model.num_timesteps
         if model._overlapped is not None:
             model._overlapped.finish()
+        model._guard.report(model)  # nothing that is not finite is kept
         try:
-            generation = model._checkpoint_writer.write(model, self.keep)
-        except OSError as error:
+            generation = self._writer.write(model, self.keep, environments_may_be_gone=self._signal is not None)
+        except Exception as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
             warnings.warn(
-                f"no checkpoint could be written to {self.path} after {self.num_timesteps} agent steps "
-                f"({error.strerror}): training goes on, and the one after {self._last_saved} remains the last.",
+                f"no checkpoint could be written to {self.path} after {self.num_timesteps} agent steps ({reason}): "
+                f"training goes on, and the one after {self._last_saved} remains the last.",
                 stacklevel=2,
             )
             return
@@ -625,7 +741,7 @@ class ExactCheckpoint(BaseCallback):
 
     @contextlib.contextmanager
     def _signals_noted(self) -> Iterator[None]:
-        """SIGTERM and SIGINT are obeyed before the next step; a second one at once."""
+        """SIGTERM and SIGINT are obeyed before the next rollout; a second one at once."""
         self._signal = None
         if threading.current_thread() is not threading.main_thread():
             yield
@@ -648,3 +764,11 @@ class ExactCheckpoint(BaseCallback):
         finally:
             for number, handler in former.items():
                 signal.signal(number, handler)
+        self._leave_if_told()
+
+    def _leave_if_told(self) -> None:
+        number, self._signal = self._signal, None
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if number is not None:
+            raise SystemExit(128 + number)

@@ -1,10 +1,8 @@
 """CuReSAC: SAC from pixels with state representation learning (SRL) and a policy that is curious about it."""
 
-import contextlib
 import io
 import pathlib
 from collections.abc import Callable, Iterable
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -34,7 +32,7 @@ from torch.nn import functional as F
 from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
 from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
 from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked
-from sb3_cure.checkpoint import CheckpointWriter, Resumption, WatchedCallback, resume, watch
+from sb3_cure.checkpoint import Run, resume, watch
 from sb3_cure.checks import (
     check_arguments,
     check_construction,
@@ -62,7 +60,7 @@ SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
 #: Made anew by `_setup_model` or `learn`
 NOT_SAVED = (
     *("_metrics", "_guard", "_transition_guard", "_task_agent", "_curious_agent", "_overlapped"),
-    *("_checkpoint_writer", "_resumed", "_callbacks", "_leaving_learn"),
+    "_run",
 )
 
 #: Updates between two pictures of reconstructions in TensorBoard
@@ -276,12 +274,7 @@ class CuReSAC(SAC):
         self._warmed_up = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
-        # For exact checkpoints: where they go, what a resumed model has yet to restore, the callbacks of the running
-        # `learn`, and what is to be undone when it ends
-        self._checkpoint_writer: CheckpointWriter | None = None
-        self._resumed: Resumption | None = None
-        self._callbacks: list[WatchedCallback] = []
-        self._leaving_learn = contextlib.ExitStack()
+        self._run = Run()
         if overlap is True and self.env is not None:
             OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if _init_setup_model:
@@ -438,23 +431,18 @@ class CuReSAC(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        resumed = self._resumed
+        resumed = self._run.resumed
         if resumed is not None:
-            # The interrupted call is gone on with: its start and action noise are kept, and its total is meant.
+            # The interrupted call is gone on with, whose total is meant.
             reset_num_timesteps = False
             total_timesteps += self._num_timesteps_at_start - self.num_timesteps
-            kept = {
-                "_num_timesteps_at_start": self._num_timesteps_at_start,
-                "action_noise": deepcopy(self.action_noise),
-            }
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         self._metrics.attach(self.logger)
         self._read_env_attributes()
-        self._callbacks = watch(callback)
+        self._run.watched = watch(callback)
         if resumed is not None:
-            vars(self).update(kept)
             resumed.set_up(self)
         return total, callback
 
@@ -586,9 +574,12 @@ class CuReSAC(SAC):
         :param log_interval: Episodes between two dumps of the logger
         :return: What was collected
         """
-        if self._resumed is not None:
-            self._resumed.enter(self)
-            self._resumed = None
+        run = self._run
+        if run.resumed is not None:
+            run.resumed.enter(self)
+            run.resumed = None
+        for look in run.before_rollout:
+            look()
         rollout = super().collect_rollouts(
             self._overlapped or env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
         )
@@ -836,22 +827,27 @@ class CuReSAC(SAC):
         :return: self
         """
         check_learning(self, total_timesteps, callback, log_interval)
+        if self._run.skips("learn"):
+            return self
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
-        self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._learn("learn", total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return self
 
-    def _learn(self, *arguments: Any) -> None:
+    def _learn(self, call: str, *arguments: Any) -> None:
         """SB3's ``learn``, with environments that overlap with the updates if they are to."""
+        run = self._run
         if self.overlap and self.env is not None:
             self._overlapped = OverlappedVecEnv(self.env)
         try:
-            with self._leaving_learn:
+            with run.calling(call):
                 super().learn(*arguments)
                 self._guard.report(self)
+                if run.resumed is not None:  # nothing was left to do
+                    run.resumed.enter(self)
+                    run.resumed = None
         finally:
-            self._overlapped = self._resumed = None
-            self._callbacks = []
+            self._overlapped = None
 
     def pretrain(
         self: SelfCuReSAC,
@@ -892,14 +888,13 @@ class CuReSAC(SAC):
         if collector == "curious":
             check_curious_agent(self)
         check_learning(self, total_timesteps, callback, log_interval)
-        if self._resumed is not None and self._collector != collector:
-            if self._collector is not None:
-                raise ValueError(
-                    f"pretrain got collector={collector!r}, but the resumed checkpoint was taken while pretraining "
-                    f"with {self._collector!r}: go on with that one."
-                )
-            # The same script, started again: its pretraining was over when the checkpoint was taken.
+        if self._run.skips("pretrain"):
             return self
+        if self._run.resumed is not None and self._collector != collector:
+            raise ValueError(
+                f"pretrain got collector={collector!r}, but the resumed checkpoint was taken with {self._collector!r}: "
+                "make the calls of the interrupted training, or load the checkpoint's model.zip to begin another."
+            )
         self._collector = collector
         if self._has_curious_agent and self.policy.curious_actor is None:
             self.policy.add_curious_agent()
@@ -911,7 +906,9 @@ class CuReSAC(SAC):
             self._setup_curious_temperature()
         self._create_agents()
         try:
-            self._learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            self._learn(
+                "pretrain", total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+            )
         finally:
             self._end_pretraining()
         return self
@@ -919,7 +916,7 @@ class CuReSAC(SAC):
     def _end_pretraining(self) -> None:
         if self._collector is None:
             return
-        self._collector = self._resumed = None
+        self._collector = self._run.resumed = None
         if not self._has_curious_agent and self.policy.curious_actor is not None:
             self.policy.remove_curious_agent()
             if self.curiosity_encoder_grad:
@@ -1078,9 +1075,9 @@ class CuReSAC(SAC):
     ) -> SelfCuReSAC:
         """Go on with a training that was killed, from the newest whole checkpoint of ``ExactCheckpoint``.
 
-        The same call of ``learn`` (or ``pretrain``) as before, with the same number of timesteps and the same
-        callbacks, then does what was left of it, and goes on with the log files of a logger that was given by
-        ``set_logger``. A ``pretrain`` that was over is skipped, so that a script can be started again as it is.
+        The same calls of ``learn`` and ``pretrain`` as before, with the same numbers of timesteps and the same
+        callbacks, then do what was left: those that were over are skipped, so that a script can be started again as it
+        is. Log files are gone on with where ``set_logger`` is called as before.
 
         :param path: Folder of the checkpoints
         :param env: Environments as those before: as many, of the same settings

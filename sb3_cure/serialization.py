@@ -128,6 +128,8 @@ class Encoder:
             return value if math.isfinite(value) else {"float": struct.pack(">d", value).hex()}
         if kind is int:
             return {"int": hex(value)}
+        if kind is list and len(value) > 100 and set(map(type, value)) == {float}:
+            return {"floats": self._keep(np.array(value, dtype=np.float64))}  # of histories, say
         if kind is list or kind is tuple or kind is deque:
             items = [self.encode(item, f"{path}[{i}]", depth + 1) for i, item in enumerate(value)]
             if kind is deque:
@@ -235,6 +237,11 @@ class Decoder:
             if maxlen is not None and (type(maxlen) is not int or len(items) > maxlen):
                 raise ArchiveError(f"the archive's JSON has a deque of {len(items)} items and maxlen {maxlen!r:.50}.")
             return deque(items, maxlen)
+        if tag == "floats":
+            stored = self._take(content)
+            if stored.dtype != np.float64 or len(stored.shape) != 1:
+                raise ArchiveError(f"the archive's JSON has floats of {stored.dtype} and shape {stored.shape}.")
+            return stored.read().tolist()
         if tag == "float":
             return struct.unpack(">d", bytes.fromhex(content))[0]
         if tag == "int":

@@ -1,11 +1,13 @@
 """A training that is killed and resumed equals one that was never killed, bit for bit; no fault costs a checkpoint."""
 
+import collections
 import contextlib
 import csv
 import itertools
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,20 +25,22 @@ import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks import faults
 from sb3_cure import CuReSAC, files, generations, make_dmc_env
-from sb3_cure.callbacks import ExactCheckpoint, PeriodicCallback
+from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
 from sb3_cure.envs import FaultTolerantSubprocVecEnv
 from sb3_cure.generations import Generations
+from sb3_cure.serialization import read_state, write_state
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +118,7 @@ def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallba
         model = CuReSAC.resume(folder / "checkpoints", env, device="cpu")
     else:
         model = tiny_model(case.policy, env, **case.arguments)
-        model.set_logger(configure(str(folder / "logs"), ["csv"]))
+    model.set_logger(configure(str(folder / "logs"), ["csv"]))
     try:
         if case.pretrain > 0:
             model.pretrain(case.pretrain, callback=[checkpoints, *callbacks], log_interval=1)
@@ -238,7 +242,9 @@ SCRIPT = textwrap.dedent(
     from pathlib import Path
     import torch
     from stable_baselines3.common.logger import configure
-    from sb3_cure import CuReSAC, files, generations, make_dmc_env
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sb3_cure import CuReSAC, files, generations, make_dmc_env
     from sb3_cure.callbacks import ExactCheckpoint
 
     torch.set_num_threads(1)
@@ -252,7 +258,7 @@ SCRIPT = textwrap.dedent(
             compile=False, seed=0, device="cpu",
             policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
         )
-        model.set_logger(configure(str(folder / "logs"), ["csv"]))
+    model.set_logger(configure(str(folder / "logs"), ["csv"]))
     model.learn(180, callback=ExactCheckpoint(20, folder / "checkpoints"), log_interval=1)
     model.save(folder / "final")
     """
@@ -377,14 +383,121 @@ def test_environments_that_keep_their_state_to_themselves_begin_a_new_episode(tm
     assert steps == [7, 14, 21, 31, 38, 45, 52, 59]
 
 
-def test_a_logger_of_the_users_own_is_gone_on_with_too(tmp_path: Path, tmp_path_factory: Any) -> None:
-    """A script that sets its logger before each learn, and so empties the file."""
+def test_a_log_that_nothing_goes_on_with_is_told(tmp_path: Path) -> None:
     with pytest.raises(Killed):
-        train(CASES["rae, joint"], tmp_path, False, KillAt(40))
+        train(CASES["vectors"], tmp_path, False, KillAt(40))
+    model = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu")
+    with pytest.warns(UserWarning, match=r"wrote the log progress\.csv, which nothing goes on with.*set_logger"):
+        model.learn(60)
+
+
+def script(folder: Path, resume: bool, kill_at: int = 0) -> CuReSAC:
+    """One that pretrains, and learns twice."""
+    env = pixels()()
+    model = CuReSAC.resume(folder / "checkpoints", env) if resume else tiny_model("CnnPolicy", env)
+    model.set_logger(configure(str(folder / "logs"), ["csv"]))
+    kill = KillAt(kill_at)
+    for call, steps in ((model.pretrain, 25), (model.learn, 30), (model.learn, 20)):
+        call(steps, callback=[kill, ExactCheckpoint(8, folder / "checkpoints")], log_interval=1)
+    return model
+
+
+@pytest.mark.parametrize("kill_at", [12, 40, 57, 70])
+def test_a_script_of_several_calls_goes_on_in_the_right_one(kill_at: int, tmp_path: Path) -> None:
+    expected = outcome(script(tmp_path / "whole", False), tmp_path / "whole")
+    with pytest.raises(Killed):
+        script(tmp_path / "killed", False, kill_at)
+    assert differences(expected, outcome(script(tmp_path / "killed", True), tmp_path / "killed")) == []
+
+
+def test_a_finished_training_can_be_resumed_and_continued(tmp_path: Path) -> None:
+    case = CASES["rae, joint"]
+    for name, resumes in (("whole", False), ("resumed", True)):
+        model = train(case, tmp_path / name)
+        if resumes:
+            model = CuReSAC.resume(tmp_path / name / "checkpoints", case.make_env(), device="cpu")
+            model.set_logger(configure(str(tmp_path / name / "logs"), ["csv"]))
+            model.learn(case.steps)
+        model.learn(20, reset_num_timesteps=False, log_interval=1)
+    results = [outcome(model, tmp_path / name) for name in ("whole", "resumed")]
+    assert results[0]["log"] == results[1]["log"]
+
+
+def test_a_learn_that_failed_can_be_called_again(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    expected = reference("rae, joint", tmp_path_factory)
+    with pytest.raises(Killed):
+        train(CASES["rae, joint"], tmp_path, False, KillAt(33))
     model = CuReSAC.resume(tmp_path / "checkpoints", pixels()(), device="cpu")
     model.set_logger(configure(str(tmp_path / "logs"), ["csv"]))
-    model.learn(60, log_interval=1)
-    assert differences(reference("rae, joint", tmp_path_factory)["log"], outcome(model, tmp_path)["log"]) == []
+    with pytest.raises(ValueError, match="EvalBothCallback"):
+        model.learn(60, callback=EvalBothCallback(VectorBox(), 5))
+    model.learn(60, callback=ExactCheckpoint(12, tmp_path / "checkpoints"), log_interval=1)
+    assert differences(expected, outcome(model, tmp_path)) == []
+
+
+def test_the_log_of_a_run_goes_on_in_its_own_folder(tmp_path: Path) -> None:
+    """TensorBoard's runs are numbered, and another one has begun since."""
+    board = tmp_path / "boards"
+
+    def learn(model: CuReSAC, folder: str, *callbacks: BaseCallback) -> None:
+        model.learn(60, callback=[ExactCheckpoint(12, tmp_path / folder), *callbacks], log_interval=1)
+
+    with pytest.raises(Killed):
+        learn(tiny_model("CnnPolicy", pixels()(), tensorboard_log=str(board)), "first", KillAt(33))
+    learn(tiny_model("CnnPolicy", pixels()(), tensorboard_log=str(board)), "second")
+    before = {path: path.stat().st_size for path in (board / "CuReSAC_2").iterdir()}
+    model = CuReSAC.resume(tmp_path / "first", pixels()(), device="cpu")
+    learn(model, "first")
+    model.logger.close()
+    steps = []
+    for path in sorted((board / "CuReSAC_1").iterdir()):
+        events = EventAccumulator(str(path)).Reload()
+        steps.append([event.step for event in events.Scalars("rollout/ep_rew_mean")])
+    assert steps == [[7, 14, 21, 28], [28, 35, 42, 49, 56]]  # of which TensorBoard drops the first 28
+    assert before.items() <= {path: path.stat().st_size for path in (board / "CuReSAC_2").iterdir()}.items()
+
+
+def test_what_a_stranger_put_into_a_checkpoint_reaches_no_file_and_no_code(tmp_path: Path) -> None:
+    """Forged logs and attributes of callbacks: nothing is written elsewhere, nothing but counters is taken."""
+    train(CASES["vectors"], tmp_path)
+    kept = Generations(tmp_path / "checkpoints")
+    folder = kept.folder(kept.numbers()[-1])
+    state = read_state(folder / "state.zip")
+    state["logger"]["files"] = [{"name": str(tmp_path / "stolen.txt"), "keys": []}]
+    state["logger"]["boards"] = ["../../elsewhere"]
+    name = "EveryNTimesteps"
+    forged = {"n_steps": "seven", "last_time_trigger": 3, "_on_step": 5, "on_step": 5, "n_calls": 77, "new": 1}
+    state["callbacks"] = [{"class": name, "changed": forged}]
+    write_state(folder / "state.zip", state)
+    kept.write(lambda draft: [shutil.copy(path, draft.folder) for path in folder.iterdir()] and {"frames": []}, 1)
+    model = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu")
+    callback = EveryNTimesteps(1000, PeriodicCallback(1000))
+    with pytest.warns(UserWarning, match="nothing goes on with"):
+        model.learn(60, callback=callback)
+    assert not (tmp_path / "stolen.txt").exists() and not (tmp_path / "elsewhere").exists()
+    assert (callback.n_calls, callback.last_time_trigger, callback.n_steps) == (77, 3, 1000)
+    assert callable(callback.on_step) and not hasattr(callback, "new")
+
+
+def test_a_callback_that_cannot_be_kept_does_not_stop_training(tmp_path: Path) -> None:
+    class Odd(BaseCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.seen: dict[str, int] = collections.Counter()
+            self.history: list[float] = []
+
+        def _on_step(self) -> bool:
+            self.seen["steps"] += 1
+            self.history += [0.1 * self.num_timesteps] * 5000
+            return True
+
+    odd = Odd()
+    with pytest.warns(UserWarning, match="do not keep seen of Odd"):
+        model = train(CASES["vectors"], tmp_path, False, odd)
+    resumed, again = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu"), Odd()
+    with pytest.warns(UserWarning):
+        resumed.learn(60, callback=again)
+    assert model.num_timesteps == 60 and again.history == odd.history and len(odd.history) == 300_000
 
 
 # ------------------------------------------------------------------------------------------------ refusals

@@ -1,6 +1,7 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
 import fcntl
+import itertools
 import json
 import shutil
 import time
@@ -138,8 +139,15 @@ class _CellRun:
         try:
             return CuReSAC.resume(path, self._make_env(), custom_objects=self.cell.custom_objects())
         except ValueError as error:
-            print(f"{self.folder} begins anew: {error}")
-            shutil.rmtree(path)
+            if not ExactCheckpoint.exists(path):  # killed before there was one
+                return None
+            aside = next(
+                path.with_name(f"unusable-{n}")
+                for n in itertools.count()
+                if not path.with_name(f"unusable-{n}").exists()
+            )
+            print(f"{self.folder} begins anew, its checkpoints are kept in {aside.name}: {error}")
+            path.rename(aside)
             return None
 
 
@@ -151,7 +159,7 @@ class _TimedCheckpoint(ExactCheckpoint):
     """
 
     def __init__(self, path: Path, minutes: float):
-        super().__init__(save_freq=1, path=path, keep=1)
+        super().__init__(save_freq=1, path=path, keep=2)
         self.seconds = 60 * minutes
         self._due_at = np.inf
 
@@ -188,7 +196,7 @@ class _Record(BaseCallback):
         self.attempts: list[Row] = []
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
-        self.losses: list[th.Tensor] = []
+        self.loss_sum, self.n_losses = th.zeros(()), 0
         self._now, self._reported_at = time.monotonic(), -np.inf
         self._is_known = False
 
@@ -207,7 +215,9 @@ class _Record(BaseCallback):
     def _on_step(self) -> bool:
         loss = self.logger.name_to_value.get("train/srl_loss")
         if loss is not None:
-            self.losses.append(th.as_tensor(loss))
+            loss = th.as_tensor(loss)
+            self.loss_sum = self.loss_sum.to(loss.device) + loss
+            self.n_losses += 1
         self._tick()
         self.report(self.model)  # type: ignore[arg-type]
         return True
@@ -261,8 +271,8 @@ class _Record(BaseCallback):
                 row["curious_return_mean"] = float(np.mean(returns))
             if getattr(model.policy, "srl", None) is not None:
                 row[f"{actor}_srl_error"] = float(np.concatenate(errors).mean())
-        row["srl_loss"] = float(np.mean([float(loss) for loss in self.losses])) if self.losses else ""
-        self.losses.clear()
+        row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
+        self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
         row["seconds"] = round(self.seconds, 1)
         self.evaluations.append(row)
