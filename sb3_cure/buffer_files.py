@@ -11,7 +11,7 @@ from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.files import PathOrFile, reading, writing
 from sb3_cure.serialization import Archive, ArchiveError, StoredArray, decode_state, sentences, write_state
 from sb3_cure.settings import whole
-from sb3_cure.weights import expect, expect_keys
+from sb3_cure.weights import expect_keys
 
 if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC
@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 #: Classes whose contents are written without pickle, with what is written of them: counters, and arrays of rows
 _COUNTERS = ("buffer_size", "n_envs", "pos")
+_FRAME_COUNTERS = ("n_valid", "n_frames")
 _ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "marked")
+#: Most frames that a buffer ever stored: enough for any training, and no sum of them overflows
+_MAX_FRAMES = 2**62
 _BUFFERS = (
     FrameStackReplayBuffer,
     SkippingReplayBuffer,
@@ -44,26 +47,74 @@ def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Call
         write_state(target, _buffer_state(buffer))
 
 
+def frame_rows(buffer: FrameStackReplayBuffer) -> dict[str, Any]:
+    """All that a buffer of frames holds, but for the frames.
+
+    :param buffer: The replay buffer
+    :return: Plain values, and views of the arrays as far as they are used, for ``load_frame_rows``
+    """
+    rows = {name: getattr(buffer, name)[: _n_rows(buffer)] for name in buffer._ROW_ARRAYS}
+    counters = {name: int(getattr(buffer, f"_{name}")) for name in _FRAME_COUNTERS}
+    return {**_counters(buffer), **counters, "tails": buffer._tails, "rows": rows}
+
+
+def load_frame_rows(buffer: FrameStackReplayBuffer, rows: dict[str, Any], name: str) -> None:
+    """Give a buffer what ``frame_rows`` took of one of the same size; the frames have to follow.
+
+    :param buffer: The replay buffer, which changes only if all is well
+    :param rows: What a file has of it, its arrays read; nobody vouches for it
+    :param name: What to call the file
+    :raises ArchiveError: if it does not fit the buffer or is damaged, in one sentence
+    """
+    expect_keys(rows, frame_rows(buffer).keys(), name)
+    _check_counters(rows, name)
+    if (rows["buffer_size"], rows["n_envs"]) != (buffer.buffer_size, buffer.n_envs):
+        raise ArchiveError(
+            f"{name} holds a replay buffer of {rows['buffer_size']} rows for {rows['n_envs']} environments, but this "
+            f"model's has {buffer.buffer_size} for {buffer.n_envs}: load it into a model with the same settings."
+        )
+    _check_rows(buffer, rows, name)
+    _check_array(rows["tails"], buffer._tails.shape, buffer._tails.dtype, f"{name} has tails")
+    for path, array in rows["rows"].items():
+        _check_finite(array, f"{name}: {path}")
+    _check_frames(rows, buffer.frame_capacity, name)
+    _set_counters(buffer, rows)
+    buffer._tails[:] = rows["tails"]
+    for path, array in rows["rows"].items():
+        getattr(buffer, path)[: len(array)] = array
+
+
+def _n_rows(buffer: sb3_buffers.ReplayBuffer) -> int:
+    return buffer.buffer_size if buffer.full else buffer.pos
+
+
+def _counters(buffer: sb3_buffers.ReplayBuffer) -> dict[str, Any]:
+    return {"full": bool(buffer.full), **{name: int(getattr(buffer, name)) for name in _COUNTERS}}
+
+
+def _set_counters(buffer: sb3_buffers.ReplayBuffer, state: dict[str, Any]) -> None:
+    """Those that the constructor does not give."""
+    buffer.pos, buffer.full = state["pos"], state["full"]
+    if isinstance(buffer, FrameStackReplayBuffer):
+        buffer._n_valid, buffer._n_frames = state["n_valid"], state["n_frames"]
+
+
 def _buffer_state(buffer: sb3_buffers.ReplayBuffer) -> dict[str, Any]:
     """What of a buffer was written to, as views."""
-    state: dict[str, Any] = {"class": type(buffer).__name__, "full": bool(buffer.full)}
-    state.update({name: int(getattr(buffer, name)) for name in _COUNTERS})
-    n_rows = buffer.buffer_size if buffer.full else buffer.pos
+    kind = {"class": type(buffer).__name__}
     if isinstance(buffer, FrameStackReplayBuffer):
-        state.update(n_valid=buffer._n_valid, n_frames=buffer._n_frames, tails=buffer._tails)
-        state["frames"] = buffer.frames[: buffer._n_frames]
-        state["rows"] = {name: getattr(buffer, name)[:n_rows] for name in buffer._ROW_ARRAYS}
-        return state
-    state["rows"] = {}
+        return {**kind, **frame_rows(buffer), "frames": buffer.frames[: buffer._n_frames]}
+    n_rows = _n_rows(buffer)
+    rows: dict[str, Any] = {}
     for name in _ROWS:
         # The memory-efficient variant keeps the next observation in the next row.
         length = min(n_rows + 1, buffer.buffer_size) if buffer.optimize_memory_usage else n_rows
         array = getattr(buffer, name, None)
         if isinstance(array, dict):
-            state["rows"][name] = {key: part[:length] for key, part in array.items()}
+            rows[name] = {key: part[:length] for key, part in array.items()}
         elif array is not None:
-            state["rows"][name] = array[: length if name == "observations" else n_rows]
-    return state
+            rows[name] = array[: length if name == "observations" else n_rows]
+    return {**kind, **_counters(buffer), "rows": rows}
 
 
 def is_pickled_buffer(path: PathOrFile) -> bool:
@@ -94,14 +145,12 @@ def load_buffer(model: "CuReSAC", path: PathOrFile) -> sb3_buffers.ReplayBuffer:
                 f"{name} holds a {state.get('class')!s:.50}, but this model has a {kind.__name__ if kind else None}: "
                 "load the replay buffer of a model with the same settings."
             )
-        size, n_envs, pos = (whole(state[counter]) for counter in _COUNTERS)
+        n_envs = whole(state["n_envs"])
         if n_envs != model.n_envs:
             raise ArchiveError(
                 f"{name} holds a replay buffer for {n_envs} environments, but this model has {model.n_envs}: load it "
                 "into a model with as many environments."
             )
-        if pos >= size or type(state["full"]) is not bool or not isinstance(state["rows"], dict):
-            raise ArchiveError(f"{name} holds a replay buffer at row {pos} of {size}: it is damaged.")
         make: Callable[[int], sb3_buffers.ReplayBuffer] = partial(
             kind,
             observation_space=model.observation_space,
@@ -112,9 +161,12 @@ def load_buffer(model: "CuReSAC", path: PathOrFile) -> sb3_buffers.ReplayBuffer:
             **model.replay_buffer_kwargs,
         )
         # One row tells the shape of all.
-        _check_rows(make(n_envs), state, name)
-        buffer = make(size * n_envs)
-        buffer.pos, buffer.full = pos, state["full"]
+        example = make(n_envs)
+        expect_keys(state, _buffer_state(example).keys(), name)
+        _check_counters(state, name)
+        _check_rows(example, state, name)
+        buffer = make(state["buffer_size"] * n_envs)
+        _set_counters(buffer, state)
         if isinstance(buffer, FrameStackReplayBuffer):
             _read_frames(buffer, state, name)
         for path, stored in _flat(state["rows"]).items():
@@ -122,7 +174,7 @@ def load_buffer(model: "CuReSAC", path: PathOrFile) -> sb3_buffers.ReplayBuffer:
             stored.read(out=array[: stored.shape[0]])
             _check_finite(array[: stored.shape[0]], f"{name}: {path}")
         if isinstance(buffer, FrameStackReplayBuffer):
-            _check_frames(buffer, name)
+            _check_frames(frame_rows(buffer), buffer.frame_capacity, name)
         return buffer
 
 
@@ -136,53 +188,70 @@ def _flat(arrays: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _check_rows(example: sb3_buffers.ReplayBuffer, state: dict[str, Any], name: str) -> None:
-    """Shapes and types of all that is stored, before there is a buffer for it.
+def _check_counters(state: dict[str, Any], name: str) -> None:
+    """Types and ranges of all that is no array; that its keys are those of a buffer is known."""
+    size, _, pos = (whole(state[counter]) for counter in _COUNTERS)
+    if pos >= size or type(state["full"]) is not bool or not isinstance(state["rows"], dict):
+        raise ArchiveError(f"{name} holds a replay buffer at row {pos} of {size}: it is damaged.")
+    n_valid, n_frames = (whole(state.get(counter, 0)) for counter in _FRAME_COUNTERS)
+    if n_valid > (size if state["full"] else pos) or n_frames > _MAX_FRAMES:
+        raise ArchiveError(f"{name} holds a replay buffer with {n_valid} rows of {n_frames} frames: it is damaged.")
 
-    :param example: A buffer of one row
-    :param state: What is stored, arrays not read yet
+
+def _check_rows(like: sb3_buffers.ReplayBuffer, state: dict[str, Any], name: str) -> None:
+    """Shapes and types of all rows, before they take the place of others.
+
+    :param like: A buffer with the same rows, no matter how many
+    :param state: What a file holds, its counters checked, its arrays read or not
     :param name: What to call the file
     """
-    expected, stored = _flat(_buffer_state(example)["rows"]), _flat(state["rows"])
+    expected, stored = _flat(_buffer_state(like)["rows"]), _flat(state["rows"])
     expect_keys(stored, expected.keys(), name)
     size, n_rows = state["buffer_size"], state["buffer_size"] if state["full"] else state["pos"]
     for path, array in stored.items():
-        shares = example.optimize_memory_usage and path.startswith("observations")
+        shares = like.optimize_memory_usage and path.startswith("observations")
         shape = (min(n_rows + 1, size) if shares else n_rows, *expected[path].shape[1:])
-        if not isinstance(array, StoredArray) or (array.shape, array.dtype) != (shape, expected[path].dtype):
-            kind = f"{array.dtype} of shape {array.shape}" if isinstance(array, StoredArray) else type(array).__name__
-            raise ArchiveError(
-                f"{name} has {path:.50} as {kind:.100}, but this model's replay buffer needs {expected[path].dtype} of "
-                f"shape {shape}: load the replay buffer of a model with the same settings and environment."
-            )
+        _check_array(array, shape, expected[path].dtype, f"{name} has {path:.50}")
+
+
+def _check_array(array: Any, shape: tuple[int, ...], dtype: np.dtype, what: str) -> None:
+    is_array = isinstance(array, np.ndarray | StoredArray)
+    if not is_array or (array.shape, array.dtype) != (shape, dtype):
+        kind = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
+        raise ArchiveError(
+            f"{what} as {kind:.100}, but this model's replay buffer needs {dtype} of shape {shape}: load the replay "
+            "buffer of a model with the same settings and environment."
+        )
 
 
 def _read_frames(buffer: FrameStackReplayBuffer, state: dict[str, Any], name: str) -> None:
-    n_frames = min(whole(state["n_frames"]), buffer.frame_capacity)
-    frames, tails = expect(StoredArray, state["frames"]), expect(StoredArray, state["tails"])
-    shapes = (n_frames, *buffer.frame_shape), buffer._tails.shape
-    if (frames.shape, tails.shape, frames.dtype, tails.dtype) != (*shapes, np.dtype(np.uint8), buffer._tails.dtype):
-        raise ArchiveError(
-            f"{name} has frames of shape {frames.shape!s:.100}, but this model's replay buffer needs {shapes[0]}: load "
-            "the replay buffer of a model with the same settings and environment."
-        )
-    buffer._n_frames, buffer._n_valid = state["n_frames"], whole(state["n_valid"])
+    n_frames = min(buffer._n_frames, buffer.frame_capacity)
+    frames, tails = state["frames"], state["tails"]
+    _check_array(frames, (n_frames, *buffer.frame_shape), np.dtype(np.uint8), f"{name} has frames")
+    _check_array(tails, buffer._tails.shape, buffer._tails.dtype, f"{name} has tails")
     if n_frames:
         buffer.reserve_frames()
         frames.read(out=buffer.frames[:n_frames])
     tails.read(out=buffer._tails)
 
 
-def _check_frames(buffer: FrameStackReplayBuffer, name: str) -> None:
-    """Whether what refers to frames refers to some that are there."""
-    n_rows = buffer.buffer_size if buffer.full else buffer.pos
-    valid = np.arange(buffer.pos - min(buffer._n_valid, n_rows), buffer.pos) % buffer.buffer_size
+def _check_frames(state: dict[str, Any], capacity: int, name: str) -> None:
+    """Whether what refers to frames refers to some that are there.
+
+    :param state: As of ``frame_rows``, all but this checked
+    :param capacity: Number of frames that there is room for
+    :param name: What to call the file
+    """
+    size, pos, n_valid, n_frames = (state[counter] for counter in ("buffer_size", "pos", *_FRAME_COUNTERS))
+    slots, oldest, marked = (state["rows"][row] for row in ("frame_slots", "oldest_frame", "marked"))
+    valid = np.arange(pos - n_valid, pos) % size
+    # Of marked transitions no frames are kept, and their slots are whatever was there.
     for array, low, high in (
-        (buffer.frame_slots[:n_rows], 0, min(buffer._n_frames, buffer.frame_capacity)),
-        (buffer.oldest_frame[:n_rows], 0, buffer._n_frames),
-        (buffer.oldest_frame[valid], buffer._n_frames - buffer.frame_capacity, buffer._n_frames),
-        (buffer._tails, -buffer.frame_capacity, buffer._n_frames),
-        (np.array([buffer._n_valid]), 0, n_rows + 1),
+        (slots, 0, capacity),
+        (slots[~marked], 0, n_frames),
+        (oldest - marked.all(axis=1), -1, n_frames),
+        (oldest[valid], n_frames - capacity, n_frames + 1),
+        (state["tails"], -capacity, n_frames),
     ):
         if array.size and not (array.min() >= low and array.max() < high):
             raise ArchiveError(f"{name} has rows whose frames are not in it: it is damaged.")
