@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
@@ -25,6 +25,8 @@ from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head
 from sb3_cure.values import check_folder, is_integer, is_number
 
 ENGINES = ("local", "ray")
+#: From what is under way or left, what can begin besides
+Ready: TypeAlias = Callable[[Iterable[Unit]], Sequence[Unit]]
 
 
 def run_grid(
@@ -58,7 +60,8 @@ def run_grid(
     results = Path(results).resolve()
     _check_run(engine, checkpoint_minutes, cpus_per_cell, gpus_per_cell, retries)
     # Finished cells too, as they are to be compared with those that are run now.
-    for unit in (*grid.complete, *common_heads(grid, results, grid.complete)):
+    every: list[Unit] = [*grid.complete, *common_heads(grid, results, grid.complete)]
+    for unit in every:
         check_settings(results / unit.folder, unit.config())
     left = [cell for cell in grid.cells if not cell.is_done(results)]
     check_arms(left)
@@ -83,11 +86,11 @@ def run_grid(
     return failed
 
 
-def _heads_when_ready(grid: Grid, results: Path) -> Callable[[Iterable[Unit]], list[Unit]]:
-    """Tells which common heads can begin, by what has not ended: those of a task when none of its cells is left."""
+def _heads_when_ready(grid: Grid, results: Path) -> Ready:
+    """Common heads: those of a task, once, when none of its cells is left."""
     waiting = {cell.task for cell in grid.cells}
 
-    def ready(left: Iterable[Unit]) -> list[Unit]:
+    def ready(left: Iterable[Unit]) -> Sequence[Unit]:
         tasks = waiting - {unit.task for unit in left}
         waiting.difference_update(tasks)
         return [head for head in common_heads(grid, results) if head.task in tasks and not head.is_done(results)]
@@ -95,7 +98,7 @@ def _heads_when_ready(grid: Grid, results: Path) -> Callable[[Iterable[Unit]], l
     return ready
 
 
-def _run_here(cells: Sequence[Cell], ready: Callable, settings: tuple[Path, float, bool]) -> list[Unit]:
+def _run_here(cells: Sequence[Cell], ready: Ready, settings: tuple[Path, float, bool]) -> list[Unit]:
     left, failed = [*cells, *ready(cells)], []
     while left:
         unit = left.pop(0)
@@ -140,7 +143,7 @@ def _keep_error(unit: Unit, results: Path, text: str) -> None:
 
 def _run_with_ray(
     cells: Sequence[Cell],
-    ready: Callable,
+    ready: Ready,
     settings: tuple[Path, float, bool],
     address: str | None,
     resources: dict[str, Any],
@@ -290,15 +293,16 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
     :param results: Folder of all results
     :return: What is done, how fast it goes, when it will be finished
     """
-    table = Table("task", "method", "seed", "state", "environment steps, or updates", "per s", "left", "best return")
+    table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
     finished, left, speed = set(), 0.0, 0.0
     for unit in units:
         state, progress = read_progress(unit, results)
         if state == "done":
             finished.add(unit.folder)
         if isinstance(unit, CommonHead):
-            total, done = unit.updates, progress.get("updates", 0)
+            total, done, what = unit.updates, progress.get("updates", 0), " updates"
         else:
+            what = ""
             total = unit.budget + (unit.pretrain.budget if unit.pretrain else 0)
             done = progress.get("environment_steps", 0)
             if unit.pretrain and progress.get("phase") == "train":
@@ -306,12 +310,11 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
         rate = done / progress["seconds"] if progress.get("seconds") else 0.0
         if state != "done" and isinstance(unit, Cell):
             left += total - done
-        if state == "running" and isinstance(unit, Cell):
-            speed += rate
+            speed += rate if state == "running" else 0.0
         if state in ("running", "interrupted", "failed"):
             best = progress.get("best_return")
             table.add_row(
-                *(unit.folder.parts[1], unit.method, str(unit.seed), state, f"{done:,} of {total:,}"),
+                *(unit.folder.parts[1], unit.method, str(unit.seed), state, f"{done:,} of {total:,}{what}"),
                 *(
                     f"{rate:.1f}",
                     _duration((total - done) / rate) if rate else "",
@@ -411,7 +414,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
         if options.dry_run:
-            for unit in (*grid.cells, *common_heads(grid, options.out, grid.cells)):
+            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
+            for unit in units:
                 print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
             return 0
         of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
