@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,12 +18,14 @@ import psutil
 import pytest
 import yaml
 from envs_for_tests import PixelBox, differences, state_of
+from stable_baselines3 import SAC
 
 from sb3_cure import CuReSAC, files, generations
-from sb3_cure.experiments import cells, run, visitation, yardsticks
+from sb3_cure.experiments import cells, heads, run, yardsticks
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.files import read_rows
+from sb3_cure.experiments.files import read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
+from sb3_cure.experiments.visitation import COLUMNS
 from sb3_cure.generations import Generations
 
 GRIDS = Path(__file__).parent.parent / "zoo_configs" / "experiments"
@@ -352,6 +355,7 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
         with pytest.raises(GridError, match="is being run by another process") as refusal:
             run_cell(cell, tmp_path, pictures=False)
         refusals.append(refusal)
+        assert run.read_progress(cell, tmp_path)[0] == "running"
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(CuReSAC, "learn", learn_while_another_tries)
@@ -387,7 +391,7 @@ def test_a_cell_goes_on_after_any_exception(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(RuntimeError, match="the power went"):
         run_cell(cell, tmp_path, checkpoint_minutes=0, pictures=False)
     folder = tmp_path / cell.folder
-    assert not (folder / "DONE").exists()
+    assert not (folder / "DONE").exists() and run.read_progress(cell, tmp_path)[0] == "interrupted"
     reached = updates[-1]
     updates.clear()
     run_cell(cell, tmp_path, checkpoint_minutes=0, pictures=False)
@@ -426,6 +430,21 @@ def test_a_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out.count(": done") == 2
 
 
+def test_only_of_other_machines_the_clock_tells_what_runs(tmp_path: Path) -> None:
+    """Their locks may be unknown here; of this machine a lock that nobody holds says that nothing runs."""
+    (cell,) = load_grid(write_grid(tmp_path)).cells
+    folder = tmp_path / cell.folder
+    folder.mkdir(parents=True)
+    assert run.read_progress(cell, tmp_path)[0] == "waiting"
+    cells.write_progress(folder, environment_steps=8, seconds=2)
+    here = json.loads((folder / "progress.json").read_text())
+    states = []
+    for change in ({}, {"machine": "another"}, {"machine": "another", "time": here["time"] - 3600}):
+        (folder / "progress.json").write_text(json.dumps({**here, **change}))
+        states.append(run.read_progress(cell, tmp_path)[0])
+    assert states == ["interrupted", "running", "interrupted"]
+
+
 # ------------------------------------------------------------------ visitation
 
 
@@ -447,8 +466,8 @@ def visitation_grid(folder: Path) -> Grid:
 
 def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On real pixels: an untrained yardstick is the image's own energy, the mean image beats it, states are true."""
-    monkeypatch.setattr(visitation, "COMMON_UPDATES", 150)
-    monkeypatch.setattr(visitation, "COMMON_SHARE", 100)
+    monkeypatch.setattr(heads, "COMMON_UPDATES", 150)
+    monkeypatch.setattr(heads, "COMMON_SHARE", 100)
     grid = visitation_grid(tmp_path)
     assert run.run_grid(grid, tmp_path / "out", pictures=False) == []
     for cell in grid.cells:
@@ -487,6 +506,91 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
     assert returns[0] == returns[1] and returns[2] == returns[3] and returns[0].isdisjoint(returns[2])
 
 
+@pytest.fixture
+def visits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A grid of three seeds on the tiny task, with common heads that are soon fitted."""
+    monkeypatch.setattr(heads, "COMMON_UPDATES", 3)
+    monkeypatch.setattr(heads, "COMMON_SHARE", 10)
+    return write_grid(tmp_path, kind="visitation", budget=40, seeds=3, evaluation=dict(every=40, episodes=1))
+
+
+def common_rows(out: Path) -> dict[str, list[Any]]:
+    """By the cell's folder."""
+    tables = {path.parent.name: read_rows(path) for path in out.rglob("visitation.csv")}
+    return {name: [row for row in rows if row["head"] == "common"] for name, rows in tables.items()}
+
+
+def test_common_heads_are_made_once_and_again_of_other_cells(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that was stopped is all that the next call makes; more seeds, and cells run again, ask for others."""
+    out = visits.parent / "out"
+    fitted: list[int] = []
+    rolled_out: list[tuple[int, str]] = []
+    fit, roll_out = heads.fit_head, heads.roll_out
+
+    def fit_but_one(model: CuReSAC, *arguments: Any) -> Iterator[int]:
+        fitted.append(model.seed - 1000)
+        if fitted == [0, 1]:
+            raise RuntimeError("the power went")
+        yield from fit(model, *arguments)
+
+    def count(model: CuReSAC, cell: Any, env: Any, actor: str) -> Any:
+        rolled_out.append((cell.seed, actor))
+        return roll_out(model, cell, env, actor)
+
+    monkeypatch.setattr(heads, "fit_head", fit_but_one)
+    monkeypatch.setattr(heads, "roll_out", count)
+    grid = load_grid(visits)
+    (stopped,) = run.run_grid(grid, out, pictures=False)
+    assert stopped.folder == Path("tiny", "PixelBox", "common_heads", "for_seed1")
+    assert "the power went" in (out / stopped.folder / "error.txt").read_text()
+    assert run.read_progress(stopped, out)[0] == "failed"
+    rows = common_rows(out)
+    assert [name for name in sorted(rows) if rows[name]] == ["seed0", "seed2"]
+    assert run.run_grid(grid, out, pictures=False) == []
+    assert fitted == [0, 1, 2, 1]
+    # Once for the mixes, which all heads share, and once to be judged.
+    every = [(seed, actor) for seed in range(3) for actor in ("task", "curious", "random")]
+    assert sorted(rolled_out) == sorted(2 * every)
+    assert not list(out.rglob("mix*"))
+    again = common_rows(out)
+    assert again["seed0"] == rows["seed0"] and again["seed2"] == rows["seed2"] and again["seed1"]
+    assert run.run_grid(grid, out, pictures=False) == [] and len(fitted) == 4
+    # Made anew of the same cells they are the same; after another training of a seed they are not.
+    shutil.rmtree(out / "tiny" / "PixelBox" / "common_heads")
+    assert run.run_grid(load_grid(visits, seeds=[0]), out, pictures=False) == []
+    assert common_rows(out) == again and fitted[4:] == [0, 1, 2]
+    shutil.rmtree(out / grid.cells[1].folder)
+    monkeypatch.setattr(cells, "_now", lambda: "later")
+    assert run.run_grid(grid, out, pictures=False) == []
+    assert common_rows(out)["seed1"] and fitted[7:] == [0, 1, 2]
+    assert run.run_grid(load_grid(visits, seeds=4), out, pictures=False) == []
+    assert fitted[10:] == [0, 1, 2, 3]
+    assert [len(rows) for rows in common_rows(out).values()] == [3] * 4
+
+
+def test_common_heads_of_other_settings_are_refused(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As cells are: one that was fitted by fewer updates is not taken for another."""
+    assert run.run_grid(load_grid(visits), visits.parent / "out", pictures=False) == []
+    monkeypatch.setattr(heads, "COMMON_UPDATES", 4)
+    with pytest.raises(GridError, match="for_seed0 was run with other settings: updates is 3 there and 4 now"):
+        run.run_grid(load_grid(visits), visits.parent / "out", pictures=False)
+
+
+def test_common_heads_of_pickled_models_tell_what_to_do(visits: Path, capsys: pytest.CaptureFixture) -> None:
+    """Finished cells of older versions: the sentence names the file, and doing what it says is enough."""
+    out = visits.parent / "out"
+    options = [str(visits), "--out", str(out), "--no-pictures"]
+    path = out / load_grid(visits).cells[0].folder / "model.zip"
+    assert run.main([*options, "--seeds", "1"]) == 0
+    SAC.save(CuReSAC.load(path), path)
+    assert run.main(options) == 1
+    advice = f"CuReSAC.load({str(path)!r}, trusted=True).save({str(path)!r})"
+    assert f"{path} was written by an older version" in (told := capsys.readouterr().out) and advice in told
+    eval(advice)
+    assert run.main(options) == 0
+    assert all(common_rows(out).values())
+
+
 def test_yardsticks_follow_an_autoencoder_from_its_first_update() -> None:
     """Untrained it errs like a prediction of zero, as the paper reports; then it learns. Rows make the table."""
     rows = yardsticks.measure_task("dmc_pixels/cartpole-swingup-v0", (0,), (0, 1, 6), 40, frame_stack=1)
@@ -504,17 +608,12 @@ def test_yardsticks_follow_an_autoencoder_from_its_first_update() -> None:
 # ------------------------------------------------------------------- processes
 
 
+#: The command, with common heads that are soon fitted
+FEW_UPDATES = "from sb3_cure.experiments import heads, run; heads.COMMON_UPDATES = 20; raise SystemExit(run.main())"
+
+
 def launch(path: Path, out: Path, *options: str) -> subprocess.Popen:
-    command = [
-        sys.executable,
-        "-m",
-        "sb3_cure.experiments.run",
-        str(path),
-        "--out",
-        str(out),
-        "--no-pictures",
-        *options,
-    ]
+    command = [sys.executable, "-c", FEW_UPDATES, str(path), "--out", str(out), "--no-pictures", *options]
     return subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, text=True)
 
 
@@ -552,10 +651,13 @@ def test_a_killed_grid_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
 
 
 def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
-    """Two workers, one killed half-way: every cell is complete, no row is doubled, and the killed cell resumed."""
+    """Two workers, one killed half-way: every cell is complete, no row is doubled, and the killed cell resumed.
+
+    The common heads that follow are those that one process makes of the same cells.
+    """
     pytest.importorskip("ray")
     path = write_grid(
-        tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0"], budget=2400, seeds=3,
+        tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0"], kind="visitation", budget=2400, seeds=3,
         evaluation=dict(every=400, episodes=1),
     )  # fmt: skip
     out = tmp_path / "out"
@@ -580,6 +682,13 @@ def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
             keys = [(row["environment_steps"], row["actor"], row["episode"]) for row in csv.DictReader(file)]
         assert len(keys) == len(set(keys)) == 7 * 2
     assert json.loads((victim / "run.json").read_text())["attempts"] == 2
+    by_ray = common_rows(out)
+    assert all(by_ray.values())
+    shutil.rmtree(out / "tiny" / "cartpole-swingup" / "common_heads")
+    for cell in folders:
+        write_csv(cell / "visitation.csv", COLUMNS, [])
+    assert launch(path, out).wait(timeout=300) == 0
+    assert common_rows(out) == by_ray
 
 
 def _holds(process: psutil.Process, path: Path) -> bool:

@@ -3,6 +3,8 @@
 import fcntl
 import itertools
 import json
+import math
+import platform
 import shutil
 import time
 from collections.abc import Iterator
@@ -21,17 +23,16 @@ from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import Cell, GridError
+from sb3_cure.experiments.grid import DONE, Cell, GridError
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
 
 #: Evaluations start from the same states in all cells
 EVAL_SEED = 10_000
-#: The file that tells that a cell is finished
-DONE = "DONE"
 #: The file that tells why a cell failed, until it is begun again
 ERROR = "error.txt"
-_PROGRESS_SECONDS = 2.0
+#: Between two reports of progress
+PROGRESS_SECONDS = 2.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
     "task_srl_error", "curious_return_mean", "curious_srl_error",
@@ -55,9 +56,9 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     :raises CellIsRunning: if another process is running it
     """
     folder = Path(results) / cell.folder
-    check_settings(cell, results)
+    check_settings(folder, cell.config())
     folder.mkdir(parents=True, exist_ok=True)
-    with _alone_in(folder):
+    with alone_in(folder):
         if not (folder / DONE).exists():
             (folder / ERROR).unlink(missing_ok=True)
             _keep_config(cell, folder)
@@ -66,20 +67,20 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     return folder
 
 
-def check_settings(cell: Cell, results: str | Path) -> None:
+def check_settings(folder: Path, config: dict[str, Any]) -> None:
     """
-    :param cell: A cell that is to be run, or that has been run
-    :param results: Folder of all results
-    :raises GridError: if its folder holds results of other settings
+    :param folder: Of what is to be run, or has been run
+    :param config: Its settings
+    :raises GridError: if the folder holds results of other settings
     """
-    path = Path(results) / cell.folder / "config.json"
+    path = folder / "config.json"
     if not path.exists():
         return
-    begun, now = json.loads(path.read_text()), _plain(cell.config())
+    begun, now = json.loads(path.read_text()), _plain(config)
     for key in now:
         if begun.get(key) != now[key]:
             raise GridError(
-                f"{path.parent} was run with other settings: {key} is {begun.get(key)!r} there and {now[key]!r} now. "
+                f"{folder} was run with other settings: {key} is {begun.get(key)!r} there and {now[key]!r} now. "
                 "Choose another --out, or remove that folder."
             )
 
@@ -285,21 +286,18 @@ class _Record(BaseCallback):
     # ---------------------------------------------------------------- progress
 
     def report(self, model: CuReSAC, force: bool = False) -> None:
-        """Tell a display, which may be another process, how far this is."""
-        if not force and time.monotonic() - self._reported_at < _PROGRESS_SECONDS:
+        """Write ``progress.json``, unless that was done a moment ago."""
+        if not force and time.monotonic() - self._reported_at < PROGRESS_SECONDS:
             return
         self._reported_at = time.monotonic()
         returns = [row["return_mean"] for row in self.evaluations if row["return_mean"] != ""]
-        write_json(
-            self.folder / "progress.json",
-            {
-                "phase": "train" if self.evaluates else "pretrain",
-                "agent_steps": model.num_timesteps,
-                "environment_steps": model.num_timesteps * self.action_repeat,
-                "seconds": self.seconds,
-                "best_return": max(returns, default=None),
-                "time": time.time(),
-            },
+        write_progress(
+            self.folder,
+            phase="train" if self.evaluates else "pretrain",
+            agent_steps=model.num_timesteps,
+            environment_steps=model.num_timesteps * self.action_repeat,
+            seconds=self.seconds,
+            best_return=max(returns, default=None),
         )
 
     def conditions(self, model: CuReSAC) -> dict[str, Any]:
@@ -334,18 +332,54 @@ class CellIsRunning(GridError):
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """The lock goes with the process, however that ends."""
+def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Hold a folder's lock, which goes with the process, however that ends.
+
+    :param folder: A folder
+    :param wait: Whether to wait for another process that holds it
+    :raises CellIsRunning: if another process holds it
+    """
     with (folder / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CellIsRunning(
-                f"{folder} is being run by another process: wait for it, or choose another --out."
-            ) from None
-        except OSError as error:
-            print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this cell.")
+        # Not at once: `is_held` holds it for a moment, too.
+        deadline = math.inf if wait else time.monotonic() + 1
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise CellIsRunning(
+                        f"{folder} is being run by another process: wait for it, or choose another --out."
+                    ) from None
+                time.sleep(0.1)
+            except OSError as error:
+                print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this.")
+                break
         yield
+
+
+def is_held(folder: Path) -> bool:
+    """
+    :param folder: Of a cell, whether it exists or not
+    :return: Whether a process runs it; of other machines this may not be known
+    """
+    try:
+        with (folder / ".lock").open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def write_progress(folder: Path, **progress: Any) -> None:
+    """Tell a display, which may be another process or machine, how far this is.
+
+    :param folder: Of the cell
+    :param progress: What to tell, besides when and where
+    """
+    write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
 
 
 def _keep_config(cell: Cell, folder: Path) -> None:

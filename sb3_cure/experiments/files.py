@@ -58,13 +58,22 @@ def _commit() -> str | None:
         return None
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     """
     :param path: A CSV file
+    :param needed: Columns that it must have
     :return: Its rows; numbers are numbers, missing values ``""``
+    :raises ValueError: saying what of the file's form is wrong
     """
-    with path.open(newline="") as file:
-        return [{key: _number(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        rows = list(reader)
+    for name in needed:
+        if name not in (reader.fieldnames or ()):
+            raise ValueError(f"has no column {name!r}")
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError("has a row that is shorter or longer than its header")
+    return [{key: _number(value) for key, value in row.items()} for row in rows]
 
 
 def _number(text: str) -> Any:

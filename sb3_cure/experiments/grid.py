@@ -17,6 +17,8 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.values import arguments_of, is_integer
 
+#: The file that tells that a cell is finished
+DONE = "DONE"
 KINDS = ("curves", "visitation", "pretraining")
 COLLECTORS = ("curious", "random")
 _GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "methods", "baseline"}
@@ -89,6 +91,13 @@ class Cell:
         """What ``CuReSAC.load`` needs besides the archive: a head that is named like a module's."""
         arguments = self.build_arguments()
         return {"srl": arguments["srl"]} if "srl" in arguments else {}
+
+    def is_done(self, results: Path) -> bool:
+        """
+        :param results: Folder of all results
+        :return: Whether it has been run
+        """
+        return (results / self.folder / DONE).exists()
 
     def config(self) -> dict[str, Any]:
         """What its ``config.json`` holds."""

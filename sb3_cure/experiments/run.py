@@ -2,28 +2,31 @@
 
 import argparse
 import json
+import platform
 import re
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from sb3_cure.allocator import tune_allocator
-from sb3_cure.experiments.cells import DONE, ERROR, CellIsRunning, check_settings, run_cell
+from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
 from sb3_cure.experiments.files import write_json, write_text
 from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid
-from sb3_cure.experiments.visitation import measure_common_heads
+from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head
 from sb3_cure.values import check_folder, is_integer, is_number
 
 ENGINES = ("local", "ray")
+#: From what is under way or left, what can begin besides
+Ready: TypeAlias = Callable[[Iterable[Unit]], Sequence[Unit]]
 
 
 def run_grid(
@@ -37,27 +40,30 @@ def run_grid(
     cpus_per_cell: float = 1,
     gpus_per_cell: float = 0,
     retries: int = 3,
-) -> list[Cell]:
+) -> list[Unit]:
     """Run the cells that are not done; started again after any interruption, it goes on.
+
+    Of a grid of kind ``"visitation"`` the common heads of a task follow when none of its cells is left.
 
     :param grid: The grid
     :param results: Folder of all results; with several machines one that they share
-    :param engine: ``"local"``: one cell after the other in this process; ``"ray"``: side by side in worker processes
+    :param engine: ``"local"``: one after the other in this process; ``"ray"``: side by side in worker processes
     :param checkpoint_minutes: At most so many minutes of a cell are lost by an interruption
     :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
-    :param cpus_per_cell: Ray: cores per cell, also its threads
+    :param cpus_per_cell: Ray: cores per cell or common head, also its threads
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card
     :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
-    :return: The cells that failed; each has its traceback in ``error.txt``
+    :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, for what cannot be run
     """
     results = Path(results).resolve()
     _check_run(engine, checkpoint_minutes, cpus_per_cell, gpus_per_cell, retries)
     # Finished cells too, as they are to be compared with those that are run now.
-    for cell in grid.complete:
-        check_settings(cell, results)
-    left = [cell for cell in grid.cells if not (results / cell.folder / DONE).exists()]
+    every: list[Unit] = [*grid.complete, *common_heads(grid, results, grid.complete)]
+    for unit in every:
+        check_settings(results / unit.folder, unit.config())
+    left = [cell for cell in grid.cells if not cell.is_done(results)]
     check_arms(left)
     try:
         check_folder("--out", results)
@@ -66,15 +72,39 @@ def run_grid(
         raise GridError(f"--out is {results}, which cannot be written to ({error.strerror}): give another.") from error
     except ValueError as error:
         raise error if isinstance(error, GridError) else GridError(str(error)) from error
-    with _live_progress(grid.cells, results):
+    ready, settings = _heads_when_ready(grid, results), (results, checkpoint_minutes, pictures)
+    with _live_progress(lambda: [*grid.cells, *common_heads(grid, results, left)], results):
         if engine == "ray":
             resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-            failed = _run_with_ray(left, (results, checkpoint_minutes, pictures), address, resources)
+            failed = _run_with_ray(left, ready, settings, address, resources)
         else:
-            failed = [cell for cell in left if not _run_and_tell(cell, results, checkpoint_minutes, pictures)]
+            failed = _run_here(left, ready, settings)
     if grid.kind == "visitation":
-        for sentence in measure_common_heads(grid, results):
-            print(f"No common heads for {sentence}.")
+        with_heads = {head.task for head in common_heads(grid, results)}
+        for task in dict.fromkeys(cell.task for cell in grid.cells if cell.task not in with_heads):
+            print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
+    return failed
+
+
+def _heads_when_ready(grid: Grid, results: Path) -> Ready:
+    """Common heads: those of a task, once, when none of its cells is left."""
+    waiting = {cell.task for cell in grid.cells}
+
+    def ready(left: Iterable[Unit]) -> Sequence[Unit]:
+        tasks = waiting - {unit.task for unit in left}
+        waiting.difference_update(tasks)
+        return [head for head in common_heads(grid, results) if head.task in tasks and not head.is_done(results)]
+
+    return ready
+
+
+def _run_here(cells: Sequence[Cell], ready: Ready, settings: tuple[Path, float, bool]) -> list[Unit]:
+    left, failed = [*cells, *ready(cells)], []
+    while left:
+        unit = left.pop(0)
+        if not _run_and_tell(unit, *settings):
+            failed.append(unit)
+        left += ready(left)
     return failed
 
 
@@ -89,28 +119,35 @@ def _check_run(engine: str, checkpoint_minutes: float, cpus: float, gpus: float,
         raise GridError(f"--retries is {retries!r}, but it must be at least 0, or -1 for no limit: change it.")
 
 
-def _run_and_tell(cell: Cell, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
-    """Whether the cell could be run; a failure must not stop the others."""
+def _run_and_tell(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
+    """Whether it could be run; a failure must not stop the others."""
     tune_allocator()
     try:
-        run_cell(cell, results, checkpoint_minutes, pictures)
+        if isinstance(unit, CommonHead):
+            run_head(unit, results)
+        else:
+            run_cell(unit, results, checkpoint_minutes, pictures)
     except CellIsRunning as elsewhere:
         print(elsewhere)
     except Exception:
-        _keep_error(cell, results, traceback.format_exc())
+        _keep_error(unit, results, traceback.format_exc())
         return False
     return True
 
 
-def _keep_error(cell: Cell, results: Path, text: str) -> None:
-    path = results / cell.folder / ERROR
+def _keep_error(unit: Unit, results: Path, text: str) -> None:
+    path = results / unit.folder / ERROR
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, text)
 
 
 def _run_with_ray(
-    cells: Sequence[Cell], settings: tuple[Path, float, bool], address: str | None, resources: dict[str, Any]
-) -> list[Cell]:
+    cells: Sequence[Cell],
+    ready: Ready,
+    settings: tuple[Path, float, bool],
+    address: str | None,
+    resources: dict[str, Any],
+) -> list[Unit]:
     try:
         import ray
     except ImportError:
@@ -125,25 +162,26 @@ def _run_with_ray(
         ) from None
     try:
         _check_resources(ray.nodes(), resources)
-        # A process per cell: what one leaves behind does not burden the next.
+        # A process for each: what one leaves behind does not burden the next.
         run = ray.remote(max_calls=1, **resources)(_run_and_tell)
-        pending = {run.remote(cell, *settings): cell for cell in cells}
+        pending: dict[Any, Unit] = {run.remote(unit, *settings): unit for unit in (*cells, *ready(cells))}
         failed = []
         while pending:
             for reference in ray.wait(list(pending), timeout=5)[0]:
-                cell = pending.pop(reference)
+                unit = pending.pop(reference)
                 try:
                     succeeded = ray.get(reference)
                 except ray.exceptions.RayError as error:
                     # The worker has died more often than `retries`: nobody else could have told.
-                    _keep_error(cell, settings[0], f"{error}\n")
+                    _keep_error(unit, settings[0], f"{error}\n")
                     succeeded = False
-                if succeeded and not (settings[0] / cell.folder).exists():
+                if succeeded and not (settings[0] / unit.folder).exists():
                     sentence = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
-                    _keep_error(cell, settings[0], f"{sentence}\n")
+                    _keep_error(unit, settings[0], f"{sentence}\n")
                     succeeded = False
                 if not succeeded:
-                    failed.append(cell)
+                    failed.append(unit)
+                pending.update({run.remote(head, *settings): head for head in ready(pending.values())})
         return failed
     finally:
         ray.shutdown()
@@ -187,21 +225,21 @@ def _keep_grid(grid: Grid, folder: Path) -> None:
 
 
 @contextmanager
-def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
-    """Show how far all cells are, as their files tell, whichever process or machine runs them."""
+def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Iterator[None]:
+    """Show how far all units are, as their files tell, whichever process or machine runs them."""
     console = Console()
     watches = console.is_terminal or console.is_jupyter
     stopped = threading.Event()
 
     def refresh(show: Callable[[Table], object]) -> None:
-        told = _finished(cells, results)
+        told = _finished(list_units(), results)
         while not stopped.wait(1.0):
             if watches:
-                show(progress_table(cells, results))
+                show(progress_table(list_units(), results))
             else:  # in the log of a job
-                told = _tell_finished(cells, results, told)
+                told = _tell_finished(list_units(), results, told)
 
-    with _shown(console, progress_table(cells, results)) as show:
+    with _shown(console, progress_table(list_units(), results)) as show:
         thread = threading.Thread(target=refresh, args=(show,), daemon=True)
         thread.start()
         try:
@@ -209,22 +247,32 @@ def _live_progress(cells: Sequence[Cell], results: Path) -> Iterator[None]:
         finally:
             stopped.set()
             thread.join()
-            show(progress_table(cells, results))
+            show(progress_table(list_units(), results))
 
 
-def _finished(cells: Sequence[Cell], results: Path) -> dict[Path, str]:
-    states = {cell.folder: read_progress(cell, results)[0] for cell in cells}
+def _finished(units: Sequence[Unit], results: Path) -> dict[Path, str]:
+    states = {unit.folder: read_progress(unit, results)[0] for unit in units}
     return {folder: state for folder, state in states.items() if state in ("done", "failed")}
 
 
-def _tell_finished(cells: Sequence[Cell], results: Path, told: dict[Path, str]) -> dict[Path, str]:
+def _tell_finished(units: Sequence[Unit], results: Path, told: dict[Path, str]) -> dict[Path, str]:
     """Print what has been finished since; returns what has been told."""
-    finished = _finished(cells, results)
+    finished = _finished(units, results)
+    done = {folder for folder, state in finished.items() if state == "done"}
     for folder, state in finished.items():
         if told.get(folder) != state:
-            done = sum(each == "done" for each in finished.values())
-            print(f"{folder} {state}; {done} of {len(cells)} cells done", flush=True)
+            print(f"{folder} {state}; {_count(units, done)} done", flush=True)
     return finished
+
+
+def _count(units: Sequence[Unit], done: Container[Path]) -> str:
+    """Such as "12 of 12 cells, 3 of 6 common heads"."""
+    counts = []
+    for name, kind in (("cells", Cell), ("common heads", CommonHead)):
+        folders = [unit.folder for unit in units if isinstance(unit, kind)]
+        if folders:
+            counts.append(f"{sum(folder in done for folder in folders)} of {len(folders)} {name}")
+    return ", ".join(counts)
 
 
 @contextmanager
@@ -239,30 +287,34 @@ def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]
             yield lambda later: live.update(later, refresh=True)
 
 
-def progress_table(cells: Sequence[Cell], results: Path) -> Table:
+def progress_table(units: Sequence[Unit], results: Path) -> Table:
     """
-    :param cells: The cells of a grid
+    :param units: The cells of a grid, and its common heads
     :param results: Folder of all results
     :return: What is done, how fast it goes, when it will be finished
     """
     table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
-    n_done, left, speed = 0, 0.0, 0.0
-    for cell in cells:
-        state, progress = read_progress(cell, results)
-        n_done += state == "done"
-        total = cell.budget + (cell.pretrain.budget if cell.pretrain else 0)
-        done = progress.get("environment_steps", 0)
-        if cell.pretrain and progress.get("phase") == "train":
-            done += cell.pretrain.budget
+    finished, left, speed = set(), 0.0, 0.0
+    for unit in units:
+        state, progress = read_progress(unit, results)
+        if state == "done":
+            finished.add(unit.folder)
+        if isinstance(unit, CommonHead):
+            total, done, what = unit.updates, progress.get("updates", 0), " updates"
+        else:
+            what = ""
+            total = unit.budget + (unit.pretrain.budget if unit.pretrain else 0)
+            done = progress.get("environment_steps", 0)
+            if unit.pretrain and progress.get("phase") == "train":
+                done += unit.pretrain.budget
         rate = done / progress["seconds"] if progress.get("seconds") else 0.0
-        if state != "done":
+        if state != "done" and isinstance(unit, Cell):
             left += total - done
-        if state == "running":
-            speed += rate
+            speed += rate if state == "running" else 0.0
         if state in ("running", "interrupted", "failed"):
             best = progress.get("best_return")
             table.add_row(
-                *(cell.folder.parts[1], cell.method, str(cell.seed), state, f"{done:,} of {total:,}"),
+                *(unit.folder.parts[1], unit.method, str(unit.seed), state, f"{done:,} of {total:,}{what}"),
                 *(
                     f"{rate:.1f}",
                     _duration((total - done) / rate) if rate else "",
@@ -270,29 +322,32 @@ def progress_table(cells: Sequence[Cell], results: Path) -> Table:
                 ),
             )
     eta = f", about {_duration(left / speed)} left" if speed else ""
-    table.caption = f"{n_done} of {len(cells)} cells done, {speed:.1f} environment steps/s{eta}"
+    table.caption = f"{_count(units, finished)} done, {speed:.1f} environment steps/s{eta}"
     return table
 
 
-def read_progress(cell: Cell, results: Path) -> tuple[str, dict[str, Any]]:
+def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
     """
-    :param cell: A cell
+    :param unit: A cell or a common head
     :param results: Folder of all results
     :return: ``"done"``, ``"failed"``, ``"running"``, ``"interrupted"`` or ``"waiting"``, and its ``progress.json``
     """
-    folder = results / cell.folder
+    folder = results / unit.folder
     try:
         progress = json.loads((folder / "progress.json").read_text())
     except (OSError, ValueError):
         progress = {}
-    if (folder / DONE).exists():
+    if unit.is_done(results):
         return "done", progress
+    if is_held(folder):
+        return "running", progress
     if (folder / ERROR).exists():
         return "failed", progress
     if not progress:
         return "waiting", progress
-    # Evaluations and bursts of updates are silent.
-    return ("running" if time.time() - progress["time"] < 600 else "interrupted"), progress
+    # Another machine's lock may be unknown here; evaluations and bursts of updates are silent.
+    may_run = progress.get("machine") != platform.node() and time.time() - progress["time"] < 600
+    return ("running" if may_run else "interrupted"), progress
 
 
 def _duration(seconds: float) -> str:
@@ -331,7 +386,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """``sb3-cure experiment``.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0 if all cells are done, else 1
+    :return: 0 if nothing failed, else 1
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure experiment",
@@ -359,8 +414,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
         if options.dry_run:
-            for cell in grid.cells:
-                print(f"{cell.folder}: {read_progress(cell, options.out)[0]}")
+            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
+            for unit in units:
+                print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
             return 0
         of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
         given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
@@ -389,10 +445,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if failed else 0
 
 
-def _failures(failed: Iterable[Cell], results: Path) -> Iterator[str]:
-    for cell in failed:
-        path = Path(results) / cell.folder / ERROR
-        yield f"{cell.folder} failed: {path.read_text().strip().splitlines()[-1]} ({path})"
+def _failures(failed: Iterable[Unit], results: Path) -> Iterator[str]:
+    for unit in failed:
+        path = Path(results) / unit.folder / ERROR
+        yield f"{unit.folder} failed: {path.read_text().strip().splitlines()[-1]} ({path})"
 
 
 if __name__ == "__main__":

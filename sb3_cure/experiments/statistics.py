@@ -21,6 +21,8 @@ import numpy as np
 from scipy import integrate, stats
 
 from sb3_cure.experiments import published
+from sb3_cure.experiments.files import Row, read_rows
+from sb3_cure.experiments.grid import short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
 #: Heads by which policies are compared; others are yardsticks
@@ -222,7 +224,7 @@ def _read_experiment(path: Path) -> Experiment:
         seeds = list(range(seeds))
     if not isinstance(seeds, list) or not all(isinstance(seed, int) for seed in seeds):
         raise ResultsError(f"{path} has seeds {grid.get('seeds')!r}, but they must be a list of numbers: correct it.")
-    tasks = [_short_name(str(task)) for task in grid["tasks"]]
+    tasks = [short_name(str(task)) for task in grid["tasks"]]
     for name in (*tasks, *methods):
         if name in ("", ".", "..") or any(mark in name for mark in "/\\\0"):
             raise ResultsError(f"{path} names {name!r}, which cannot be the name of a folder: correct it.")
@@ -268,26 +270,21 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_rows(path: Path, needed: Sequence[str]) -> list[dict[str, str]]:
+def _read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            rows = list(reader)
+        return read_rows(path, needed)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ResultsError(f"{path} cannot be read ({error}): run the cell again.") from None
-    missing = [name for name in needed if name not in (reader.fieldnames or ())]
-    if missing:
-        raise ResultsError(f"{path} has no column {missing[0]!r}: run the cell again.")
-    if any(None in row or None in row.values() for row in rows):
-        raise ResultsError(f"{path} has a row that is shorter or longer than its header: run the cell again.")
-    return rows
+    except ValueError as error:
+        raise ResultsError(f"{path} {error}: run the cell again.") from None
 
 
-def _number(path: Path, line: int, column: str, text: str) -> float:
-    try:
-        return float(text) if text else float("nan")
-    except ValueError:
-        raise ResultsError(f"{path} has {text!r} as {column} in line {line}, which is no number: correct it.") from None
+def _number(path: Path, line: int, column: str, value: Any) -> float:
+    if value == "":
+        return float("nan")
+    if isinstance(value, str):
+        raise ResultsError(f"{path} has {value!r} as {column} in line {line}, which is no number: correct it.")
+    return float(value)
 
 
 def _read_evaluations(path: Path) -> dict[str, np.ndarray]:
@@ -309,17 +306,11 @@ def _read_visitation(path: Path) -> tuple[Visit, ...]:
         Visit(
             row["actor"],
             row["head"],
-            int(_number(path, line, "episode", row["episode"] or "0")),
+            int(_number(path, line, "episode", row["episode"] or 0)),
             *(_number(path, line, name, row[name]) for name in names),
         )
         for line, row in enumerate(rows, 2)
     )
-
-
-def _short_name(task: str) -> str:
-    name = task.split("/")[-1]
-    stem, mark, version = name.rpartition("-v")
-    return stem if mark and version.isdecimal() else name
 
 
 # Learning curves

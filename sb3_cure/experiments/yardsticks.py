@@ -19,8 +19,9 @@ from sb3_cure import CuReSAC
 from sb3_cure.evaluation import run_episodes, srl_errors
 from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import short_name
+from sb3_cure.experiments.heads import fit_head, observation_batch
 from sb3_cure.experiments.published import SRL_ERROR, task_key
-from sb3_cure.experiments.visitation import constant_errors, fit_head, mean_target, observation_batch
+from sb3_cure.experiments.visitation import constant_errors, mean_target
 
 TASKS = ("cartpole-swingup", "finger-spin", "finger-turn_easy", "ball_in_cup-catch", "reacher-easy", "reacher-hard")
 #: Numbers of updates after which the autoencoder is measured
