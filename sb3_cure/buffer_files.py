@@ -32,6 +32,14 @@ _BUFFERS = (
 )
 
 
+def can_be_kept(buffer: Any) -> bool:
+    """
+    :param buffer: A replay buffer
+    :return: Whether it is written without pickle, and so can be read back without trust
+    """
+    return type(buffer) in _BUFFERS
+
+
 def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Callable[[Any], None]) -> None:
     """What ``CuReSAC.save_replay_buffer`` does.
 
@@ -40,7 +48,7 @@ def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Call
     :param pickle: Writes it to a path or file as SB3 does, for classes of which no more is known
     """
     with writing(path, "pkl") as target:
-        if type(buffer) not in _BUFFERS:
+        if not can_be_kept(buffer):
             # A name with a suffix, as SB3 would add one.
             pickle(target)
             return

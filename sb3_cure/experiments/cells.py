@@ -216,8 +216,8 @@ class _Record(BaseCallback):
     def _on_step(self) -> bool:
         loss = self.logger.name_to_value.get("train/srl_loss")
         if loss is not None:
-            loss = th.as_tensor(loss)
-            self.loss_sum = self.loss_sum.to(loss.device) + loss
+            value = th.as_tensor(loss)
+            self.loss_sum = self.loss_sum.to(value.device) + value
             self.n_losses += 1
         self._tick()
         self.report(self.model)  # type: ignore[arg-type]
