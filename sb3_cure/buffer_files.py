@@ -81,6 +81,7 @@ def load_frame_rows(buffer: FrameStackReplayBuffer, rows: dict[str, Any], name: 
             f"{name} holds a replay buffer of {rows['buffer_size']} rows for {rows['n_envs']} environments, but this "
             f"model's has {buffer.buffer_size} for {buffer.n_envs}: load it into a model with the same settings."
         )
+    expect_keys(rows["rows"], set(buffer._ROW_ARRAYS), name)
     _check_rows(buffer, rows, name)
     _check_array(rows["tails"], buffer._tails.shape, buffer._tails.dtype, f"{name} has tails")
     for path, array in rows["rows"].items():

@@ -341,7 +341,7 @@ def _plain(value: Any) -> Any:
 
 
 class TransitionGuard:
-    """Looks at what environments return before it is stored or shown to the policy.
+    """Looks at what environments return before it is stored or shown to the policy: all has to be finite as float32.
 
     With ``skip`` a bad transition is marked in its info (``"bad_transition"``: why), by which replay buffers know never
     to sample it; finite numbers are stored in its place, and the policy goes on with the last good observation. The
@@ -358,6 +358,31 @@ class TransitionGuard:
         # The latest observations that were looked at, and of which environments they are stand-ins
         self._seen: Observations | None = None
         self._stand_ins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        # Whether the latest observations come from a state, so that only their values tell them
+        self._restored = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What the transitions to come depend on, between two steps: plain values and arrays
+        """
+        seen = self._seen if self._stand_ins.any() else None
+        return {
+            "n_bad": self.n_bad,
+            "warned": sorted(self._warned),
+            "stand_ins": [bool(stand_in) for stand_in in self._stand_ins],
+            # Observations without stand-ins can be looked at again.
+            "seen": {key: value.copy() for key, value in seen.items()} if isinstance(seen, dict) else copy.copy(seen),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``state_dict``; where the policy then does not see the same observations, as after a reset,
+            nothing is a stand-in
+        """
+        self.n_bad = state["n_bad"]
+        self._warned = set(state["warned"])
+        self._stand_ins = np.array(state["stand_ins"], dtype=bool)
+        self._seen, self._restored = state["seen"], True
 
     def admit_first(self, observations: Observations, original: Observations | None, timestep: int) -> Observations:
         """
@@ -367,8 +392,10 @@ class TransitionGuard:
         :return: The same, with zeros in place of what is not finite
         :raises ValueError: if something is not finite and must not be skipped
         """
-        if observations is self._seen:
+        if observations is self._seen or (self._restored and _equal(observations, self._seen)):
+            self._seen, self._restored = observations, False
             return observations
+        self._restored = False
         bad = _not_finite(observations) | (False if original is None else _not_finite(original))
         for i in map(int, np.flatnonzero(bad)):
             self._complain("first observation", i, (_row(observations, i), _row(original, i)), timestep)
@@ -426,7 +453,7 @@ class TransitionGuard:
     def _complain(self, kind: str, env: int, value: Any, timestep: int) -> str:
         """Raise, or warn of the first of a kind, and return what is wrong."""
         what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
-        reason = f"environment {env} returned {what} at agent step {timestep}, but {kind}s must be finite"
+        reason = f"environment {env} returned {what} at agent step {timestep}, but {kind}s must be finite in float32"
         if not self.skip:
             raise ValueError(
                 f"{reason}: it was not stored; fix the environment, or leave such transitions out with "
@@ -448,7 +475,19 @@ def _not_finite(values: Observations) -> npt.NDArray[np.bool_]:
         return np.logical_or.reduce([_not_finite(value) for value in values.values()])
     if not np.issubdtype(values.dtype, np.floating):
         return np.zeros(len(values), dtype=bool)
-    return ~np.logical_and.reduce(np.isfinite(values.reshape(len(values), -1)), axis=1)
+    return ~np.logical_and.reduce(_is_finite(values.reshape(len(values), -1)), axis=1)
+
+
+def _is_finite(numbers: np.ndarray) -> npt.NDArray[np.bool_]:
+    """As float32, in which rewards are stored and networks compute: 1e39 is not."""
+    with np.errstate(over="ignore"):
+        return np.isfinite(numbers.astype(np.float32, copy=False))
+
+
+def _equal(one: Observations, other: Observations | None) -> bool:
+    if isinstance(one, dict):
+        return isinstance(other, dict) and one.keys() == other.keys() and all(_equal(one[k], other[k]) for k in one)
+    return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
 
 
 def _first_bad(value: Any) -> float | None:
@@ -457,7 +496,7 @@ def _first_bad(value: Any) -> float | None:
         found = map(_first_bad, value.values() if isinstance(value, dict) else value)
         return next((bad for bad in found if bad is not None), None)
     numbers = np.ravel([] if value is None else value)
-    bad = numbers[~np.isfinite(numbers)]
+    bad = numbers[~_is_finite(numbers)]
     return float(bad[0]) if len(bad) > 0 else None
 
 

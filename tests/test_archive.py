@@ -319,7 +319,7 @@ def test_dictionaries_and_pickled_buffers(tmp_path: Path) -> None:
     ).learn(12)
     her.save_replay_buffer(tmp_path / "her")
     with pytest.raises(
-        ArchiveError, match=r"her is no replay buffer that this package saved without pickle.*trusted=True"
+        ArchiveError, match=r"her' is no replay buffer that this package saved without pickle.*trusted=True"
     ):
         her.load_replay_buffer(tmp_path / "her")
     her.load_replay_buffer(tmp_path / "her", trusted=True)

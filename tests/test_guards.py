@@ -4,6 +4,7 @@ import contextlib
 import copy
 import errno
 import functools
+import io
 import itertools
 import json
 import warnings
@@ -20,11 +21,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import transitions
-from sb3_cure.guards import Guard, NonFiniteError
+from sb3_cure.guards import Guard, NonFiniteError, TransitionGuard
+from sb3_cure.serialization import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
 
 NAN, INF = float("nan"), float("inf")
@@ -555,6 +557,109 @@ def test_values_that_normalization_hides_are_found() -> None:
     with pytest.raises(ValueError, match="the reward inf at agent step 3"):
         model.learn(10)
     assert model.replay_buffer.pos == 2
+
+
+class Wide(VecEnvWrapper):
+    """Returns float64, as workers do that stack what they were sent; at step 7 environment 1 returns 1e39."""
+
+    def __init__(self, venv: Any, flaw: str):
+        super().__init__(venv)
+        self.flaw, self.total = flaw, 0
+
+    def reset(self) -> np.ndarray:
+        return self.widened(self.venv.reset(), "first observation")
+
+    def widened(self, observations: np.ndarray, flaw: str) -> np.ndarray:
+        observations = observations.astype(np.float64)
+        if self.flaw == flaw:
+            observations[1, 0] = 1e39
+        return observations
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self.total += 1
+        rewards = rewards.astype(np.float64)
+        if self.total == 7 and self.flaw == "reward":
+            rewards[1] = 1e39
+        if self.total == 10 and self.flaw == "terminal observation":
+            infos[1]["terminal_observation"] = np.array([1.0, 1e39])
+        return self.widened(observations, "observation" if self.total == 7 else ""), rewards, dones, infos
+
+
+@pytest.mark.parametrize("flaw", ["reward", "observation", "first observation", "terminal observation"])
+@pytest.mark.parametrize("mode", ["raise", "skip"])
+@pytest.mark.filterwarnings("error:overflow")
+def test_what_is_infinite_only_as_float32_is_bad_too(flaw: str, mode: str) -> None:
+    """It would be stored, and shown to the networks, as infinity."""
+    env = functools.partial(VectorBox, episode_length=5)
+    venv = Wide(DummyVecEnv([env, env]), flaw)
+    model = tiny_model("MlpPolicy", venv, learning_starts=4, on_bad_transition=mode)
+    sentence = rf"environment 1 returned the {flaw} (with )?1e\+39 .*, but {flaw}s must be finite in float32: "
+    if mode == "raise":
+        with pytest.raises(ValueError, match=sentence):
+            model.learn(30)
+    else:
+        with pytest.warns(UserWarning, match=sentence):
+            model.learn(30)
+        marks = {"first observation": [[0, 1]], "reward": [[6, 1]], "observation": [[6, 1], [7, 1]]}
+        assert np.argwhere(model.replay_buffer.marked).tolist() == marks.get(flaw, [[9, 1]])
+    buffer = model.replay_buffer
+    assert not any(not_finite(getattr(buffer, name)) for name in ("observations", "next_observations", "rewards"))
+
+
+def admitted(guard: TransitionGuard, steps: list[Any], start: int, last_obs: Any) -> tuple[list[Any], Any]:
+    """What a guard makes of steps, as it is asked while a model collects, and the last observations."""
+    told = []
+    for timestep, (new_obs, rewards) in enumerate(steps, start=start):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            last_obs = guard.admit_first(last_obs, None, timestep)
+            dones = np.arange(len(rewards)) == timestep % 4
+            infos = [{"terminal_observation": np.full(2, rewards[i])} if done else {} for i, done in enumerate(dones)]
+            last_obs, stored, infos = guard.admit(last_obs, new_obs, rewards, dones, infos, timestep)
+        told.append((copy.deepcopy(last_obs), stored, infos, guard.n_bad, [str(warning.message) for warning in caught]))
+    return told, last_obs
+
+
+NUMBERS = st.sampled_from([0.0, 0.0, 0.0, 1.0, 1.0, NAN, INF, 1e39])
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data(), st.booleans(), st.integers(1, 3))
+def test_a_guard_that_was_saved_between_two_steps_goes_on_identically(
+    data: st.DataObject, dictionaries: bool, n_envs: int
+) -> None:
+    """Stand-ins, counts and what was warned of come back, also where the observations are other objects by then."""
+
+    def observations() -> Any:
+        array = np.array(data.draw(st.lists(NUMBERS, min_size=2 * n_envs, max_size=2 * n_envs))).reshape(n_envs, 2)
+        return {"a": array, "b": np.zeros((n_envs, 1), dtype=np.uint8)} if dictionaries else array
+
+    def steps() -> list[Any]:
+        rewards = st.lists(NUMBERS, min_size=n_envs, max_size=n_envs)
+        return [(observations(), np.array(data.draw(rewards))) for _ in range(data.draw(st.integers(0, 4)))]
+
+    guard, restored, before, after = TransitionGuard(True), TransitionGuard(True), steps(), steps()
+    _, last_obs = admitted(guard, before, 0, observations())
+    file = io.BytesIO()
+    write_state(file, {"guard": guard.state_dict(), "last_obs": last_obs})
+    state = read_state(file)
+    restored.load_state_dict(state["guard"])
+    other, _ = admitted(restored, copy.deepcopy(after), len(before), state["last_obs"])
+    assert differences(other, admitted(guard, after, len(before), last_obs)[0]) == []
+    assert differences(restored.state_dict(), guard.state_dict()) == []
+
+
+def test_after_a_reset_a_restored_guard_knows_no_stand_ins() -> None:
+    guard, restored = TransitionGuard(True), TransitionGuard(True)
+    with pytest.warns(UserWarning, match="first observation with nan"):
+        seen = guard.admit_first(np.array([[NAN]]), None, 0)
+    restored.load_state_dict(guard.state_dict())
+    for observations, marked in ((np.array([[2.0]]), False), (seen.copy(), True)):
+        restored.load_state_dict(guard.state_dict())
+        first = restored.admit_first(observations, None, 1)
+        _, _, infos = restored.admit(first, np.array([[1.0]]), np.zeros(1), np.zeros(1, dtype=bool), [{}], 1)
+        assert ("bad_transition" in infos[0]) == marked
 
 
 def test_skipping_and_normalization_are_refused_together() -> None:
