@@ -27,7 +27,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cure.buffer_files import can_be_kept, frame_rows, load_frame_rows
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.envs.state import load_vec_env_state, vec_env_state, why_not_restorable
+from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.generations import CHUNK, CheckpointError, Draft, Entry, Generation, Generations
 from sb3_cure.serialization import ArchiveError, read_state, sentences, write_state
 
@@ -280,16 +280,7 @@ def watch(callback: BaseCallback) -> list[WatchedCallback]:
 def _plain_attributes(callback: BaseCallback) -> dict[str, Any]:
     given = ("locals", "globals", "num_timesteps", "verbose")
     public = {name: value for name, value in vars(callback).items() if not name.startswith("_")}
-    return {name: value for name, value in public.items() if name not in given and _is_plain(value)}
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    if isinstance(value, dict):
-        return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
-    is_array = isinstance(value, th.Tensor) or (isinstance(value, np.ndarray) and value.dtype.kind in "biuf")
-    return value is None or is_array or isinstance(value, bool | int | float | str | np.number | np.bool_)
+    return {name: value for name, value in public.items() if name not in given and is_plain(value)}
 
 
 def _changed(watched: WatchedCallback) -> dict[str, Any]:

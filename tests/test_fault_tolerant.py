@@ -34,6 +34,7 @@ from sb3_cure import buffers, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.callbacks import _spread_over
 from sb3_cure.envs import EnvFaultError, FaultTolerantSubprocVecEnv
+from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.evaluation import most_uncomfortable
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -58,6 +59,12 @@ class Breakable(gym.Wrapper):
     def break_down(self, kind: str) -> int:
         self.kind = kind
         return os.getpid()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"kind": self.kind, "frozen": self.frozen}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(**kwargs)
@@ -551,6 +558,137 @@ def test_workers_leave_when_the_parent_is_killed() -> None:
     _, alive = psutil.wait_procs(workers[:2], timeout=30)
     workers[2].kill()
     assert all(process.status() == psutil.STATUS_ZOMBIE for process in alive)
+
+
+def job(start_method: str, tell: int) -> None:
+    """Survives a SIGTERM to all its processes, as its own handler wishes, then is killed with one worker in a hang."""
+    os.setsid()
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    get_context("forkserver").set_forkserver_preload([__name__])
+    try:
+        env = FaultTolerantSubprocVecEnv([breakable_box] * 2, start_method=start_method, start_timeout=600)
+        env.reset()
+        os.killpg(0, signal.SIGTERM)
+        for _ in range(100):
+            env.step(still(env))
+        env.env_method("break_down", "hang", indices=1)
+        env.step_async(still(env))
+        os.write(tell, " ".join(str(process.pid) for process in env.processes).encode())
+    except BaseException as error:
+        os.write(tell, str(error).encode())
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def run_jobs(start_methods: list[str]) -> list[tuple[str, list[str]]]:
+    """What each told, and how those of its processes do that did not end."""
+    readers = []
+    for start_method in start_methods:
+        reader, writer = os.pipe()
+        if os.fork() == 0:
+            job(start_method, writer)
+        os.close(writer)
+        readers.append(reader)
+    told = []
+    for reader in readers:
+        told.append(os.read(reader, 1000).decode())
+        os.close(reader)
+    results = []
+    for text in told:
+        pids = [int(word) for word in text.split() if word.isdigit()]
+        _, alive = psutil.wait_procs([psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)], timeout=60)
+        results.append((text, [process.status() for process in alive if process.status() != psutil.STATUS_ZOMBIE]))
+    return results
+
+
+def test_a_sigterm_to_all_is_the_parents_and_its_death_ends_all(fresh: ProcessPoolExecutor) -> None:
+    for told, alive in fresh.submit(run_jobs, ["fork", "forkserver"]).result():
+        assert re.fullmatch(r"\d+ \d+", told), told
+        assert alive == []
+
+
+forgotten: list[VecEnv] = []
+
+
+def forget_to_close() -> None:
+    env = made([breakable_box] * 2)
+    forgotten.append(env)
+    env.reset()
+    env.env_method("break_down", "hang", indices=1)
+    env.step_async(still(env))
+
+
+def test_a_program_ends_that_forgot_to_close_its_environments() -> None:
+    program = get_context("fork").Process(target=forget_to_close)
+    program.start()
+    program.join(60)
+    code = program.exitcode
+    program.kill()
+    assert code == 0
+
+
+def resumable(**kwargs: Any) -> Any:
+    box = partial(Remembers, size=12, episode_length=9)
+    return made([lambda: Breakable(box())] * 2, state=position, frozen_steps=20, max_faults=4, **kwargs)
+
+
+@pytest.mark.parametrize("found_in_saving", [False, True])
+def test_resumed_environments_go_on_as_the_others_bit_for_bit(found_in_saving: bool) -> None:
+    whole, resumed = resumable(), resumable()
+    whole.set_attr("difficulty", 3, indices=1)
+    whole.seed(5)
+    whole.set_options([{}, {"level": 2}])
+    whole.reset()
+
+    def follow(env: Any, steps: int) -> list[Any]:
+        return [env.step(np.full_like(still(env), 0.5 if k % 2 else -0.5)) for k in range(steps)]
+
+    def kill(env: Any) -> None:
+        os.kill(env.processes[1].pid, signal.SIGKILL)
+
+    kill(whole)
+    follow(whole, 2)
+    whole.env_method("break_down", "frozen", indices=0)
+    follow(whole, 4)  # two more, and it is a fault
+    if found_in_saving:
+        kill(whole)
+    state = vec_env_state(whole)
+    assert state is not None and is_plain(state)
+    assert whole.restarts == [0, 1 + found_in_saving]
+    load_vec_env_state(resumed, state)
+    assert differences(vec_env_state(resumed), state) == []
+    runs = []
+    for env in (whole, resumed):
+        seen: list[Any] = follow(env, 4)
+        kill(env)
+        seen += follow(env, 12)
+        runs.append([seen, env.get_attr("difficulty"), env.get_attr("told", 1), env.restarts])
+        env.close()
+    assert differences(*runs) == []
+    faults = [info.get("env_fault_steps") for _, _, _, infos in runs[0][0] for info in infos if "env_fault" in info]
+    assert sorted(faults) == [1] * (1 + found_in_saving) + [5]
+
+
+def test_a_resumed_worker_is_no_new_one() -> None:
+    env = resumable(timeout=2, start_timeout=20)
+    env.reset()
+    state = vec_env_state(env)
+    env.close()
+    env = resumable(timeout=2, start_timeout=20)
+    load_vec_env_state(env, state)
+    env.step(still(env))
+    env.env_method("break_down", "hang", indices=0)
+    (info, _) = env.step(still(env))[3]
+    env.close()
+    assert "did not answer step within timeout=2 s" in info["env_fault"]
+
+
+def test_what_was_set_and_cannot_be_saved_is_said() -> None:
+    env = made([breakable_box])
+    env.set_attr("tool", partial(print))
+    env.reset()
+    assert vec_env_state(env) is None
+    assert "was given tool of type partial" in str(why_not_restorable(env))
+    env.close()
 
 
 class Hopeless(VectorBox):

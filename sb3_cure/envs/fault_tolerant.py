@@ -1,14 +1,17 @@
 """Environments in worker processes that may fail: what goes wrong in one is noticed, told, and can be survived."""
 
 import multiprocessing as mp
+import os
 import signal
+import threading
 import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partialmethod
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any
 
 import gymnasium as gym
@@ -26,7 +29,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
-# Seconds that a worker is given to leave by itself when the environments are closed, and after SIGTERM or SIGKILL.
+# Seconds that a worker is given to leave by itself when the environments are closed or the parent is gone, and after
+# SIGKILL.
 CLOSE_SECONDS = 10.0
 KILL_SECONDS = 2.0
 # Commands in which an error leaves no environment to go on with; in all others it is the caller's.
@@ -88,6 +92,18 @@ class _FrameWatcher:
     def suspect(self) -> int:
         """How many of the latest steps showed the same pixels, if anything moved meanwhile."""
         return self._n_same if self._n_moving else 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What it remembers of the steps before
+        """
+        return {name: getattr(self, name) for name in ("_frame", "_position", "_n_same", "_n_moving")}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
+        vars(self).update(state)
 
     def check(self, observation: Any, of_step: bool) -> None:
         """
@@ -176,8 +192,23 @@ class _Environment:
     def set_attr(self, name_and_value: tuple[str, Any]) -> None:
         setattr(self.env, *name_and_value)
 
+    def watcher_state(self, _: None) -> dict[str, Any]:
+        return self.watcher.state_dict()
+
+    def load_watcher_state(self, state: dict[str, Any]) -> None:
+        self.watcher.load_state_dict(state)
+
     def is_wrapped(self, wrapper_class: type[gym.Wrapper]) -> bool:
         return is_wrapped(self.env, wrapper_class)
+
+
+def _leave_with_parent() -> None:
+    """End this process a while after the parent is gone, as one that hangs in a step sees no end of its pipe."""
+    parent = mp.parent_process()
+    if parent is not None:
+        parent.join()
+        time.sleep(CLOSE_SECONDS)
+        os._exit(1)
 
 
 def _work(
@@ -198,9 +229,10 @@ def _work(
     """
     for connection in inherited:
         connection.close()
-    # Ctrl-C reaches all processes of a terminal, but what it means is up to the parent.
+    # Ctrl-C reaches all processes of a terminal, and SIGTERM all of a job, but what they mean is up to the parent.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
     if again:
         # Or its Monitor would empty the file with the episodes before the fault.
         Monitor.__init__ = partialmethod(Monitor.__init__, override_existing=False)  # type: ignore[assignment]
@@ -256,9 +288,10 @@ class _Worker:
         inherited = [self.connection, *others] if context.get_start_method() == "fork" else []
         arguments = (remote, inherited, CloudpickleWrapper(self.env_fn), CloudpickleWrapper(self.owner.watch), again)
         try:
-            # daemon: it ends with the parent
             self.process = context.Process(target=_work, args=arguments, daemon=True)
             self.process.start()
+            # At the parent's exit multiprocessing sends SIGTERM to daemons, which they ignore, and waits for them
+            self._kill_at_exit = Finalize(self, self.process.kill, exitpriority=0)
         finally:
             remote.close()
         self.fault = None
@@ -274,11 +307,11 @@ class _Worker:
         if self.fault is not None:
             return
         self.fault = fault
+        self._kill_at_exit.cancel()
         self.process.join(patience)
-        for end in (self.process.terminate, self.process.kill):
-            if self.process.is_alive():
-                end()
-                self.process.join(KILL_SECONDS)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join(KILL_SECONDS)
         self.connection.close()
         if not self.process.is_alive():
             self.process.close()
@@ -343,7 +376,8 @@ class _Worker:
             if is_attribute:
                 raise AttributeError(str(sentence)) from sentence
             raise sentence
-        self._starting &= command != "reset"
+        # Restored environments begin with a step
+        self._starting &= command not in ("reset", "step")
         return answer
 
     def _read(self) -> tuple[Any, Any] | str:
@@ -351,19 +385,16 @@ class _Worker:
         command = self._request[0]
         number = 0
         while number < self._number:  # answers to requests that were given up (by Ctrl-C, say) are dropped
-            if not wait([self.connection, self.process.sentinel], max(0.0, self._deadline - time.monotonic())):
-                name, seconds = self._patience
-                return (
-                    f"did not answer {command} within {name}={seconds:g} s (rendering or the environment hangs; raise "
-                    f"{name} if it is only slow)"
-                )
             try:
-                # An answer may lie there although the process has ended since
-                number, answer, error = self.connection.recv() if self.connection.poll() else (0, None, None)
-                ended = number == 0
+                # Not its sentinel, which with forkserver tells of the server's end too
+                if not self.connection.poll(max(0.0, self._deadline - time.monotonic())):
+                    name, seconds = self._patience
+                    return (
+                        f"did not answer {command} within {name}={seconds:g} s (rendering or the environment hangs; "
+                        f"raise {name} if it is only slow)"
+                    )
+                number, answer, error = self.connection.recv()
             except (EOFError, OSError):
-                ended = True
-            if ended:
                 self.process.join(KILL_SECONDS)
                 code = self.process.exitcode
                 how = (
@@ -414,7 +445,8 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     :param timeout: Seconds that an answer may take
     :param on_env_fault: ``"raise"`` or ``"restart"``
     :param start_method: As in ``SubprocVecEnv``
-    :param start_timeout: Seconds for each answer of a new worker until its first ``reset`` is done
+    :param start_timeout: Seconds for each answer of a new worker until its first ``reset`` is done (with a state that was
+        loaded, its first ``step``)
     :param max_faults: Faults of one environment without a good step in between, after which ``"restart"`` raises too
     :param allow_black_frames: Whether a frame of zeros is all right
     :param frozen_steps: Environment steps (agent steps times ``action_repeat``) with the same pixels during which the
@@ -472,8 +504,8 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         self._last_obs: list[Any] = [None] * len(env_fns)
         # How many of the latest steps of each showed stuck pixels, perhaps: a fault spoils these too
         self._suspect = [0] * len(env_fns)
-        # By index, the faults that the next step has to report, with the first observations of the new episodes
-        self._unreported: dict[int, tuple[EnvFaultError, Any]] = {}
+        # The sentences of faults that the next step has to report, with the first observations of the new episodes
+        self._unreported: list[list[Any] | None] = [None] * len(env_fns)
         self.remotes = []
         try:
             for index, env_fn in enumerate(env_fns):
@@ -496,7 +528,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         :param actions: One per environment
         """
         for worker, action in zip(self.remotes, actions, strict=True):
-            if worker.index not in self._unreported:
+            if self._unreported[worker.index] is None:
                 worker.send(("step", action))
         self.waiting = True
 
@@ -512,7 +544,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
 
     def _step_result(self, worker: _Worker) -> tuple[Any, Any, Any, dict[str, Any], dict[str, Any]]:
         index = worker.index
-        if index not in self._unreported:
+        if self._unreported[index] is None:
             result = worker.outcome()
             if not isinstance(result, EnvFaultError):
                 result, self._suspect[index] = result
@@ -520,9 +552,10 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
                 self._last_obs[index] = result[0]
                 return result
             self._restart(worker, result)
-        reported, observation = self._unreported.pop(index)
+        sentence, observation = self._unreported[index]  # type: ignore[misc]
+        self._unreported[index] = None
         info = {
-            "env_fault": str(reported),
+            "env_fault": sentence,
             "env_fault_steps": 1 + self._suspect[index],
             "TimeLimit.truncated": True,
             "terminal_observation": self._last_obs[index],
@@ -546,11 +579,11 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
             outcome = worker.outcome()
             if isinstance(outcome, EnvFaultError):
                 self._restart(worker, outcome)
-                _, self._last_obs[worker.index] = self._unreported[worker.index]
+                _, self._last_obs[worker.index] = self._unreported[worker.index]  # type: ignore[misc]
             else:
                 self._last_obs[worker.index], self.reset_infos[worker.index] = outcome
         # Nothing came before the first observation that could be told of
-        self._unreported.clear()
+        self._unreported = [None] * self.num_envs
         self._reset_seeds()
         self._reset_options()
         return _stack_obs(self._last_obs, self.observation_space)
@@ -578,7 +611,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
                 observation = self._begin_again(worker)
             except EnvFaultError as another:
                 latest = another
-        self._unreported[index] = fault, observation
+        self._unreported[index] = [str(fault), observation]
 
     def _begin_again(self, worker: _Worker) -> Any:
         """Start a new worker and its first episode; returns the first observation."""
@@ -607,6 +640,31 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         for index in indices:
             self._attributes[index][attr_name] = value
 
+    def state_dict(self) -> dict[str, Any]:
+        """For exact resume.
+
+        :return: What is remembered of workers, beside what their environments tell of themselves
+        """
+        # First, as it may find a worker dead
+        watchers = self._ask("watcher_state", [None] * self.num_envs)
+        return {"attributes": self._attributes, "watchers": watchers, **{name: getattr(self, name) for name in _OWN}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
+        for index, attributes in enumerate(state["attributes"]):
+            for name, value in attributes.items():
+                self.set_attr(name, value, index)
+        self._ask("load_watcher_state", state["watchers"])
+        for name in _OWN:
+            setattr(self, name, state[name])
+
+    def _ask(self, command: str, data: Sequence[Any]) -> list[Any]:
+        for worker, own in zip(self.remotes, data, strict=True):
+            worker.send((command, own))
+        return [worker.recv() for worker in self.remotes]
+
     def close(self) -> None:
         """End all workers, within ten seconds or ``timeout``, whichever is less."""
         if self.closed:
@@ -630,6 +688,11 @@ def _check_positive(**values: Any) -> None:
             raise ValueError(f"{name}={value!r} is not a number greater than 0: use {name}={usual}, for example.")
 
 
+# Attributes of the environments that a resumed training needs.
+_OWN = (
+    *("_seeds", "_options", "restarts", "_faults_in_a_row", "_last_seeds", "_last_options", "_last_obs", "_suspect"),
+    "_unreported",
+)
 _USUAL: Mapping[str, float] = {
     "timeout": 60,
     "start_timeout": 120,

@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import wrappers
 from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.monitor import Monitor
@@ -96,7 +97,6 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
     # The buffers of DummyVecEnv are overwritten by every step.
     DummyVecEnv: ("_seeds", "_options"),
     SubprocVecEnv: ("_seeds", "_options"),
-    FaultTolerantSubprocVecEnv: ("_seeds", "_options"),
     VecFrameStack: ("stacked_obs",),
     VecMonitor: ("episode_count", "episode_returns", "episode_lengths"),
     VecNormalize: ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward"),
@@ -139,8 +139,9 @@ def vec_env_state(venv: VecEnv) -> dict[str, Any] | None:
     if why_not_restorable(venv) is not None:
         return None
     *_, base = layers = _layers(venv)
-    states = [_layer_state(layer) for layer in layers]
-    return {"layers": states, "envs": _in_envs(base, _env_state, [()] * base.num_envs)}
+    # The environments first: asking them may find a worker dead, which is then replaced.
+    env_states = _in_envs(base, _env_state, [()] * base.num_envs)
+    return {"layers": [_layer_state(layer) for layer in layers], "envs": env_states}
 
 
 def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
@@ -151,13 +152,16 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
     :raises ValueError: if the state is of environments that were built in another way; they may then be changed in part
     :raises RuntimeError: if a step is under way
     """
-    *_, base = layers = _layers(venv)
+    *outer, base = layers = _layers(venv)
     try:
         if len(state["envs"]) != base.num_envs:
             raise ValueError(f"it is of {len(state['envs'])} environments, and here are {base.num_envs}")
         _check_layers(layers, state["layers"])
+        *outer_states, base_state = state["layers"]
+        # Before the environments: it sets attributes again that may have changed in them since.
+        _load_layer_state(base, base_state)
         _in_envs(base, _load_env_state, [(env_state,) for env_state in state["envs"]])
-        for layer, layer_state in zip(layers, state["layers"], strict=True):
+        for layer, layer_state in zip(outer, outer_states, strict=True):
             _load_layer_state(layer, layer_state)
     except Exception as error:
         raise ValueError(
@@ -234,8 +238,28 @@ def _is_dmc(layer: Any) -> bool:
     return type(layer).__module__ == _SHIMMY  # without importing shimmy, which needs OpenGL
 
 
+def is_plain(value: Any) -> bool:
+    """
+    :param value: Anything
+    :return: Whether it can be saved: numbers, strings, arrays, and lists and dictionaries of these
+    """
+    if isinstance(value, list | tuple):
+        return all(map(is_plain, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and is_plain(each) for key, each in value.items())
+    is_array = isinstance(value, th.Tensor) or (isinstance(value, np.ndarray) and value.dtype.kind in "biuf")
+    return value is None or is_array or isinstance(value, bool | int | float | str | np.number | np.bool_)
+
+
 def _why_not(layer: Any) -> str | None:
     name = type(layer).__name__
+    if isinstance(layer, FaultTolerantSubprocVecEnv):
+        for given in (*layer._attributes, *layer._options, *layer._last_options):
+            for key, value in given.items():
+                if not is_plain(value):
+                    return (
+                        f"{name} was given {key} of type {type(value).__name__} (set_attr, set_options), not plain data"
+                    )
     if _has_state_dict(layer) or type(layer) in ATTRIBUTES:
         return None
     if _is_dmc(layer):
