@@ -657,7 +657,7 @@ def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
     """
     pytest.importorskip("ray")
     path = write_grid(
-        tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0"], kind="visitation", budget=2400, seeds=3,
+        tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0"], kind="visitation", budget=2400, seeds=2,
         evaluation=dict(every=400, episodes=1),
     )  # fmt: skip
     out = tmp_path / "out"

@@ -321,8 +321,8 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
                     "" if best is None else f"{best:.0f}",
                 ),
             )
-    eta = f", about {_duration(left / speed)} left" if speed else ""
-    table.caption = f"{_count(units, finished)} done, {speed:.1f} environment steps/s{eta}"
+    pace = f", {speed:.1f} environment steps/s, about {_duration(left / speed)} left" if speed else ""
+    table.caption = f"{_count(units, finished)} done{pace}"
     return table
 
 
