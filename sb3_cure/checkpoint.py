@@ -305,7 +305,7 @@ def _take_back(callback: BaseCallback, changed: dict[str, Any]) -> None:
     """What was saved of a callback, perhaps by a stranger: values of plain attributes that it has, of their types."""
     now = _plain_attributes(callback)
     for name, value in changed.items():
-        same_type = name in now and (type(now[name]) is type(value) or now[name] is None) and _is_plain(value)
+        same_type = name in now and (type(now[name]) is type(value) or now[name] is None) and is_plain(value)
         if same_type and not isinstance(value, str):
             setattr(callback, name, value)
 

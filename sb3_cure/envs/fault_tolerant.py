@@ -445,8 +445,8 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     :param timeout: Seconds that an answer may take
     :param on_env_fault: ``"raise"`` or ``"restart"``
     :param start_method: As in ``SubprocVecEnv``
-    :param start_timeout: Seconds for each answer of a new worker until its first ``reset`` is done (with a state that was
-        loaded, its first ``step``)
+    :param start_timeout: Seconds for each answer of a new worker until its first ``reset`` is done (with a state that
+        was loaded, its first ``step``)
     :param max_faults: Faults of one environment without a good step in between, after which ``"restart"`` raises too
     :param allow_black_frames: Whether a frame of zeros is all right
     :param frozen_steps: Environment steps (agent steps times ``action_repeat``) with the same pixels during which the
