@@ -148,7 +148,8 @@ def _resume(folder: Path) -> tuple[str, int, list[str]]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         model = CuReSAC.resume(folder, _Dots(), device="cpu")
-    return _digest(model), model.num_timesteps, [str(warning.message) for warning in said]
+    told = [str(warning.message) for warning in said if issubclass(warning.category, UserWarning)]
+    return _digest(model), model.num_timesteps, told
 
 
 class Site:

@@ -119,7 +119,7 @@ def _frame_segments(generation: Generation, buffer: Any) -> list[FrameSegment]:
     for segment in segments:
         size = (segment.last - segment.first) * int(np.prod(buffer.frame_shape))
         if segment.first < 0 or segment.last > buffer._n_frames or segment.entry.size != size or size == 0:
-            raise CheckpointError(
+            raise ArchiveError(
                 f"{segment.entry.name} of {generation.folder} has {segment.entry.size} bytes, which are not the frames "
                 f"{segment.first} to {segment.last} of {buffer._n_frames}: the checkpoint is damaged."
             )
@@ -332,11 +332,13 @@ def resume(
     if env is None:
         raise CheckpointError("resume got no environment: give those of the training, made as they were then.")
     generations = Generations(path)
-    errors: list[CheckpointError | ArchiveError] = []
+    errors: list[ArchiveError] = []
     for generation, lost in _usable(generations):
         try:
             with sentences(str(generation.folder), "resume on a machine with more"):
                 return _restore(model_class, generation, lost, env, custom_objects, kwargs)
+        except CheckpointError:
+            raise
         except ArchiveError as error:
             # What is amiss with the settings that were given is amiss with all of them: the newest tells best.
             errors.append(error)
@@ -358,7 +360,7 @@ def _restore(
     )
     state = read_state(generation.folder / STATE)
     if model.n_envs != state["n_envs"]:
-        raise ArchiveError(
+        raise CheckpointError(
             f"resume got {model.n_envs} environments, but the checkpoint {generation.folder} is of a training with "
             f"{state['n_envs']}: give as many."
         )
@@ -473,6 +475,11 @@ class Resumption:
         kept = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_num_timesteps_at_start", "action_noise")
         self._kept = {name: copy.deepcopy(getattr(model, name)) for name in kept}
 
+    @property
+    def started_at(self) -> int:
+        """Agent steps at which the interrupted call began."""
+        return self._kept["_num_timesteps_at_start"]
+
     def set_up(self, model: "CuReSAC") -> None:
         """Counters of callbacks, files of the logger and what was not yet logged.
 
@@ -480,7 +487,7 @@ class Resumption:
         """
         # `learn` begins noises anew, and takes its start for now.
         model.action_noise = self._kept["action_noise"]
-        model._num_timesteps_at_start = self._kept["_num_timesteps_at_start"]
+        model._num_timesteps_at_start = self.started_at
         with sentences(str(self.generation.folder), "resume on a machine with more"):
             saved = list(self.state["callbacks"])
             for watched in model._run.watched:

@@ -435,7 +435,7 @@ class CuReSAC(SAC):
         if resumed is not None:
             # The interrupted call is gone on with, whose total is meant.
             reset_num_timesteps = False
-            total_timesteps += self._num_timesteps_at_start - self.num_timesteps
+            total_timesteps += resumed.started_at - self.num_timesteps
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sb3_cure.files import flush_to_disk
+from sb3_cure.serialization import ArchiveError
 
 #: Bytes that are read or written at once
 CHUNK = 2**22
@@ -32,7 +33,7 @@ _NAME = re.compile(r"generation-(\d{6,})")
 _MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
 
-class CheckpointError(ValueError):
+class CheckpointError(ArchiveError):
     """A checkpoint cannot be written or read; the message says what to do."""
 
 
