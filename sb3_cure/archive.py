@@ -1,4 +1,4 @@
-"""Model archives and replay-buffer files that can be loaded from strangers: nothing in them is pickle that is run.
+"""Model archives that can be loaded from strangers: nothing in them is pickle that is run.
 
 An archive is a zip with the members of SB3's: ``data`` (settings, here JSON with a few tagged types), ``*.pth`` (state
 dicts of tensors, which torch reads with ``weights_only=True``) and the version. Whatever is not data (a function, a
@@ -21,7 +21,7 @@ from stable_baselines3.common.utils import (
 
 from sb3_cure.files import PathOrFile, reading, writing
 from sb3_cure.serialization import Archive, ArchiveError, dump_json, sentences, write_arrays
-from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA, SettingsDecoder, SettingsEncoder
+from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA, SettingsDecoder, SettingsEncoder, check_sizes
 from sb3_cure.weights import Allowance, TensorInfo, TorchFile, check_parameters, check_tensor, expect_keys
 
 if TYPE_CHECKING:
@@ -244,6 +244,8 @@ def load_model(
 def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dict[str, Any]) -> dict[str, Any]:
     """The archive's settings, checked, with the user's objects in their places."""
     settings = dict(archive.settings or {})
+    for key in sorted((NEVER_SAVED | DERIVED) & (settings.keys() | archive.placeholders.keys())):
+        raise ArchiveError(f"{archive.name} has {key}, which is no setting: it is damaged, or of another version.")
     missing = sorted(archive.placeholders.keys() - custom_objects.keys() - kwargs.keys())
     if missing:
         told = "; ".join(archive.placeholders[key] for key in missing)
@@ -255,12 +257,13 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
     for key, value in settings.items():
         words, check = SCHEMA.get(key, ("", lambda _: True))
         with sentences(archive.name, _SMALLER):
-            fits = key not in NEVER_SAVED and check(value)
+            fits = check(value)
         if not fits:
-            expected = f"but {key} is {words}" if words else "which is no setting"
             raise ArchiveError(
-                f"{archive.name} has {key}={value!r:.100}, {expected}: it is damaged, or of another version."
+                f"{archive.name} has {key}={value!r:.100}, but {key} is {words}: it is damaged, or of another version."
             )
+    with sentences(archive.name, _SMALLER):
+        check_sizes(settings)
     known = settings.keys() | archive.placeholders.keys()
     settings.update({key: value for key, value in custom_objects.items() if key in known})
     for key in ("policy_class", "observation_space", "action_space"):

@@ -357,6 +357,8 @@ class FrameStackReplayBuffer(_SkipsMarked):
         marks = self._mark(infos)
         for i, (stack, next_stack) in enumerate(zip(stacks, next_stacks, strict=True)):
             if marks[i]:
+                # What follows must not need older frames than this row, or it would outlive them.
+                self._tails[i] = -self.frame_capacity
                 continue
             numbers = self._tails[i] if self._continues_tail(i, stack) else self._store_stack(stack)
             if np.array_equal(next_stack[:-1], stack[1:]):

@@ -52,16 +52,11 @@ from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
 from sb3_cure.serialization import ArchiveError
+from sb3_cure.settings import NEVER_SAVED
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
-
-#: Made anew by `_setup_model` or `learn`
-NOT_SAVED = (
-    *("_metrics", "_guard", "_transition_guard", "_task_agent", "_curious_agent", "_overlapped"),
-    "_run",
-)
 
 #: Updates between two pictures of reconstructions in TensorBoard
 RECONSTRUCTION_INTERVAL = 1000
@@ -1091,7 +1086,7 @@ class CuReSAC(SAC):
         return resume(cls, path, env, custom_objects, device=device, **kwargs)  # type: ignore[return-value]
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *NOT_SAVED]
+        return [*super()._excluded_save_params(), *NEVER_SAVED]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -8,7 +8,7 @@ import pathlib
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -34,25 +34,27 @@ from stable_baselines3.sac import policies as sb3_policies
 from torch.nn.modules import activation
 
 from sb3_cure import encoders, policies
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.serialization import ArchiveError, Decoder, Encoder, numeric_dtype
 from sb3_cure.srl import SRL_HEADS, SRLHead
-
-if TYPE_CHECKING:
-    pass
+from sb3_cure.values import is_integer, is_number
 
 #: Most numbers in one observation or action; a space of them takes some 20 bytes each
 MAX_SPACE_SIZE = 2**22
 #: Most parallel environments, each of which takes a few bytes in a replay buffer
 MAX_ENVS = 2**16
-#: What belongs to a running model alone, and is never a setting
+#: Most frames in the stacks of all environments together, which a replay buffer numbers before it holds any
+MAX_STACKED_FRAMES = 2**20
+#: What belongs to a running model alone, and is never a setting: made anew by set-up or ``learn``
 NEVER_SAVED = frozenset(
     "policy device env replay_buffer rollout_buffer _vec_normalize_env _logger actor critic critic_target _metrics "
-    "_task_agent _curious_agent _overlapped".split()
+    "_guard _transition_guard _task_agent _curious_agent _overlapped _run".split()
 )
 #: What set-up derives from other settings
-DERIVED = frozenset("lr_schedule batch_norm_stats batch_norm_stats_target _computed_precision _compiles".split())
+DERIVED = frozenset(
+    "lr_schedule ent_coef_tensor batch_norm_stats batch_norm_stats_target _computed_precision _compiles".split()
+)
 
 
 # -------------------------------------------------------------- as JSON
@@ -73,6 +75,7 @@ def _named() -> dict[str, Any]:
         torch_layers.NatureCNN,
         torch_layers.CombinedExtractor,
         FrameStackReplayBuffer,
+        SkippingReplayBuffer,
         sb3_buffers.ReplayBuffer,
         sb3_buffers.DictReplayBuffer,
         sb3_buffers.NStepReplayBuffer,
@@ -215,12 +218,45 @@ def _read_ou_noise(
 
 
 def _read_vectorized_noise(base: ActionNoise, *noises: ActionNoise) -> VectorizedActionNoise:
-    noise = VectorizedActionNoise(base, len(noises))
+    if not all(isinstance(part, NormalActionNoise | OrnsteinUhlenbeckActionNoise) for part in (base, *noises)):
+        raise ArchiveError("the archive has a VectorizedActionNoise whose parts are not NormalActionNoise or the like.")
     states = [dict(vars(part)) for part in noises]
+    noise = VectorizedActionNoise(base, 1)
+    noise.n_envs = len(noises)  # given to the constructor, it would make as many copies of the base
     noise.noises = list(noises)  # which resets them
     for part, state in zip(noises, states, strict=True):
         vars(part).update(state)
     return noise
+
+
+def check_sizes(settings: dict[str, Any]) -> None:
+    """What is small in an archive must not become large in a model.
+
+    :param settings: Settings of an archive, each of its type
+    :raises ArchiveError: if the noise is larger than the actions that it is for, or there are too many stacks of frames
+    """
+    noise, space = settings.get("action_noise"), settings.get("action_space")
+    parts = [noise.base_noise, *noise.noises] if isinstance(noise, VectorizedActionNoise) else [noise]
+    values = [value for part in parts if part is not None for value in vars(part).values()]
+    shapes = {np.shape(value) for value in values if not isinstance(value, type)}  # all but the type of numbers
+    if space is not None and not all(_broadcasts(shape, space.shape) for shape in shapes):
+        raise ArchiveError(
+            f"the archive has an action_noise with numbers of shape {max(shapes, key=math.prod)!s:.50}, but actions "
+            f"have the shape {space.shape}: it is damaged, or was made to exhaust memory."
+        )
+    n_envs, frame_stack = settings.get("n_envs", 1), settings.get("replay_buffer_kwargs", {}).get("frame_stack", 1)
+    if _is_count(frame_stack) and int(n_envs) * int(frame_stack) > MAX_STACKED_FRAMES:
+        raise ArchiveError(
+            f"the archive has n_envs={n_envs} and frame_stack={frame_stack}, but together they may be at most "
+            f"{MAX_STACKED_FRAMES}: it was made to exhaust memory."
+        )
+
+
+def _broadcasts(shape: tuple[int, ...], to: tuple[int, ...]) -> bool:
+    try:
+        return np.broadcast_shapes(shape, to) == to
+    except ValueError:
+        return False
 
 
 #: Each type's parts, of which the function of the same name in ``_READERS`` makes it again
@@ -267,15 +303,11 @@ _READERS: dict[str, Callable[..., Any]] = {
 
 
 def _is_integer(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and -(2**63) <= int(value) < 2**63
+    return is_integer(value, -(2**63)) and int(value) < 2**63
 
 
 def _is_count(value: Any) -> bool:
     return _is_integer(value) and value >= 0
-
-
-def is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def _is_schedule(value: Any) -> bool:
@@ -303,7 +335,7 @@ def _is_observation(value: Any) -> bool:
 
 
 #: What each setting of an archive has to be, in words and as a check; what an argument may be beyond its type is
-#: checked by set-up, as for a new model. Of a subclass's own settings nothing is known.
+#: checked by set-up, as for a new model. Of a subclass's own settings nothing is known; the base class has no others.
 SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
     name: entry
     for names, entry in {
@@ -334,7 +366,7 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
         "use_sde use_sde_at_warmup optimize_memory_usage normalize_curiosity curiosity_encoder_grad task overlap "
         "_warmed_up _custom_logger": ("True or False", _is_a(bool)),
         "compile": ("True, False or a string", _is_a(bool, str)),
-        "srl_schedule curiosity_target update precision": ("a string", _is_a(str)),
+        "srl_schedule curiosity_target update precision on_bad_transition": ("a string", _is_a(str)),
         "curiosity _collector": ("a string or None", _or_none(_is_a(str))),
         "tensorboard_log": ("a path or None", _or_none(lambda value: isinstance(value, str | pathlib.PurePath))),
         "policy_kwargs replay_buffer_kwargs srl_kwargs": ("a dictionary", _is_a(dict)),

@@ -12,7 +12,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_cure.encoder_optimizer import EncoderOptimizer
 from sb3_cure.serialization import Archive, ArchiveError, one_line
-from sb3_cure.settings import is_number, whole
+from sb3_cure.settings import whole
+from sb3_cure.values import is_number
 
 if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC

@@ -11,6 +11,7 @@ import os
 import pickle
 import pickletools
 import struct
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -33,8 +34,10 @@ from torch import nn
 
 from benchmarks.fuzz import example_model, examples, fuzz, load, members_of, outcome, watching, zip_of
 from sb3_cure import CuReSAC
+from sb3_cure.buffers import SkippingReplayBuffer
 from sb3_cure.encoders import VectorEncoder
 from sb3_cure.serialization import ArchiveError
+from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA
 from sb3_cure.zoo import ActingCuReSAC
 
 # -------------------------------------------------------------------- settings
@@ -137,6 +140,37 @@ def test_settings_that_the_class_has_not() -> None:
     with pytest.raises(ArchiveError, match=r"the setting 'spam', which CuReSAC does not have"):
         CuReSAC.load(file)
     assert CuReSAC.load(file, trusted=True).spam == 0.5
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(),
+        dict(srl=None, curiosity=None),
+        dict(ent_coef=0.1, curiosity="bonus"),
+        dict(srl=None, curiosity=None, use_sde=True),
+    ],
+    ids=str,
+)
+def test_all_that_a_model_has_is_a_setting_with_a_schema_or_no_setting(kwargs: dict[str, Any]) -> None:
+    """So that what else an archive may have is a subclass's own."""
+    model = tiny_model("MlpPolicy", VectorBox(), learning_starts=5, **kwargs).learn(12)
+    assert vars(model).keys() <= SCHEMA.keys() | NEVER_SAVED | DERIVED
+    assert not SCHEMA.keys() & (NEVER_SAVED | DERIVED)
+    assert {*model._excluded_save_params()} <= NEVER_SAVED | {"_custom_logger"}
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+@pytest.mark.parametrize("name", sorted(NEVER_SAVED | DERIVED))
+def test_parts_of_the_running_model_are_no_settings(name: str, trusted: bool) -> None:
+    """No archive can set one, or have it asked for, nor does `save` write one."""
+    for node in (None, {"placeholder": "spam"}):
+        file = io.BytesIO(setting(name, node)())
+        with pytest.raises(ArchiveError, match=rf"has {name}, which is no setting"):
+            CuReSAC.load(file, custom_objects={name: None}, trusted=trusted)
+    if name in NEVER_SAVED:
+        with pytest.raises(ValueError, match=rf"include=\['{name}'\], which an archive does not hold"):
+            example_model().save(io.BytesIO(), include=[name])
 
 
 # ----------------------------------------------------------- SB3's conventions
@@ -328,6 +362,20 @@ def test_dictionaries_and_pickled_buffers(tmp_path: Path) -> None:
         her.load_replay_buffer(tmp_path / "dictionaries")
 
 
+def test_a_buffer_that_skips_is_known_by_name() -> None:
+    """As class of the replay buffer it needs no custom_objects."""
+    model = tiny_model(
+        "MlpPolicy", VectorBox(), srl=None, curiosity=None, replay_buffer_class=SkippingReplayBuffer
+    ).learn(12)
+    file, buffer = io.BytesIO(), io.BytesIO()
+    model.save(file)
+    model.save_replay_buffer(buffer)
+    loaded = CuReSAC.load(file)
+    loaded.load_replay_buffer(buffer)
+    assert type(loaded.replay_buffer) is loaded.replay_buffer_class is SkippingReplayBuffer
+    assert differences(loaded.replay_buffer.rewards[:12], model.replay_buffer.rewards[:12]) == []
+
+
 # ---------------------------------------------------------------- the corpus
 
 HERE = Path(__file__)
@@ -467,6 +515,17 @@ def box(shape: list[int], low: Any = 0, high: Any = 255, dtype: str = "|u1") -> 
     return {"Box": {"tuple": [low, high, shape, dtype]}}
 
 
+def noisy(noise: Any) -> bytes:
+    """A model with an action noise."""
+    model, file = example_model(), io.BytesIO()
+    try:
+        model.action_noise = noise
+        model.save(file)
+    finally:
+        model.action_noise = None
+    return file.getvalue()
+
+
 SLOTS = [
     "policy.pth", "actor.optimizer.pth", "policy.encoder_optimizer.pth", "curious_ent_coef_optimizer.pth",
     "pytorch_variables.pth",
@@ -581,6 +640,13 @@ MODELS: dict[str, Callable[[], bytes]] = {
     "a huge observation": setting("observation_space", box([10**6, 10**6, 3])),
     "huge spaces together": setting("observation_space", {"Tuple": {"tuple": [box([2000, 2000])] * 50}}),
     "a huge discrete space": setting("observation_space", {"Discrete": {"tuple": [10**12, 0, "<i8"]}}),
+    "many long stacks": lambda: changed_json(
+        "model",
+        lambda settings: settings.update(n_envs=2**16, replay_buffer_kwargs={"dict": {"frame_stack": 4096}}),
+    ),
+    "huge noise": lambda: noisy(NormalActionNoise(np.zeros(10**5), np.zeros(1))),
+    "noise that is large when it is drawn": lambda: noisy(NormalActionNoise(np.zeros((10**4, 1)), np.zeros((1, 2)))),
+    "noise of noise": lambda: noisy(VectorizedActionNoise(NOISES[1], 3)),
     "huge layers": policy_kwarg("net_arch", [10**6, 10**6]),
     "many layers": policy_kwarg("net_arch", [1] * 300_000),
     "many critics": policy_kwarg("n_critics", 10**9),
@@ -735,6 +801,34 @@ def test_hostile_and_broken_files(kind: str, build: Callable[[], bytes]) -> None
     data = build()
     assert outcome(lambda: load(kind, data)) == "refused"
     assert not (HERE.parent / "executed").exists()
+
+
+@pytest.mark.parametrize("name", ["many long stacks", "huge noise", "noise that is large when it is drawn"])
+def test_what_would_become_large_is_named(name: str) -> None:
+    """Rather than refused for lack of memory, which a larger machine has."""
+    with pytest.raises(ArchiveError, match=r"the archive has .*: it (is damaged, or )?was made to exhaust memory"):
+        load("model", MODELS[name]())
+
+
+def test_a_noise_is_not_copied_for_every_environment() -> None:
+    noise = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.ones(2)), 200)
+    noise.base_noise = NormalActionNoise(np.zeros(10**5), np.ones(10**5))
+    data = noisy(noise)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ArchiveError, match=r"action_noise with numbers of shape \(100000,\), but actions have"):
+            load("model", data)
+        assert tracemalloc.get_traced_memory()[1] < 10 * len(data) < 200 * 8 * 10**5
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("shape", [(), (1,), (2,)])
+def test_noises_of_any_shape_that_fits_come_back(shape: tuple[int, ...], n_envs: int) -> None:
+    base = NormalActionNoise(np.zeros(shape), np.ones(shape))
+    read = CuReSAC.load(io.BytesIO(noisy(base if n_envs == 1 else VectorizedActionNoise(base, n_envs)))).action_noise
+    assert len(getattr(read, "noises", [read])) == n_envs and getattr(read, "base_noise", read)._mu.shape == shape
 
 
 @pytest.mark.parametrize(

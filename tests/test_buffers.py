@@ -607,6 +607,29 @@ def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
         huge.add(*transition)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 95])  # the last one has a stream in which it comes to that
+def test_no_row_outlives_its_frames_where_observations_stand_still_around_a_mark(seed: int) -> None:
+    """What continues the stack of before the mark would need older frames than the marked row between them."""
+    buffer, rng = (
+        FrameStackReplayBuffer(6, image_space(3, 1), ACTIONS, "cpu", frame_stack=3),
+        np.random.default_rng(seed),
+    )
+    source = distinct_frames(1, (1, 4, 5))
+    stack = [next(source) for _ in range(3)]
+    rows: dict[int, np.ndarray] = {}
+    for _ in range(25):
+        what = rng.choice(["mark", "jump", "step", "step"])
+        following = [next(source) for _ in range(3)] if what == "jump" else [*stack[1:], next(source)]
+        rows[buffer.pos], next_obs = np.concatenate(stack), np.concatenate(following)
+        infos = [{"bad_transition": "bad" if what == "mark" else None}]
+        buffer.add(rows[buffer.pos][None], next_obs[None], np.zeros((1, 2)), np.zeros(1), np.zeros(1), infos)
+        stack = stack if what == "mark" else following
+        for row in (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size:
+            if not buffer.marked[row, 0]:
+                batch = buffer.transitions(np.array([row]), np.array([0]))
+                np.testing.assert_array_equal(batch.observations[0].numpy(), rows[int(row)])
+
+
 # ------------------------------------------------------------------ rows from files
 
 
@@ -667,7 +690,10 @@ def test_rows_from_a_file_are_those_that_were_written(data: st.DataObject) -> No
 
 
 def flat(rows: dict[str, Any]) -> dict[str, Any]:
-    return {**rows.pop("rows"), **rows}
+    """By name; without the slots of marked transitions, which are whatever was there."""
+    arrays = dict(rows.pop("rows"))
+    arrays["frame_slots"] = np.where(arrays["marked"][..., None, None], 0, arrays["frame_slots"])
+    return {**arrays, **rows}
 
 
 def broken(data: st.DataObject, value: Any) -> Any:
