@@ -35,7 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks import faults
-from sb3_cure import CuReSAC, files, generations, make_dmc_env
+from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
 from sb3_cure.envs import FaultTolerantSubprocVecEnv
@@ -87,6 +87,14 @@ def in_watched_workers() -> VecEnv:
     return FaultTolerantSubprocVecEnv(environments, on_env_fault="restart", start_method="fork")
 
 
+class Flawed(VectorBox):
+    """Every fifth observation is not a number."""
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, *rest = super().step(action)
+        return observation * (np.nan if self.n_steps % 5 == 0 else 1), *rest
+
+
 CASES = {
     "rae, joint": Case(pixels()),
     "curl, sequential": Case(pixels(), {"srl": "curl", "srl_kwargs": {"crop_size": 32}, "update": "sequential"}),
@@ -107,6 +115,13 @@ CASES = {
     "pretraining": Case(pixels(), {"curiosity": None}, pretrain=25),
     "workers": Case(in_workers),
     "watched workers": Case(in_watched_workers),
+    # Checkpoints are taken after 10, 20, ... steps: episodes of 10 steps, so right after a bad observation, too.
+    "bad transitions": Case(
+        lambda: make_vec_env(Flawed, 1, env_kwargs={"episode_length": 10}),
+        {"on_bad_transition": "skip"},
+        policy="MlpPolicy",
+        save_freq=5,
+    ),
 }
 
 
@@ -302,6 +317,40 @@ def test_signals_are_obeyed_after_a_checkpoint(
     assert differences(expected, outcome(train(CASES["rae, joint"], tmp_path, True), tmp_path)) == []
 
 
+def test_a_signal_that_the_environments_do_not_survive_still_leaves_a_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C in a terminal, or a cluster's SIGTERM, also reaches the workers."""
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 31:
+                monkeypatch.setattr(checkpoint, "vec_env_state", gone)
+                signal.raise_signal(signal.SIGTERM)
+            return True
+
+    def gone(env: VecEnv) -> None:
+        raise BrokenPipeError
+
+    with pytest.raises(SystemExit, match="143"):
+        train(CASES["vectors"], tmp_path, False, Stop())
+    monkeypatch.undo()
+    kept = Generations(tmp_path / "checkpoints")
+    assert kept.read(kept.numbers()[-1]).about["num_timesteps"] == 31
+    assert train(CASES["vectors"], tmp_path, True).num_timesteps == 60
+
+
+def test_a_signal_in_the_last_step_is_obeyed(tmp_path: Path) -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 60:
+                signal.raise_signal(signal.SIGTERM)
+            return True
+
+    with pytest.raises(SystemExit, match="143"):
+        train(CASES["vectors"], tmp_path, False, Stop())
+
+
 # ------------------------------------------------------------------------------------------------- contents
 
 
@@ -329,6 +378,38 @@ def test_a_checkpoint_does_not_disturb_training(tmp_path: Path) -> None:
         for save_freq in (1, 1000)
     )
     assert differences(often, seldom) == []
+
+
+@pytest.mark.parametrize("place", ["before", "after", "inside"])
+def test_the_place_of_the_checkpoint_among_callbacks_does_not_matter(place: str, tmp_path: Path) -> None:
+    class Rollouts(BaseCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.n_rollouts = 0
+
+        def _on_rollout_start(self) -> None:
+            self.n_rollouts += 1
+
+        def _on_step(self) -> bool:
+            return True
+
+    counts = []
+    for calls in (0, 33):
+        folder = tmp_path / str(calls)
+        for attempt in range(2 if calls else 1):
+            env, rollouts, keep = vectors(), Rollouts(), ExactCheckpoint(12, folder)
+            model = CuReSAC.resume(folder, env) if attempt else tiny_model("MlpPolicy", env)
+            callbacks = {
+                "before": [keep, rollouts],
+                "after": [rollouts, keep],
+                "inside": [rollouts, EveryNTimesteps(50, keep)],
+            }
+            try:
+                model.learn(60, callback=[*callbacks[place], KillAt(0 if attempt else calls)])
+            except Killed:
+                continue
+        counts.append(rollouts.n_rollouts)
+    assert counts == [60, 60]
 
 
 class OneStart(gym.Wrapper):
