@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_for_tests import PixelBox, VectorBox, differences
+from envs_for_tests import VectorBox, differences
 from gymnasium import spaces, wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -320,6 +320,12 @@ def test_dictionaries_of_observations_and_the_generators_of_their_spaces_go_on()
     goes_on(venv, fresh, 30)
 
 
+class Silent(gym.Env):
+    """Tells nothing of its state."""
+
+    action_space = observation_space = spaces.Box(-1, 1, (2,), np.float32)
+
+
 class Remembering(gym.ObservationWrapper):
     """Of which nothing is known."""
 
@@ -329,7 +335,7 @@ class Remembering(gym.ObservationWrapper):
 
 def test_what_cannot_be_saved_is_named(tmp_path: Any) -> None:
     refused: dict[str, Callable[[], VecEnv]] = {
-        "the environment PixelBox ": lambda: DummyVecEnv([PixelBox]),
+        "the environment Silent ": lambda: DummyVecEnv([Silent]),
         "the wrapper Remembering ": lambda: DummyVecEnv([Dot, lambda: Monitor(Remembering(Dot()))]),
         "the wrapper RecordVideo ": lambda: DummyVecEnv([lambda: wrappers.RecordVideo(Dot(), str(tmp_path / "a"))]),
         "the wrapper VecVideoRecorder ": lambda: VecVideoRecorder(
