@@ -338,10 +338,11 @@ def test_a_damaged_checkpoint_is_left_out(
     with pytest.raises(ZeroDivisionError):
         run_cell(cell, tmp_path, 0, pictures=False)
     monkeypatch.setattr(cells, "write_text", write)
-    (newest,) = (tmp_path / cell.folder / "checkpoint").glob("generation-*")
-    (newest / "model.zip").write_bytes((newest / "model.zip").read_bytes()[:1000])
+    for path in (tmp_path / cell.folder / "checkpoint").glob("generation-*/model.zip"):
+        path.write_bytes(path.read_bytes()[:1000])
     folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "begins anew: no checkpoint in" in capsys.readouterr().out
+    assert "begins anew, its checkpoints are kept in unusable-0: no checkpoint in" in capsys.readouterr().out
+    assert len(list((folder / "unusable-0").glob("generation-*"))) == 2
     assert steps_of(folder / "eval.csv") == [0, 160] and (folder / "DONE").exists()
 
 
