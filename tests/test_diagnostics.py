@@ -347,7 +347,7 @@ def test_looking_changes_nothing(srl: str) -> None:
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (dict(every=0), r"DiagnosticsCallback got every=0, but it counts agent steps: give a number >= 1"),
+        (dict(every=0), r"DiagnosticsCallback got every=0, but it counts agent steps: give a whole number >= 1"),
         (dict(n_samples=1), r"got n_samples=1, .* they must be at least 2, 0 and 0: change them"),
         (dict(autoencoder_updates=-1), r"autoencoder_updates=-1, but they must be at least 2, 0 and 0"),
         (dict(temperature_bounds=[1, 0]), r"got temperature_bounds=\[1, 0\], but .*: give two numbers >= 0"),
