@@ -377,3 +377,22 @@ def test_a_state_of_other_environments_is_refused_in_one_sentence() -> None:
         with pytest.raises(ValueError, match=r"does not fit these environments, build them as .*: \w") as error:
             load_vec_env_state(second(), saved(first()))
         assert "\n" not in str(error.value)
+
+
+def test_rl_zoos_time_limit_is_known() -> None:
+    """rl-zoo puts a class of its own in the place of Gymnasium's, in every process that imports it."""
+    from rl_zoo3.gym_patches import PatchedTimeLimit
+
+    (original,) = (kind for kind in PatchedTimeLimit.__mro__ if kind.__name__ == "TimeLimit")
+
+    def limited(kind: type) -> DummyVecEnv:
+        return DummyVecEnv([lambda: Monitor(kind(Dot(episode_length=1000), 6))])
+
+    venv, other = limited(PatchedTimeLimit), limited(original)
+    venv.reset()
+    for _ in range(4):
+        venv.step(np.zeros((1, 2)))
+    assert why_not_restorable(venv) is None
+    load_vec_env_state(other, vec_env_state(venv))
+    dones = [other.step(np.zeros((1, 2)))[2][0] for _ in range(8)]
+    assert dones == [step in (1, 7) for step in range(8)]

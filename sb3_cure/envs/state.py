@@ -74,6 +74,12 @@ _STATELESS: tuple[type, ...] = (
     VecTransposeImage,
 )
 
+
+def _class_of(kind: type) -> type:
+    """The class itself, or Gymnasium's where rl-zoo has put a subclass of its own in its place (``TimeLimit``)."""
+    return kind.__mro__[1] if kind.__module__ == "rl_zoo3.gym_patches" else kind
+
+
 # By class (not its subclasses, which may remember more): the attributes that change. Times of the clock are left out.
 ATTRIBUTES: dict[type, tuple[str, ...]] = {
     **dict.fromkeys(_STATELESS, ()),
@@ -92,7 +98,7 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
     ),
     wrappers.StickyAction: ("last_action", "is_sticky_actions", "num_repeats", "repeats_taken"),
     wrappers.TimeAwareObservation: ("timesteps",),
-    wrappers.TimeLimit: ("_elapsed_steps",),
+    _class_of(wrappers.TimeLimit): ("_elapsed_steps",),
     Monitor: ("rewards", "needs_reset", "episode_returns", "episode_lengths", "total_steps", "current_reset_info"),
     # The buffers of DummyVecEnv are overwritten by every step.
     DummyVecEnv: ("_seeds", "_options"),
@@ -260,7 +266,7 @@ def _why_not(layer: Any) -> str | None:
                     return (
                         f"{name} was given {key} of type {type(value).__name__} (set_attr, set_options), not plain data"
                     )
-    if _has_state_dict(layer) or type(layer) in ATTRIBUTES:
+    if _has_state_dict(layer) or _class_of(type(layer)) in ATTRIBUTES:
         return None
     if _is_dmc(layer):
         from dm_control.rl.control import Environment
@@ -291,7 +297,7 @@ def _load_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
 
 
 def _check_layers(layers: list[Any], states: list[dict[str, Any]]) -> None:
-    found, saved = [type(layer).__name__ for layer in layers], [state["layer"] for state in states]
+    found, saved = [_class_of(type(layer)).__name__ for layer in layers], [state["layer"] for state in states]
     if found != saved:
         raise ValueError(f"it is of {' around '.join(saved)}, and here is {' around '.join(found)}")
 
@@ -303,7 +309,7 @@ def _layer_state(layer: Any) -> dict[str, Any]:
         own = _dmc_state(layer)
     else:
         own = _plain(layer)
-    state = {"layer": type(layer).__name__, "own": own}
+    state = {"layer": _class_of(type(layer)).__name__, "own": own}
     state["spaces"] = [_generator_state(space._np_random) for space in _spaces(layer)]
     if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper):
         state["np_random"] = _generator_state(layer._np_random)
@@ -330,9 +336,9 @@ def _load_layer_state(layer: Any, state: dict[str, Any]) -> None:
 
 def _plain(value: Any) -> Any:
     """A copy of what is to be saved of a value."""
-    if type(value) in ATTRIBUTES:
+    if _class_of(type(value)) in ATTRIBUTES:
         own = vars(value)
-        return {name: _plain(own[name]) for name in ATTRIBUTES[type(value)] if name in own}
+        return {name: _plain(own[name]) for name in ATTRIBUTES[_class_of(type(value))] if name in own}
     if isinstance(value, dict):
         return {key: _plain(part) for key, part in value.items()}
     return [_plain(part) for part in value] if isinstance(value, deque) else copy.deepcopy(value)
@@ -340,8 +346,8 @@ def _plain(value: Any) -> Any:
 
 def _restored(current: Any, saved: Any) -> Any:
     """The saved value, in the object that holds such values now where it is one of those above."""
-    if type(current) in ATTRIBUTES:
-        for name in ATTRIBUTES[type(current)]:
+    if _class_of(type(current)) in ATTRIBUTES:
+        for name in ATTRIBUTES[_class_of(type(current))]:
             if name in saved:
                 setattr(current, name, _restored(vars(current).get(name), saved[name]))
         return current
