@@ -45,7 +45,7 @@ from sb3_cure.checks import (
     make_env,
 )
 from sb3_cure.files import PathOrFile
-from sb3_cure.guards import Guard, TransitionGuard, check_actions
+from sb3_cure.guards import Guard, TransitionGuard, check_actions, look_before_steps
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
@@ -294,6 +294,9 @@ class CuReSAC(SAC):
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
             check_parts(self)
             super()._setup_model()
+            # SB3's update knows no guard: its optimisers look before they step.
+            optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
+            look_before_steps(self, {**optimizers, "temperature": self.ent_coef_optimizer})
             return
         check_shared_encoder_space(self.observation_space, self.policy_class)
         self._choose_replay_buffer()

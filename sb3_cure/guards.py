@@ -11,7 +11,8 @@ import math
 import tempfile
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -290,6 +291,25 @@ class Guard:
         except OSError as failure:
             where = f"the logs (a post-mortem could not be written: {failure})"
         return NonFiniteError(error.source, error.value, error.update, where)
+
+
+def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> None:
+    """See to it that no optimiser steps along gradients that are not finite, whoever calls it.
+
+    The value is read at once, which on a GPU waits for it; there is no post-mortem.
+
+    :param model: The model, for the number of the update
+    :param optimizers: Optimisers by the name of what they train; None is left out
+    """
+    guard = Guard()
+
+    def look(name: str, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        guard._start(model._n_updates)
+        guard.check(f"{name} loss", None, optimizer)
+
+    for name, optimizer in optimizers.items():
+        if optimizer is not None:
+            optimizer.register_step_pre_hook(partial(look, name))
 
 
 def _error(name: str, check: Check) -> NonFiniteError:

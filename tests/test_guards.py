@@ -375,6 +375,21 @@ def test_a_post_mortem_that_cannot_be_written_hides_nothing(monkeypatch: pytest.
         model.train(1, 8)
 
 
+@pytest.mark.parametrize("value", [NAN, float("inf")])
+def test_with_everything_off_no_optimiser_takes_what_is_not_finite(value: float) -> None:
+    """SB3's own update: the critic's loss is bad, and no network has moved."""
+    model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None).learn(30)
+    before = copy.deepcopy(model.policy.state_dict())
+    model.replay_buffer.rewards[:] = value
+    with pytest.raises(NonFiniteError, match=r"gradient of the critic loss was (nan|inf) in update 20, but"):
+        model.train(1, 8)
+    assert differences(before, model.policy.state_dict()) == []
+    assert th.isfinite(model.log_ent_coef)
+    model.replay_buffer.rewards[:] = 0
+    model.train(1, 8)
+    assert differences(before, model.policy.state_dict()) != []
+
+
 # ----------------------------------------------------------------- transitions
 
 
