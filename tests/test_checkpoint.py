@@ -227,7 +227,7 @@ def _train_in_child(name: str, folder: Path) -> None:
 
 
 def _wait_for_generation(folder: Path, number: int, process: Any) -> None:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while max(Generations(folder / "checkpoints").numbers(), default=-1) < number:
         assert process.is_alive() if hasattr(process, "is_alive") else process.poll() is None
         assert time.monotonic() < deadline
