@@ -434,8 +434,8 @@ def _load_buffer(model: "CuReSAC", generation: Generation, state: dict[str, Any]
             f"{type(buffer).__name__}: resume with environments that tell the same frame_stack."
         )
     load_frame_rows(buffer, state["buffer"], str(generation.folder))
-    if len(buffer.frames) == 0 and buffer._n_frames > 0:
-        buffer.frames = buffer._file_for_frames()
+    if buffer._n_frames > 0:
+        buffer.reserve_frames()
     lost_names = {path.name for path in lost}
     for segment in _frame_segments(generation, buffer):
         first = max(segment.first, buffer._n_frames - buffer.frame_capacity)
