@@ -363,10 +363,11 @@ def main() -> None:
     """Run the whole campaign and write ``faults.json``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/robustness"), help="folder to write")
+    parser.add_argument("--points", type=int, help="failing writes to take, evenly spread (default: all of them)")
     options = parser.parse_args()
     th.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
-        outcomes = campaign(Path(folder))
+        outcomes = campaign(Path(folder), options.points)
     counts = Counter((outcome.fault.kind, outcome.resumed) for outcome in outcomes)
     losses = [outcome for outcome in outcomes if not outcome.expected]
     options.out.mkdir(parents=True, exist_ok=True)
@@ -374,6 +375,7 @@ def main() -> None:
         options.out / "faults.json",
         {
             "faults": len(outcomes),
+            "write_points_taken": options.points or "all",
             "losses": len(losses),
             "resumed": [{"fault": kind, "from": name, "times": n} for (kind, name), n in sorted(counts.items())],
             "lost": [str(loss) for loss in losses],
