@@ -5,16 +5,18 @@ import statistics
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import psutil
 
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
+from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.checkpoint import CheckpointWriter
+from sb3_cure.generations import CHUNK
 
-BUFFER_SIZE, NEW_STEPS = 80_000, 10_000
+BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
 NETWORKS: dict[str, dict[str, Any]] = {
     "paper's networks": {},
@@ -28,17 +30,17 @@ def _collect(model: CuReSAC, steps: int) -> None:
         fill(model.replay_buffer, transitions[: steps - start])  # type: ignore[arg-type]
 
 
-def _write_frames(model: CuReSAC, n_frames: int, path: Path) -> float:
-    """Seconds to write so many frames and to wait for the disk: the least that a checkpoint can take."""
-    buffer: Any = model.replay_buffer
+def _write_frames(model: CuReSAC, n_frames: int, at_once: int, folder: Path, number: int) -> float:
+    """Seconds to write so many frames, to wait for the disk, and to keep three such files."""
+    content = cast(FrameStackReplayBuffer, model.replay_buffer).frames[:n_frames].reshape(-1).data
     start = time.perf_counter()
-    with path.open("wb") as file:
-        file.write(buffer.frames[:n_frames].reshape(-1).data)
+    with (folder / f"bare-{at_once}-{number}").open("wb") as file:
+        for first in range(0, len(content), at_once):
+            file.write(content[first : first + at_once])
         file.flush()
         os.fsync(file.fileno())
-    seconds = time.perf_counter() - start
-    path.unlink()
-    return seconds
+    (folder / f"bare-{at_once}-{number - KEEP}").unlink(missing_ok=True)
+    return time.perf_counter() - start
 
 
 def _peak_mb(reset: bool = False) -> float:
@@ -52,39 +54,46 @@ def _peak_mb(reset: bool = False) -> float:
 
 def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
     """
-    :param repeats: Checkpoints, each after ``NEW_STEPS`` new transitions, taken in turn with the bare writing
+    :param repeats: Checkpoints, each after ``NEW_STEPS`` new transitions, in turn with the bare writing of the frames,
+        in one call and in pieces as a checkpoint writes them
     :param directory: Where to write; by default where temporary files go
-    :return: Seconds of both, their ratio, and the memory that a checkpoint needs meanwhile
+    :return: Seconds of all three, the ratios of their sums, and the memory that a checkpoint needs meanwhile
     """
     results: dict[str, Any] = {}
-    for name, policy_kwargs in NETWORKS.items():
+    for networks, policy_kwargs in NETWORKS.items():
         model = make_model(buffer_size=BUFFER_SIZE, policy_kwargs=policy_kwargs)
         model.train(2, 8)  # so that the optimisers have a state
         _collect(model, BUFFER_SIZE)
         with tempfile.TemporaryDirectory(dir=directory) as folder:
             writer = CheckpointWriter(folder)
-            generation = writer.write(model, keep=3)
-            times: dict[str, list[float]] = {"frames": [], "checkpoint": []}
+            generation = writer.write(model, keep=KEEP)
+            times: dict[str, list[float]] = {name: [] for name in ("at once", "in pieces", "checkpoint")}
             extra = []
-            for _ in range(repeats):
+            for number in range(repeats + KEEP):
                 before = model.replay_buffer._n_frames
                 _collect(model, NEW_STEPS)
-                times["frames"].append(
-                    _write_frames(model, model.replay_buffer._n_frames - before, Path(folder) / "bare")
-                )
-                resident = _peak_mb(reset=True)
-                start = time.perf_counter()
-                generation = writer.write(model, keep=3)
-                times["checkpoint"].append(time.perf_counter() - start)
-                extra.append(_peak_mb() - resident)
-            ratios = [b / a for a, b in zip(times["frames"], times["checkpoint"], strict=True)]
+                n_frames = model.replay_buffer._n_frames - before
+                # Each is the first one in turn: what comes first finds other free memory for the disk's cache.
+                for name in np.roll(list(times), number):
+                    if name == "checkpoint":
+                        resident = _peak_mb(reset=True)
+                        start = time.perf_counter()
+                        generation = writer.write(model, keep=KEEP)
+                        times[name].append(time.perf_counter() - start)
+                        extra.append(_peak_mb() - resident)
+                    else:
+                        at_once = 2**40 if name == "at once" else CHUNK
+                        times[name].append(_write_frames(model, n_frames, at_once, Path(folder), number))
+            times = {name: values[KEEP:] for name, values in times.items()}  # from when files are also removed
             new_mb = (generation.segments[-1].size + sum(entry.size for entry in generation.files)) / 1e6
-        results[name] = {
+        results[networks] = {
             "new_frames_mb": round(generation.segments[-1].size / 1e6),
             "all_that_is_written_mb": round(new_mb),
-            "frames_alone_s": round(statistics.median(times["frames"]), 3),
+            "frames_at_once_s": round(statistics.median(times["at once"]), 3),
+            "frames_in_pieces_s": round(statistics.median(times["in pieces"]), 3),
             "checkpoint_s": round(statistics.median(times["checkpoint"]), 3),
-            "ratio": round(statistics.median(ratios), 2),
+            "ratio_to_at_once": round(sum(times["checkpoint"]) / sum(times["at once"]), 2),
+            "ratio_to_in_pieces": round(sum(times["checkpoint"]) / sum(times["in pieces"]), 2),
             "extra_memory_mb": round(float(np.max(extra))),
         }
     return results

@@ -81,15 +81,19 @@ class CheckpointWriter:
         state = training_state(model, environments_may_be_gone)
 
         def fill(draft: Draft) -> dict[str, Any]:
-            model.save(draft.path(MODEL))
+            with draft.file(MODEL) as path:
+                model.save(path)
             if isinstance(model.replay_buffer, FrameStackReplayBuffer):
                 segments[:] = self._write_frames(draft, model.replay_buffer)
                 state["buffer"] = frame_rows(model.replay_buffer)
             else:
-                model.save_replay_buffer(draft.path(BUFFER))
+                with draft.file(BUFFER) as path:
+                    model.save_replay_buffer(path)
             for number, output in enumerate(_log_files(model)):
-                shutil.copyfile(output.file.name, draft.path(f"log-{number}"))  # type: ignore[attr-defined]
-            write_state(draft.path(STATE), state)
+                with draft.file(f"log-{number}") as path:
+                    shutil.copyfile(output.file.name, path)  # type: ignore[attr-defined]
+            with draft.file(STATE) as path:
+                write_state(path, state)
             frames = [[segment.entry.name, segment.first, segment.last] for segment in segments]
             return {"num_timesteps": model.num_timesteps, "n_updates": model._n_updates, "frames": frames}
 

@@ -19,6 +19,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -164,20 +165,22 @@ class Generations:
         numbers = self.numbers()
         number = numbers[-1] + 1 if numbers else 0
         self.segments.mkdir(exist_ok=True)
-        draft = Draft(self, number)
-        try:
-            about = fill(draft)
-            files = [draft.seal(path) for path in sorted(draft.folder.iterdir())]
-            content = {"files": files, "segments": draft.segments, "about": about}
-            manifest = draft.folder / "manifest.json"
-            manifest.write_text(json.dumps({"manifest": content, "sha256": _sha256_of(_canonical(content))}))
-            for path in (manifest, draft.folder, self.segments):
-                flush_to_disk(path)
-            draft.folder.rename(self.folder(number))
-            flush_to_disk(self.path)
-        except BaseException:
-            draft.discard()
-            raise
+        with ThreadPoolExecutor(max_workers=1) as background:
+            draft = Draft(self, number, background)
+            try:
+                about = fill(draft)
+                files = [draft.seal(path) for path in sorted(draft.folder.iterdir())]
+                content = {"files": files, "segments": draft.segments, "about": about}
+                manifest = draft.folder / "manifest.json"
+                manifest.write_text(json.dumps({"manifest": content, "sha256": _sha256_of(_canonical(content))}))
+                for path in (manifest, draft.folder, self.segments):
+                    flush_to_disk(path)
+                draft.folder.rename(self.folder(number))
+                flush_to_disk(self.path)
+            except BaseException:
+                background.shutdown(cancel_futures=True)
+                draft.discard()
+                raise
         with contextlib.suppress(OSError):  # what could not be removed now is removed after the next one
             self._prune(keep)
         return Generation(number, self.folder(number), files, draft.segments, about)
@@ -204,34 +207,40 @@ class Generations:
 
 
 class Draft:
-    """A generation that is being written.
+    """A generation that is being written. What has been written is hashed in the background meanwhile.
 
     :param generations: Where
     :param number: Its number
+    :param background: Where to hash
     """
 
-    def __init__(self, generations: Generations, number: int):
+    def __init__(self, generations: Generations, number: int, background: ThreadPoolExecutor):
         self.number = number
         self.folder = generations.path / f".unfinished-{number}"
         self._segments_folder = generations.segments
         #: The files in ``segments/`` that it needs: older ones are to be appended, ``new_segment`` appends its own
         self.segments: list[Entry] = []
         self._new: list[Path] = []
+        self._background = background
+        self._digests: dict[Path, Future[tuple[str, int]]] = {}
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir()
 
-    def path(self, name: str) -> Path:
+    @contextlib.contextmanager
+    def file(self, name: str) -> Iterator[Path]:
         """
         :param name: Name of a file of this generation
-        :return: Where to write it
+        :return: Where to write it, inside the ``with`` block
         """
-        return self.folder / name
+        path = self.folder / name
+        yield path
+        self._digests[path] = self._background.submit(_digest, path)
 
     def new_segment(self, name: str, chunks: Iterable[memoryview]) -> Entry:
         """Write a file that later generations may share.
 
         :param name: Its name, without a suffix
-        :param chunks: Its content
+        :param chunks: Its content, at least one
         :return: Its entry
         """
         path = self._segments_folder / f"{name}-{self.number:06d}.bin"
@@ -239,22 +248,22 @@ class Draft:
         digest, size = hashlib.sha256(), 0
         with path.open("wb") as file:
             for chunk in chunks:
+                hashed = self._background.submit(digest.update, chunk)
                 file.write(chunk)
-                digest.update(chunk)
                 size += chunk.nbytes
         flush_to_disk(path)
+        hashed.result()
         entry = Entry(path.name, size, digest.hexdigest())
         self.segments.append(entry)
         return entry
 
-    @staticmethod
-    def seal(path: Path) -> Entry:
+    def seal(self, path: Path) -> Entry:
         """
-        :param path: A file that has been written
+        :param path: A file that ``file`` gave and that has been written
         :return: Its entry, when all of it is on the disk
         """
         flush_to_disk(path)
-        digest, size = _digest(path)
+        digest, size = self._digests[path].result()
         return Entry(path.name, size, digest)
 
     def discard(self) -> None:

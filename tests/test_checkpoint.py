@@ -552,7 +552,8 @@ def test_what_a_stranger_put_into_a_checkpoint_reaches_no_file_and_no_code(tmp_p
     def copy(draft: Draft) -> dict[str, Any]:
         for path in folder.iterdir():
             if path.name != "manifest.json":
-                shutil.copy(path, draft.folder)
+                with draft.file(path.name) as place:
+                    shutil.copyfile(path, place)
         return {"frames": []}
 
     kept.write(copy, 1)
