@@ -597,11 +597,14 @@ def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
     space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
     stack = np.zeros((1, 6, 84, 84), np.uint8)
     transition: tuple[Any, ...] = (stack, stack, np.ones((1, 2)), np.zeros(1), np.zeros(1), [{}])
-    nowhere = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "none")
-    with pytest.raises(
-        ValueError, match=r"frames_dir is '.*/none', but .* GB for frames cannot be reserved there \(No"
-    ):
-        nowhere.add(*transition)
+    new = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "not" / "there")
+    assert not (tmp_path / "not").exists()
+    new.add(*transition)
+    assert (tmp_path / "not" / "there").is_dir()
+    taken = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "taken")
+    (tmp_path / "taken").touch()
+    with pytest.raises(ValueError, match=r"frames_dir is '.*/taken', but .* GB for frames cannot be reserved there \("):
+        taken.add(*transition)
     huge = FrameStackReplayBuffer(10**8, space, ACTIONS, frame_stack=2, frames_dir=tmp_path)
     with pytest.raises(ValueError, match="name a directory on a disk with room, or make buffer_size smaller"):
         huge.add(*transition)

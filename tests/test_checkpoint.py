@@ -60,6 +60,7 @@ class Case:
     steps: int = 60
     save_freq: int = 12
     pretrain: int = 0
+    frames_on_disk: bool = False
 
 
 def pixels(n_envs: int = 1, **kwargs: Any) -> Callable[[], VecEnv]:
@@ -99,6 +100,7 @@ CASES = {
     "rae, joint": Case(pixels()),
     "curl, sequential": Case(pixels(), {"srl": "curl", "srl_kwargs": {"crop_size": 32}, "update": "sequential"}),
     "four environments, small ring": Case(pixels(4), {"buffer_size": 60}, steps=120),
+    "frames on disk, small ring": Case(pixels(), {"buffer_size": 25}, frames_on_disk=True),
     "vectors": Case(vectors, policy="MlpPolicy"),
     "schedules, noise, alternating": Case(
         pixels(),
@@ -132,7 +134,8 @@ def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallba
     if resume:
         model = CuReSAC.resume(folder / "checkpoints", env, device="cpu")
     else:
-        model = tiny_model(case.policy, env, **case.arguments)
+        on_disk = {"replay_buffer_kwargs": {"frames_dir": folder / "frames"}} if case.frames_on_disk else {}
+        model = tiny_model(case.policy, env, **case.arguments, **on_disk)
     model.set_logger(configure(str(folder / "logs"), ["csv"]))
     try:
         if case.pretrain > 0:
