@@ -246,14 +246,8 @@ class Guard:
         self._checks = {name: check for name, check in latest.items() if check.update == first.update}
         error = _error(name, first)
         draw = next((draw for draw in draws if draw.update == error.update), None)
-        batch, origin = None, "no longer known"
-        if draw is not None and draw.rows is not None and draw.env_inds is not None:
-            origin = "read again from the replay buffer when the flag was read; transitions may have been replaced"
-            with contextlib.suppress(IndexError):
-                batch = transitions(model.replay_buffer, draw.rows, draw.env_inds, model._vec_normalize_env)  # type: ignore[arg-type]
-        error = self._post_mortem(
-            model, error, draw or Draw(error.update, model.num_timesteps, None, None), batch, origin
-        )
+        draw = draw or Draw(error.update, model.num_timesteps, None, None)
+        error = self._post_mortem(model, error, draw, *_batch_of(model, draw))
         self._checks = {}
         raise error
 
@@ -296,16 +290,22 @@ class Guard:
 def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> None:
     """See to it that no optimiser steps along gradients that are not finite, whoever calls it.
 
-    The value is read at once, which on a GPU waits for it; there is no post-mortem.
+    The value is read at once, which on a GPU waits for it. The post-mortem knows the gradients, and the batch if the
+    replay buffer remembers it.
 
-    :param model: The model, for the number of the update
+    :param model: The model
     :param optimizers: Optimisers by the name of what they train; None is left out
     """
     guard = Guard()
 
     def look(name: str, optimizer: th.optim.Optimizer, *_: Any) -> None:
         guard._start(model._n_updates)
-        guard.check(f"{name} loss", None, optimizer)
+        try:
+            guard.check(f"{name} loss", None, optimizer)
+        except NonFiniteError as error:
+            rows, env_inds = getattr(model.replay_buffer, "last_sampled", None) or (None, None)
+            draw = Draw(error.update, model.num_timesteps, rows, env_inds)
+            raise guard._post_mortem(model, error, draw, *_batch_of(model, draw)) from None
 
     for name, optimizer in optimizers.items():
         if optimizer is not None:
@@ -340,6 +340,15 @@ def _draw(model: "CuReSAC", batch_size: int, random_state: dict[str, Any]) -> Dr
             np.random.set_state(now)
     rows, env_inds = drawn or (None, None)
     return Draw(model._n_updates, model.num_timesteps, rows, env_inds)
+
+
+def _batch_of(model: "CuReSAC", draw: Draw) -> tuple[ReplayBufferSamples | None, str]:
+    """The batch, as the replay buffer has it now, and where it comes from."""
+    if draw.rows is not None and draw.env_inds is not None:
+        with contextlib.suppress(IndexError):
+            batch = transitions(model.replay_buffer, draw.rows, draw.env_inds, model._vec_normalize_env)  # type: ignore[arg-type]
+            return batch, "read again from the replay buffer; transitions may have been replaced since the update"
+    return None, "not known"
 
 
 def _settings(model: "CuReSAC") -> dict[str, Any]:

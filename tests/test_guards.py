@@ -24,7 +24,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import transitions
+from sb3_cure.buffers import SkippingReplayBuffer, transitions
 from sb3_cure.guards import Guard, NonFiniteError, TransitionGuard
 from sb3_cure.serialization import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -376,13 +376,28 @@ def test_a_post_mortem_that_cannot_be_written_hides_nothing(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("value", [NAN, float("inf")])
-def test_with_everything_off_no_optimiser_takes_what_is_not_finite(value: float) -> None:
+@pytest.mark.parametrize("remembers", [False, True], ids=["ReplayBuffer", "SkippingReplayBuffer"])
+def test_with_everything_off_no_optimiser_takes_what_is_not_finite(
+    value: float, remembers: bool, tmp_path: Path
+) -> None:
     """SB3's own update: the critic's loss is bad, and no network has moved."""
-    model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None).learn(30)
+    buffer: Any = {"replay_buffer_class": SkippingReplayBuffer} if remembers else {}
+    model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None, **buffer).learn(30)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
     before = copy.deepcopy(model.policy.state_dict())
     model.replay_buffer.rewards[:] = value
-    with pytest.raises(NonFiniteError, match=r"gradient of the critic loss was (nan|inf) in update 20, but"):
+    with pytest.raises(NonFiniteError, match=r"gradient of the critic loss was (nan|inf) in update 20, but") as caught:
         model.train(1, 8)
+    (folder,) = tmp_path.glob("post_mortem_*")
+    assert caught.value.post_mortem == str(folder)
+    report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report["source"] == "gradient of the critic loss" and report["config"]["batch_size"] == model.batch_size
+    assert report["losses"]["critic loss"]["gradient_norm"] in ("nan", "inf") and report["agent_steps"] == 30
+    assert (report["rows"] is not None) == remembers == (folder / "batch.npz").exists()
+    if remembers:
+        again = transitions(model.replay_buffer, np.array(report["rows"]), np.array(report["environments"]))
+        with np.load(folder / "batch.npz", allow_pickle=False) as batch:
+            np.testing.assert_array_equal(batch["actions"], again.actions.numpy())
     assert differences(before, model.policy.state_dict()) == []
     assert th.isfinite(model.log_ent_coef)
     model.replay_buffer.rewards[:] = 0
