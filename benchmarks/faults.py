@@ -1,6 +1,6 @@
 """Kill a training at every point where it writes a checkpoint, fill its disk, damage its files: what is lost?
 
-python -m benchmarks.faults --out results/robustness (an hour and a half; with --points 40, three minutes)
+python -m benchmarks.faults --out results/robustness (an hour; with --points 40, three minutes)
 
 Each fault hits a copy of a folder with two generations while a third is written (or after it was), in a child process.
 Then the training is resumed, and must be in exactly the state of the newest generation that can be whole; and the
