@@ -19,6 +19,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.policies import CnnPolicy, CuRePolicy, MlpPolicy
@@ -478,6 +479,29 @@ def _reads_images(observation_space: spaces.Space) -> str:
         f"'CnnPolicy' got observations of shape {observation_space.shape}, but it reads images (channels, height, "
         "width): use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels."
     )
+
+
+def check_srl_output(head: nn.Module, output: Any, trains: bool) -> None:
+    """
+    :param head: An SRL head
+    :param output: What its ``loss`` returned
+    :param trains: Whether the loss is to be trained on
+    :raises ValueError: if it is not a loss and an error, or if nothing can be trained on the loss
+    """
+    name = type(head).__name__
+    if not (isinstance(output, tuple) and len(output) == 2 and all(isinstance(part, th.Tensor) for part in output)):
+        kind = "two other things" if isinstance(output, tuple) and len(output) == 2 else f"a {type(output).__name__}"
+        raise ValueError(
+            f"{name}.loss returned {kind}, but it must return two tensors, the loss to minimise and the error of each "
+            "sample: return SRLOutput(loss, error)."
+        )
+    loss = output[0]
+    if loss.numel() != 1 or (trains and not loss.requires_grad):
+        kind = f"of shape {tuple(loss.shape)}" if loss.numel() != 1 else "without a gradient"
+        raise ValueError(
+            f"{name}.loss returned a loss {kind}, but it must be one number that depends on the latents or on the "
+            "head's parameters: average over the batch, and detach the error only."
+        )
 
 
 def check_srl_error(error: th.Tensor, batch_size: int, look: bool) -> None:

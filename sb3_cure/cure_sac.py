@@ -42,6 +42,7 @@ from sb3_cure.checks import (
     check_shared_encoder_space,
     check_skip,
     check_srl_error,
+    check_srl_output,
     make_env,
 )
 from sb3_cure.files import PathOrFile
@@ -507,7 +508,7 @@ class CuReSAC(SAC):
         if self._collector is not None:
             return np.ones(n_envs, dtype=bool)
         if self.curiosity in ("separate", "random") and self.task:
-            return self._mixer.choose(n_envs, self._current_progress_remaining)  # type: ignore[union-attr]
+            return self._mixer.choose(n_envs, self._progress_remaining)  # type: ignore[union-attr]
         return np.zeros(n_envs, dtype=bool)
 
     def _second_actor_actions(self, observations: np.ndarray) -> np.ndarray:
@@ -651,7 +652,8 @@ class CuReSAC(SAC):
         encoder = self.policy.encoder
         with self._autocast():
             features = encoder.trunk(observations)
-            latents = encoder.projection(features)
+            # In full precision, whatever the encoder ends with: losses and the optimiser work with these.
+            latents = encoder.projection(features).float()
         self._log({"train/latent_variance": latents.detach().var(dim=0, correction=0).mean()})
 
         def next_features() -> th.Tensor:
@@ -673,7 +675,9 @@ class CuReSAC(SAC):
         # The loss stops at a copy of the latents; the encoder's optimiser takes the gradient from there.
         latents = encoded.latents.detach().requires_grad_(trains)
         with th.set_grad_enabled(trains), self._autocast():
-            loss, error = srl.loss(batch, latents)
+            output = srl.loss(batch, latents)
+        check_srl_output(srl, output, trains)
+        loss, error = output
         if trains:
             if srl.optimizer is not None:
                 srl.optimizer.zero_grad()
@@ -687,7 +691,7 @@ class CuReSAC(SAC):
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
-                next_latents = self.policy.encoder.projection(encoded.next_features)
+                next_latents = self.policy.encoder.projection(encoded.next_features).float()
                 error = srl.loss(batch._replace(observations=batch.next_observations), next_latents).error  # type: ignore[union-attr]
         return error
 
@@ -789,13 +793,18 @@ class CuReSAC(SAC):
     def _in_rl_phase(self) -> bool:
         return self.srl_schedule == "simultaneous" or not self._in_srl_phase
 
+    @property
+    def _progress_remaining(self) -> float:
+        """What schedules get: SB3's own goes below zero where the last rollout goes beyond ``total_timesteps``."""
+        return max(self._current_progress_remaining, 0.0)
+
     def _autocast(self) -> th.autocast:
         return autocast_context(self._computed_precision, self.device)
 
     def _update_learning_rates(self) -> None:
         """One schedule for everything; the temperatures follow it at a fixed ratio, so that a zero freezes all."""
         policy = self.policy
-        learning_rate = self.lr_schedule(self._current_progress_remaining)
+        learning_rate = self.lr_schedule(self._progress_remaining)
         self.logger.record("train/learning_rate", learning_rate)
         policy.encoder_optimizer.set_learning_rate(learning_rate)
         owners = (policy.srl, policy.actor, policy.critic, policy.curious_actor, policy.curious_critic)

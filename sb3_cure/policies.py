@@ -264,7 +264,14 @@ class CuRePolicy(SACPolicy):
         """
         :param observations: What the encoder is to see (after ``srl.augment`` or ``srl.center``), images in 0-255
         :return: The encoder's input: images in [0, 1]
+        :raises ValueError: if they have another shape than the encoder was built for
         """
+        if observations.shape[1:] != self.encoder_space.shape:
+            raise ValueError(
+                f"{type(self.srl).__name__}.augment or .center gave the encoder observations of shape "
+                f"{tuple(observations.shape[1:])}, but it was built for {self.encoder_space.shape}: return that shape, "
+                "or name another one in configure_encoder."
+            )
         return preprocess(observations, self.encoder_space)
 
     def augment(self, observations: th.Tensor) -> th.Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import stable_baselines3.sac.policies as sb3_policies
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
@@ -1075,6 +1075,58 @@ def test_errors_of_a_users_head(error: Callable[[Any], Any], sentence: str) -> N
             loss, right = super().loss(batch, latents)
             return SRLOutput(loss, error(right))
 
+    with pytest.raises(ValueError, match=sentence):
+        tiny_model("CnnPolicy", PixelBox(), srl=Wrong).learn(12)
+
+
+@pytest.mark.parametrize(
+    "output, sentence",
+    [
+        (lambda loss, error: loss, "returned a Tensor, but it must return two tensors, the loss to "),
+        (
+            lambda loss, error: (loss, error, {}),
+            "returned a tuple, but it must return two tensors, the loss",
+        ),
+        (
+            lambda loss, error: (loss, 0.0),
+            "returned two other things, but it must return two tensors, the loss",
+        ),
+        (
+            lambda loss, error: None,
+            "returned a NoneType, but it must return two tensors, the loss to ",
+        ),
+        (
+            lambda loss, error: (loss.detach(), error),
+            "returned a loss without a gradient, but it must be one number",
+        ),
+        (
+            lambda loss, error: (loss * error, error),
+            r"returned a loss of shape \(8,\), but it must be one number",
+        ),
+    ],
+)
+def test_outputs_of_a_users_head(output: Callable[..., Any], sentence: str) -> None:
+    """Told before anything has moved."""
+
+    class Wrong(RAE):
+        def loss(self, batch: Any, latents: Any) -> Any:
+            return output(*super().loss(batch, latents))
+
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Wrong)
+    before = state_of(model)["policy"]
+    with pytest.raises(ValueError, match=rf"^Wrong\.loss {sentence}"):
+        model.learn(12)
+    assert differences(before, state_of(model)["policy"]) == []
+
+
+@pytest.mark.parametrize("method", ["augment", "center"])
+def test_augmentations_of_a_users_head(method: str) -> None:
+    """The encoder would complain of weights, or read a part of the image."""
+    Wrong = type("Wrong", (RAE,), {method: lambda self, observations: observations[:, :, 2:]})
+    sentence = (
+        r"Wrong\.augment or \.center gave the encoder observations of shape \(6, 34, 36\), but it was built for "
+        r"\(6, 36, 36\): return that shape, or name another one in configure_encoder\."
+    )
     with pytest.raises(ValueError, match=sentence):
         tiny_model("CnnPolicy", PixelBox(), srl=Wrong).learn(12)
 

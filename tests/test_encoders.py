@@ -198,12 +198,14 @@ class SumOfVector(BaseFeaturesExtractor):
     ],
     ids=["nature-rae", "nature-curl", "own-curl-crop", "own-vector"],
 )
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("update", ["joint", "sequential"])
 def test_any_features_extractor_is_shared(
-    policy: str, env: gym.Env, extractor: type, kwargs: dict[str, Any], srl_kwargs: dict[str, Any]
+    policy: str, env: gym.Env, extractor: type, kwargs: dict[str, Any], srl_kwargs: Any, update: str, precision: str
 ) -> None:
     """It is trained, every part of the agent reads it, and actors have a projection of its features."""
     policy_kwargs = {"features_extractor_class": extractor, "features_extractor_kwargs": kwargs}
-    model = tiny_model(policy, env, policy_kwargs=policy_kwargs, **srl_kwargs)
+    model = tiny_model(policy, env, policy_kwargs=policy_kwargs, update=update, precision=precision, **srl_kwargs)
     encoder = model.policy.encoder
     dim = kwargs.get("features_dim", 12 if extractor is MeanColour else 5)
     assert isinstance(encoder, Encoder)

@@ -379,6 +379,28 @@ def test_a_state_of_other_environments_is_refused_in_one_sentence() -> None:
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "other, sentence",
+    [
+        (
+            dict(task="balance"),
+            "DmControlCompatibilityV0 with id='dmc_pixels/cartpole-swingup-v0', and .*-balance-v0",
+        ),
+        (dict(action_repeat=4), "ActionRepeat with num_repeats=8, and here it has 4"),
+        (dict(renderer="dmc"), "DMCPixels with renderer='fast', and here it has 'dmc'"),
+        (dict(camera_id=1), "DMCPixels with camera_id=0, and here it has 1"),
+    ],
+)
+def test_a_state_of_environments_built_otherwise_is_refused(other: dict[str, Any], sentence: str) -> None:
+    """Their states have the same shapes, but the task would be another one from here on."""
+    arguments: dict[str, Any] = dict(domain="cartpole", task="swingup", action_repeat=8, image_size=24, renderer="fast")
+    venv, same = (DummyVecEnv([lambda: make_dmc_env(**arguments)]) for _ in range(2))
+    venv.reset()
+    load_vec_env_state(same, vec_env_state(venv))
+    with pytest.raises(ValueError, match=f"does not fit these environments, .*: it is of {sentence}"):
+        load_vec_env_state(DummyVecEnv([lambda: make_dmc_env(**{**arguments, **other})]), vec_env_state(venv))
+
+
 def test_rl_zoos_time_limit_is_known() -> None:
     """rl-zoo puts a class of its own in the place of Gymnasium's, in every process that imports it."""
     from rl_zoo3.gym_patches import PatchedTimeLimit

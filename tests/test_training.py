@@ -254,6 +254,20 @@ def test_mixing_per_environment_and_step() -> None:
     np.testing.assert_allclose(shares, curious.reshape(15, 60).mean(axis=1))
 
 
+def test_schedules_never_see_progress_below_zero() -> None:
+    """SB3's own goes there when the last rollout goes beyond the total."""
+    seen: list[float] = []
+
+    def schedule(remaining: float) -> float:
+        seen.append(remaining)
+        return 0.01 * remaining
+
+    model = acting_model(PixelBox(), curiosity_prob=schedule, learning_rate=schedule, train_freq=7, learning_starts=10)
+    model.learn(30)
+    assert model.num_timesteps == 35 and model._current_progress_remaining < 0
+    assert min(seen) == 0
+
+
 def test_scheduled_probability() -> None:
     """p_c may be a schedule of the remaining progress."""
     model = acting_model(PixelBox(), curiosity_prob=lambda progress: float(progress > 0.5), learning_starts=10)

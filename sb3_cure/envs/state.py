@@ -300,6 +300,19 @@ def _check_layers(layers: list[Any], states: list[dict[str, Any]]) -> None:
     found, saved = [_class_of(type(layer)).__name__ for layer in layers], [state["layer"] for state in states]
     if found != saved:
         raise ValueError(f"it is of {' around '.join(saved)}, and here is {' around '.join(found)}")
+    for layer, state in zip(layers, states, strict=True):
+        here, there = _how_built(layer), state.get("built", {})
+        for name in here.keys() & there.keys():
+            if here[name] != there[name]:
+                raise ValueError(f"it is of {state['layer']} with {name}={there[name]}, and here it has {here[name]}")
+
+
+def _how_built(layer: Any) -> dict[str, str]:
+    """Arguments of the constructor as they print, as far as Gymnasium knows them, and the id of an environment."""
+    arguments = getattr(layer, "_saved_kwargs", None) or {}
+    if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper) and layer.spec is not None:
+        arguments = {"id": layer.spec.id}
+    return {name: repr(value) for name, value in arguments.items() if isinstance(value, bool | int | float | str)}
 
 
 def _layer_state(layer: Any) -> dict[str, Any]:
@@ -309,7 +322,7 @@ def _layer_state(layer: Any) -> dict[str, Any]:
         own = _dmc_state(layer)
     else:
         own = _plain(layer)
-    state = {"layer": _class_of(type(layer)).__name__, "own": own}
+    state = {"layer": _class_of(type(layer)).__name__, "built": _how_built(layer), "own": own}
     state["spaces"] = [_generator_state(space._np_random) for space in _spaces(layer)]
     if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper):
         state["np_random"] = _generator_state(layer._np_random)
