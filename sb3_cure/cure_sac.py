@@ -46,7 +46,14 @@ from sb3_cure.checks import (
     make_env,
 )
 from sb3_cure.files import PathOrFile
-from sb3_cure.guards import Guard, TransitionGuard, check_actions, look_before_steps
+from sb3_cure.guards import (
+    BadTransitionError,
+    Guard,
+    TransitionGuard,
+    check_actions,
+    look_before_steps,
+    post_mortem_of_a_step,
+)
 from sb3_cure.metrics import Metrics, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
@@ -484,7 +491,7 @@ class CuReSAC(SAC):
         self._check_first_observations()
         if self.is_plain_sac:
             executed, actions = super()._sample_action(learning_starts, action_noise, n_envs)
-            check_actions(actions, self.num_timesteps)
+            self._check_actions(actions)
             return executed, actions
         # Noise is added below, once, whoever acts.
         _, actions = super()._sample_action(learning_starts, None, n_envs)
@@ -494,14 +501,19 @@ class CuReSAC(SAC):
                 actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
         if action_noise is not None:
             actions = np.clip(actions + action_noise(), -1, 1)
-        check_actions(actions, self.num_timesteps)
+        self._check_actions(actions)
         return self.policy.unscale_action(actions), actions
+
+    def _check_actions(self, actions: np.ndarray) -> None:
+        with post_mortem_of_a_step(self, observations=self._last_obs, actions=actions):
+            check_actions(actions, self.num_timesteps)
 
     def _check_first_observations(self) -> None:
         """Observations that no transition has brought: those of a reset."""
         if self._last_obs is not None:
             original = None if self._vec_normalize_env is None else self._last_original_obs
-            self._last_obs = self._transition_guard.admit_first(self._last_obs, original, self.num_timesteps)  # type: ignore[arg-type, assignment]
+            with post_mortem_of_a_step(self, observations=self._last_obs, original_observations=original):
+                self._last_obs = self._transition_guard.admit_first(self._last_obs, original, self.num_timesteps)  # type: ignore[arg-type, assignment]
 
     def _second_actor_acts(self, n_envs: int) -> np.ndarray:
         """Boolean array [n_envs]: where the second (curious or random) actor acts in this step."""
@@ -528,22 +540,26 @@ class CuReSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        if self._vec_normalize_env is not None:
+            check_skip(self)  # `set_env` may have brought it
+        seen: dict[str, Any] = {"observations": self._last_obs, "actions": buffer_action, "next_observations": new_obs}
+        seen["terminal_observations"] = {str(i): info.get("terminal_observation") for i, info in enumerate(infos)}
         try:
-            check_actions(buffer_action, self.num_timesteps)
-            if self._vec_normalize_env is not None:
-                check_skip(self)  # `set_env` may have brought it
-                # What is stored; clipped, it may look finite.
-                original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
-                self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
-            new_obs, reward, infos = self._transition_guard.admit(
-                self._last_obs,  # type: ignore[arg-type]
-                new_obs,
-                reward,
-                dones,
-                infos,
-                self.num_timesteps,
-            )
-        except ValueError:
+            with post_mortem_of_a_step(self, **seen, rewards=reward, dones=dones):
+                check_actions(buffer_action, self.num_timesteps)
+                if self._vec_normalize_env is not None:
+                    # What is stored; clipped, it may look finite.
+                    original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+                    self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
+                new_obs, reward, infos = self._transition_guard.admit(
+                    self._last_obs,  # type: ignore[arg-type]
+                    new_obs,
+                    reward,
+                    dones,
+                    infos,
+                    self.num_timesteps,
+                )
+        except BadTransitionError:
             # The environments have gone on: another `learn` starts with a reset.
             self._last_obs = None
             raise

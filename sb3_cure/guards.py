@@ -63,6 +63,27 @@ class NonFiniteError(ValueError):
         )
 
 
+class BadTransitionError(ValueError):
+    """A reward, an observation or an action was not finite; it was neither stored nor executed.
+
+    :param reason: What was not finite, where and when
+    :param consequence: What was not done with it
+    :param fix: What to do
+    :param post_mortem: Where more about it was written
+    """
+
+    def __init__(self, reason: str, consequence: str, fix: str, post_mortem: str = ""):
+        super().__init__(reason, consequence, fix, post_mortem)
+        self.reason = reason
+        self.consequence = consequence
+        self.fix = fix
+        self.post_mortem = post_mortem
+
+    def __str__(self) -> str:
+        look = f"look at {self.post_mortem}, then " if self.post_mortem else ""
+        return f"{self.reason}: {self.consequence}; {look}{self.fix}."
+
+
 class Check(NamedTuple):
     """One look at a loss and its gradients.
 
@@ -269,21 +290,10 @@ class Guard:
             "rows": None if draw.rows is None else draw.rows.tolist(),
             "environments": None if draw.env_inds is None else draw.env_inds.tolist(),
             "batch": origin,
-            "config": _settings(model),
-            "versions": {"sb3_cure": version("sb3_cure"), **get_system_info(print_info=False)[0]},
         }
-        directory = model.logger.dir
-        if directory is not None and not Path(directory).is_dir():
-            directory = None
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=f"post_mortem_{error.update}_", dir=directory))
-            (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False))
-            if batch is not None:
-                arrays = {name: value for name, value in batch._asdict().items() if isinstance(value, th.Tensor)}
-                np.savez_compressed(folder / "batch.npz", **{k: v.cpu().numpy() for k, v in arrays.items()})  # type: ignore[arg-type]
-            where = str(folder)
-        except OSError as failure:
-            where = f"the logs (a post-mortem could not be written: {failure})"
+        batch_arrays = {} if batch is None else batch._asdict()
+        arrays = {name: value.cpu().numpy() for name, value in batch_arrays.items() if isinstance(value, th.Tensor)}
+        where = _write_post_mortem(model, str(error.update), report, {"batch.npz": arrays} if arrays else {})
         return NonFiniteError(error.source, error.value, error.update, where)
 
 
@@ -310,6 +320,27 @@ def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimi
     for name, optimizer in optimizers.items():
         if optimizer is not None:
             optimizer.register_step_pre_hook(partial(look, name))
+
+
+def _write_post_mortem(
+    model: "CuReSAC", name: str, report: dict[str, Any], archives: dict[str, dict[str, np.ndarray]]
+) -> str:
+    """Beside the logs, or among temporary files; without pickle.
+
+    :return: Where it lies
+    """
+    versions = {"sb3_cure": version("sb3_cure"), **get_system_info(print_info=False)[0]}
+    logger = getattr(model, "_logger", None)  # a model that has not learned has none
+    directory = None if logger is None or logger.dir is None or not Path(logger.dir).is_dir() else logger.dir
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f"post_mortem_{name}_", dir=directory))
+        report = {**report, "config": _settings(model), "versions": versions}
+        (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False))
+        for archive, arrays in archives.items():
+            np.savez_compressed(folder / archive, **arrays)  # type: ignore[arg-type]
+    except OSError as failure:
+        return f"the logs (a post-mortem could not be written: {failure})"
+    return str(folder)
 
 
 def _error(name: str, check: Check) -> NonFiniteError:
@@ -419,7 +450,7 @@ class TransitionGuard:
         :param original: The same before ``VecNormalize``, if there is one
         :param timestep: Agent steps so far, for the message
         :return: The same, with zeros in place of what is not finite
-        :raises ValueError: if something is not finite and must not be skipped
+        :raises BadTransitionError: if something is not finite and must not be skipped
         """
         if observations is self._seen or (self._restored and _equal(observations, self._seen)):
             self._seen, self._restored = observations, False
@@ -450,7 +481,7 @@ class TransitionGuard:
         :param infos: One dictionary per environment
         :param timestep: Agent steps so far, for the message
         :return: New observations, rewards and infos that are fit to be stored
-        :raises ValueError: if something is not finite and must not be skipped
+        :raises BadTransitionError: if something is not finite and must not be skipped
         """
         ends = {int(i): infos[i].get("terminal_observation") for i in np.flatnonzero(dones)}
         bad_rewards, bad_obs = _not_finite(rewards), _not_finite(new_obs)
@@ -484,10 +515,8 @@ class TransitionGuard:
         what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
         reason = f"environment {env} returned {what} at agent step {timestep}, but {kind}s must be finite in float32"
         if not self.skip:
-            raise ValueError(
-                f"{reason}: it was not stored; fix the environment, or leave such transitions out with "
-                "on_bad_transition='skip'."
-            )
+            fix = "fix the environment, or leave such transitions out with on_bad_transition='skip'"
+            raise BadTransitionError(reason, "it was not stored", fix)
         if kind not in self._warned:
             self._warned.add(kind)
             warnings.warn(
@@ -548,11 +577,32 @@ def check_actions(actions: np.ndarray, timestep: int) -> None:
     """
     :param actions: Actions of one step, [n_envs, ...]
     :param timestep: Agent steps so far, for the message
-    :raises ValueError: if one is not finite
+    :raises BadTransitionError: if one is not finite
     """
     for i in np.flatnonzero(_not_finite(actions)):
-        raise ValueError(
+        raise BadTransitionError(
             f"the agent chose the action {actions[i]} for environment {i} at agent step {timestep}, but actions must "
-            "be finite: it was not executed; check action_noise and the policy's parameters, and load an earlier model "
-            "if these are not finite."
+            "be finite",
+            "it was not executed",
+            "check action_noise and the policy's parameters, and load an earlier model if these are not finite",
         )
+
+
+@contextlib.contextmanager
+def post_mortem_of_a_step(model: "CuReSAC", **seen: Any) -> Iterator[None]:
+    """What is not finite in a step of the environments is found in this context, and its post-mortem written.
+
+    :param model: The model
+    :param seen: What there is of the step: arrays and dictionaries of arrays are kept
+    :raises BadTransitionError: which says where the post-mortem lies
+    """
+    try:
+        yield
+    except BadTransitionError as error:
+        arrays = {}
+        for name, value in seen.items():
+            parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
+            arrays.update({key: part for key, part in parts.items() if isinstance(part, np.ndarray)})
+        report = {"source": error.reason, "agent_steps": model.num_timesteps}
+        where = _write_post_mortem(model, f"step_{model.num_timesteps}", report, {"step.npz": arrays})
+        raise BadTransitionError(error.reason, error.consequence, error.fix, where) from None

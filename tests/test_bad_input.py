@@ -999,7 +999,9 @@ def test_a_reward_that_is_no_number_is_not_stored(reward: float, kwargs: dict[st
     """It would spoil the critics for good: the run stops, with all the transitions from before in the buffer."""
     env = DummyVecEnv([lambda: RewardAtStep(reward, at=10**9), lambda: RewardAtStep(reward, at=5)])
     model = tiny_model("CnnPolicy", env, **kwargs)
-    sentence = rf"environment 1 returned the reward {reward} at agent step 10, but .*: it was not stored; fix"
+    sentence = (
+        rf"environment 1 returned the reward {reward} at agent step 10, but .*: it was not stored; look at .*, then fix"
+    )
     with pytest.raises(ValueError, match=sentence) as error:
         model.learn(40)
     assert is_one_sentence(str(error.value))

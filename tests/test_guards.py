@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNorm
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions
-from sb3_cure.guards import Guard, NonFiniteError, TransitionGuard
+from sb3_cure.guards import BadTransitionError, Guard, NonFiniteError, TransitionGuard
 from sb3_cure.serialization import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
 
@@ -462,13 +462,45 @@ def test_bad_transitions_raise_and_are_not_stored(flaws: Any, sentence: str, ext
     """Nothing of that step is stored, of no environment; the next `learn` starts with a reset."""
     venv = DummyVecEnv([VectorBox, functools.partial(FlawedBox, flaws)])
     model = tiny_model("MlpPolicy", venv, learning_starts=100, **extras)
-    with pytest.raises(ValueError, match=rf"{sentence}.*: it was not stored; fix .* on_bad_transition='skip'\."):
+    with pytest.raises(ValueError, match=rf"{sentence}.*: it was not stored; look at .*, then fix .*='skip'\."):
         model.learn(40)
     assert model.replay_buffer.pos == max(model.num_timesteps // 2 - 1, 0) == max(max(flaws) - 1, 0)
     model._last_obs = None
     venv.envs[1].unwrapped.flaws.clear()
     model.learn(20, reset_num_timesteps=False)
     assert np.isfinite(model.replay_buffer.observations[: model.replay_buffer.pos]).all()
+
+
+@pytest.mark.parametrize("extras", [{}, PLAIN], ids=["all", "plain SAC"])
+@pytest.mark.parametrize(
+    "flaw, array, source",
+    [
+        ("reward", "rewards", "environment 1 returned the reward nan at agent step 10, "),
+        (
+            "observation",
+            "terminal_observations.1",
+            "environment 1 returned the terminal observation with nan in it at ",
+        ),
+        ("reset", "next_observations", "environment 1 returned the observation with nan in it at agent step 10, "),
+    ],
+)
+def test_the_post_mortem_of_a_step_shows_what_was_not_finite(
+    flaw: str, array: str, source: str, extras: dict[str, Any], tmp_path: Path
+) -> None:
+    """Beside the logs, without pickle: the report names the source, and the arrays hold the bad value."""
+    venv = DummyVecEnv([VectorBox, functools.partial(FlawedBox, {5: flaw})])
+    model = tiny_model("MlpPolicy", venv, learning_starts=100, **extras)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    with pytest.raises(BadTransitionError) as caught:
+        model.learn(40)
+    (folder,) = tmp_path.glob("post_mortem_step_10_*")
+    assert caught.value.post_mortem == str(folder) and str(folder) in str(caught.value)
+    report = json.loads((folder / "report.json").read_text(), parse_constant=pytest.fail)
+    assert report["source"].startswith(source) and report["agent_steps"] == 10
+    assert report["config"]["seed"] == 0 and "PyTorch" in report["versions"]
+    with np.load(folder / "step.npz", allow_pickle=False) as step:
+        assert [name for name in step if not np.isfinite(step[name]).all()] == [array]
+        assert step["observations"].shape == (2, 2) and step["actions"].shape == (2, 2)
 
 
 def test_after_a_bad_transition_training_starts_with_a_reset() -> None:
