@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped
 from torch import nn
 
 from sb3_cure.mixers import CuriousMixer
@@ -173,7 +173,7 @@ def check_arguments(model: "CuReSAC") -> None:
             f"n_steps={model.n_steps} was given with curiosity={model.curiosity!r}, but the curious reward is known "
             "for single transitions only: set n_steps=1, or curiosity=None."
         )
-    check_skip(model)
+    check_vec_normalize(model)
     # Dictionaries, for which SB3 asks for 'MultiInputPolicy', are refused for themselves.
     is_dict = isinstance(model.observation_space, spaces.Dict)
     if not (model.is_plain_sac or is_dict or issubclass(model.policy_class, CuRePolicy)):
@@ -430,15 +430,25 @@ def check_curious_agent(model: "CuReSAC") -> None:
         )
 
 
-def check_skip(model: "CuReSAC") -> None:
+def check_vec_normalize(model: "CuReSAC") -> None:
     """
     :param model: The model, its arguments and environments set
-    :raises ValueError: if bad transitions are to be left out, but something takes them before
+    :raises ValueError: if bad transitions are to be left out, but ``VecNormalize`` takes them before; or if it lies
+        inside of what SB3 turns images with, so that the replay buffer would get them as they were
     """
-    if model.on_bad_transition == "skip" and model.get_vec_normalize_env() is not None:
+    venv = model.get_vec_normalize_env()
+    if venv is None:
+        return
+    if model.on_bad_transition == "skip":
         raise ValueError(
             "on_bad_transition='skip' was given with VecNormalize, but its running averages take a bad value before it "
             "can be left out: leave on_bad_transition='raise', or use environments without VecNormalize."
+        )
+    if is_vecenv_wrapped(venv, VecTransposeImage) != is_vecenv_wrapped(model.env, VecTransposeImage):  # type: ignore[arg-type]
+        raise ValueError(
+            f"VecNormalize wraps environments with images of shape {venv.observation_space.shape}, channels last, but "
+            "SB3 stores what VecNormalize has seen, and networks need channels first: give "
+            "VecNormalize(VecTransposeImage(venv), norm_obs=False)."
         )
 
 

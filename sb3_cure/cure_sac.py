@@ -40,9 +40,9 @@ from sb3_cure.checks import (
     check_learning,
     check_parts,
     check_shared_encoder_space,
-    check_skip,
     check_srl_error,
     check_srl_output,
+    check_vec_normalize,
     make_env,
 )
 from sb3_cure.files import PathOrFile
@@ -541,7 +541,7 @@ class CuReSAC(SAC):
         infos: list[dict[str, Any]],
     ) -> None:
         if self._vec_normalize_env is not None:
-            check_skip(self)  # `set_env` may have brought it
+            check_vec_normalize(self)  # `set_env` may have brought it
         seen: dict[str, Any] = {"observations": self._last_obs, "actions": buffer_action, "next_observations": new_obs}
         seen["terminal_observations"] = {str(i): info.get("terminal_observation") for i, info in enumerate(infos)}
         try:

@@ -437,6 +437,14 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "in [0, 255]: give the environment's images as they are rendered, and VecNormalize "
         "with norm_obs=False.",
     ),
+    "VecNormalize of images that are turned outside of it": (
+        "CnnPolicy",
+        lambda: VecNormalize(DummyVecEnv([lambda: PixelBox(channels_last=True)]), norm_obs=False),
+        {},
+        "VecNormalize wraps environments with images of shape (36, 36, 6), channels last, but SB3 stores what "
+        "VecNormalize has seen, and networks need channels first: give VecNormalize(VecTransposeImage(venv), "
+        "norm_obs=False).",
+    ),
     "normalised images": (
         "CnnPolicy",
         lambda: VecNormalize(DummyVecEnv([FakeEnv])),
