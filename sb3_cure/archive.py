@@ -20,7 +20,15 @@ from stable_baselines3.common.utils import (
 )
 
 from sb3_cure.files import PathOrFile, reading, writing
-from sb3_cure.serialization import Archive, ArchiveError, dump_json, sentences, write_arrays
+from sb3_cure.serialization import (
+    MODEL_MEMBER,
+    STATE_MEMBER,
+    Archive,
+    ArchiveError,
+    dump_json,
+    sentences,
+    write_arrays,
+)
 from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA, SettingsDecoder, SettingsEncoder, check_sizes
 from sb3_cure.weights import Allowance, TensorInfo, TorchFile, check_parameters, check_tensor, expect_keys
 
@@ -67,7 +75,7 @@ def save_model(model: "CuReSAC", path: PathOrFile, exclude: Any = None, include:
     tensors = {f"{name}.pth": state for name, state in model.get_parameters().items()}
     tensors[_VARIABLES] = {name: recursive_getattr(model, name) for name in variables}
     with writing(path, "zip") as target, zipfile.ZipFile(target, "w") as archive:
-        archive.writestr("data", data)
+        archive.writestr(MODEL_MEMBER, data)
         write_arrays(archive, encoder.arrays)
         for name, state in tensors.items():
             with archive.open(name, "w", force_zip64=True) as member:
@@ -122,10 +130,15 @@ def is_pickled_model(path: PathOrFile) -> bool:
 
 
 def _is_pickled(archive: Archive) -> bool:
-    if "data" not in archive.sizes:
+    if MODEL_MEMBER not in archive.sizes:
+        if STATE_MEMBER in archive.sizes:
+            raise ArchiveError(
+                f"{archive.name} holds no model, but a replay buffer or a part of a checkpoint: read it with "
+                "load_replay_buffer, or give resume the folder of the checkpoints."
+            )
         raise archive.error("holds no model")
     # SB3 pickles what was seen last, which may be large.
-    data = archive.bytes("data", 2**28)
+    data = archive.bytes(MODEL_MEMBER, 2**28)
     if b'":serialized:"' not in data:
         return False
     if b'"srl":' not in data or b'"curiosity":' not in data:
@@ -168,7 +181,7 @@ def _read_settings(archive: Archive) -> tuple[dict[str, Any], dict[str, str]]:
             f"{archive.name} holds pickled settings, as SB3 saves them, and unpickling runs any code that is in them: "
             "if you know where it comes from, load it with trusted=True (and save it again, which needs no pickle)."
         )
-    data = archive.json("data")
+    data = archive.json(MODEL_MEMBER)
     if not isinstance(data, dict):
         raise archive.error("holds no settings")
     if data.keys() != {_FORMAT, "settings"} or data[_FORMAT] != VERSION or not isinstance(data["settings"], dict):

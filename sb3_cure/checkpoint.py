@@ -404,7 +404,7 @@ def _usable(generations: Generations) -> Iterator[tuple[Generation, list[Path]]]
             continue
         damaged = generations.damaged(generation)
         if not damaged:
-            _tell(reasons, generation)
+            _tell(reasons, f"Resuming from {generation.folder.name} instead")
             found = True
             yield generation, []
             continue
@@ -412,7 +412,7 @@ def _usable(generations: Generations) -> Iterator[tuple[Generation, list[Path]]]
         if all(path.parent == generations.segments for path, _ in damaged):
             without_frames.append((generation, [path for path, _ in damaged]))
     for generation, lost in without_frames:
-        _tell(reasons, generation)
+        _tell(reasons, f"Resuming from {generation.folder.name} without the transitions that need what is damaged")
         found = True
         yield generation, lost
     if not found:
@@ -420,10 +420,9 @@ def _usable(generations: Generations) -> Iterator[tuple[Generation, list[Path]]]
         raise CheckpointError(f"no checkpoint in {generations.path} is whole ({told}): start anew.")
 
 
-def _tell(reasons: list[str], taken: Generation) -> None:
+def _tell(reasons: list[str], consequence: str) -> None:
     if reasons:
-        told = "; ".join(dict.fromkeys(reasons))
-        warnings.warn(f"{told}. Resuming from {taken.folder.name} instead.", stacklevel=4)
+        warnings.warn(f"{'; '.join(dict.fromkeys(reasons))}. {consequence}.", stacklevel=4)
         reasons.clear()
 
 

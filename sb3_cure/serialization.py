@@ -32,7 +32,9 @@ MAX_DEPTH = 32
 #: Bytes that are copied at a time
 CHUNK_BYTES = 2**20
 
-_JSON_MEMBER = "state.json"
+#: What a state's file has, and an archive of a model instead
+STATE_MEMBER = "state.json"
+MODEL_MEMBER = "data"
 _LARGEST_PLAIN_INT = 2**64
 _DTYPE_KINDS = "biufc"
 _TENSOR_DTYPES = {
@@ -67,7 +69,7 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
     text = dump_json({"version": VERSION, "state": encoder.encode(state, "state")})
     with open(file, "wb") if isinstance(file, str | Path) else contextlib.nullcontext(file) as stream:
         with zipfile.ZipFile(stream, "w") as archive:
-            archive.writestr(zipfile.ZipInfo(_JSON_MEMBER), text)
+            archive.writestr(zipfile.ZipInfo(STATE_MEMBER), text)
             write_arrays(archive, encoder.arrays)
 
 
@@ -90,8 +92,10 @@ def decode_state(archive: "Archive", materialize: "Callable[[StoredArray], Any] 
     :return: The state
     :raises ArchiveError: if it is anything but a whole state
     """
+    if MODEL_MEMBER in archive.sizes and STATE_MEMBER not in archive.sizes:
+        raise ArchiveError(f"{archive.name} holds a model: give what was written in this place, or read it with load.")
     arrays = archive.arrays()
-    node = archive.json(_JSON_MEMBER)
+    node = archive.json(STATE_MEMBER)
     archive.check_all_read()
     if not isinstance(node, dict) or node.keys() != {"version", "state"} or node["version"] != VERSION:
         raise archive.error(f"is no state of version {VERSION}")

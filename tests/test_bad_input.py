@@ -1,5 +1,6 @@
 """What cannot work is refused in one sentence: the value, what was expected, what to do instead."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,7 +27,7 @@ from sb3_cure.callbacks import (
     PolicyVideoCallback,
     ReconstructionCallback,
 )
-from sb3_cure.envs import make_pixel_env
+from sb3_cure.envs import FaultTolerantSubprocVecEnv, make_pixel_env
 from sb3_cure.evaluation import most_uncomfortable, run_episodes
 from sb3_cure.srl import RAE, SRLOutput
 
@@ -1148,6 +1149,13 @@ def model_of(**kwargs: Any) -> CuReSAC:
     return tiny_model("CnnPolicy", PixelBox(), buffer_size=50, **kwargs)
 
 
+def saved(method: str) -> str:
+    """Written into the file ``there``, whose name is returned."""
+    getattr(model_of(), method)("saved.zip")
+    os.replace("saved.zip", "there")
+    return "there"
+
+
 def watched(callback: Any) -> None:
     """What is known with the model: in ``learn``, before its first step."""
     model = model_of()
@@ -1253,6 +1261,16 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
     "replay buffer: frames_dir is a file": (
         lambda: FrameStackReplayBuffer(9, STACK, ACTION, frame_stack=2, frames_dir="there"),
         "frames_dir is 'there', but {folder}/there is a file: name a folder, or remove the file.",
+    ),
+    "fault tolerance: an environment": (
+        lambda: FaultTolerantSubprocVecEnv([7]),  # type: ignore[list-item]
+        "env_fns is [7], but each worker makes its own environment: pass a list of functions, say "
+        "[lambda: make_dmc_env('cartpole', 'swingup')] * 4.",
+    ),
+    "fault tolerance: no list": (
+        lambda: FaultTolerantSubprocVecEnv(VectorBox),  # type: ignore[arg-type]
+        "env_fns is <class 'envs_for_tests.VectorBox'>, but each worker makes its own environment: pass a list of "
+        "functions, say [lambda: make_dmc_env('cartpole', 'swingup')] * 4.",
     ),
     "replay buffer: frames_dir is a number": (
         lambda: FrameStackReplayBuffer(9, STACK, ACTION, frame_stack=2, frames_dir=3),
@@ -1436,6 +1454,11 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         "since.",
     ),
     "load: folder": (lambda: CuReSAC.load("."), "'.' is a folder: give the path of a file in it."),
+    "load: a replay buffer": (
+        lambda: CuReSAC.load(saved("save_replay_buffer")),
+        "'there' holds no model, but a replay buffer or a part of a checkpoint: read it with load_replay_buffer, or "
+        "give resume the folder of the checkpoints.",
+    ),
     "load: number": (
         lambda: CuReSAC.load(3),
         "got 3 for a file, but expected a path, or a file that is open in binary mode.",
@@ -1455,6 +1478,10 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
     "set_parameters: missing": (
         lambda: model_of().set_parameters("missing"),
         "there is neither a file 'missing' nor 'missing.zip': give the path that it was saved to.",
+    ),
+    "load_replay_buffer: a model": (
+        lambda: model_of().load_replay_buffer(saved("save")),
+        "'there' holds a model: give what was written in this place, or read it with load.",
     ),
     "load_replay_buffer: missing": (
         lambda: model_of().load_replay_buffer("missing"),

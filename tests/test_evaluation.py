@@ -246,6 +246,10 @@ def test_uncomfortable_frames_are_drawn(tmp_path: Path) -> None:
     for name, images in (("alone.png", None), ("both.png", drawn)):
         plots.uncomfortable_frames(tmp_path / name, found, 2, "title", images)
         assert np.asarray(Image.open(tmp_path / name).convert("L")).std() > 5
+    for wrong in (1, 3, 4):
+        with pytest.raises(ValueError, match=rf"frame_stack is {wrong}, but the observations have 6 channels"):
+            plots.uncomfortable_frames(tmp_path / "wrong.png", found, wrong, "title")
+    assert not (tmp_path / "wrong.png").exists()
 
 
 @pytest.mark.parametrize(

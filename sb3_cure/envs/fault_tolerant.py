@@ -475,6 +475,11 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         frozen_motion: float = 0.01,
         state: Callable[[gym.Env], np.ndarray] | None = None,
     ) -> None:
+        if not isinstance(env_fns, Sequence) or not all(map(callable, env_fns)):
+            raise ValueError(
+                f"env_fns is {env_fns!r:.200}, but each worker makes its own environment: pass a list of functions, "
+                "say [lambda: make_dmc_env('cartpole', 'swingup')] * 4."
+            )
         if not env_fns:
             raise ValueError("env_fns is empty, but there must be an environment: pass one function for each.")
         _check_positive(

@@ -113,8 +113,14 @@ def uncomfortable_frames(
     :param frame_stack: Frames per observation, of which the newest is shown
     :param title: Title of the figure
     :param drawn: Their reconstructions, shown beside them, uint8 like ``found.observations``, or None
+    :raises ValueError: if the observations are not so many frames, grey or in colour
     """
-    channels = found.observations.shape[1] // frame_stack
+    channels, left_over = divmod(found.observations.shape[1], frame_stack)
+    if left_over or channels not in (1, 3):
+        raise ValueError(
+            f"frame_stack is {frame_stack}, but the observations have {found.observations.shape[1]} channels, of which "
+            "each frame takes 3, or 1 if it is grey: give the environment's frame_stack."
+        )
     pairs = [found.observations] if drawn is None else [found.observations, drawn]
     n_frames = len(found.errors)
     columns = min(n_frames, 8 if drawn is None else 4)
