@@ -266,7 +266,14 @@ class FrameStackReplayBuffer(_SkipsMarked):
         # Fresh zeros cost no memory until they are written to
         rows = (self.buffer_size, n_envs)
         # A file is reserved when it is needed: a model that is loaded to act needs none.
-        self.frames = np.zeros((self.frame_capacity if frames_dir is None else 0, *self.frame_shape), dtype=np.uint8)
+        shape = (self.frame_capacity if frames_dir is None else 0, *self.frame_shape)
+        try:
+            self.frames = np.zeros(shape, dtype=np.uint8)
+        except MemoryError as error:
+            raise ValueError(
+                f"buffer_size is {buffer_size}, for which the frames need {math.prod(shape) / 1e9:.0f} GB of memory: make it "
+                "smaller, or keep the frames on a disk with replay_buffer_kwargs=dict(frames_dir=...)."
+            ) from error
         self.frame_slots = np.zeros((*rows, 2, frame_stack), dtype=np.int32)
         self.oldest_frame = np.zeros(self.buffer_size, dtype=np.int64)
         self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))

@@ -1272,6 +1272,11 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         "env_fns is <class 'envs_for_tests.VectorBox'>, but each worker makes its own environment: pass a list of "
         "functions, say [lambda: make_dmc_env('cartpole', 'swingup')] * 4.",
     ),
+    "replay buffer: more than there can be": (
+        lambda: FrameStackReplayBuffer(10**12, STACK, ACTION, frame_stack=2),
+        "buffer_size is 1000000000000, for which the frames need 4043520 GB of memory: make it smaller, or keep the "
+        "frames on a disk with replay_buffer_kwargs=dict(frames_dir=...).",
+    ),
     "replay buffer: frames_dir is a number": (
         lambda: FrameStackReplayBuffer(9, STACK, ACTION, frame_stack=2, frames_dir=3),
         "frames_dir is 3, but it must be the path of a folder: give one.",
