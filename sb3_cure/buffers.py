@@ -271,8 +271,8 @@ class FrameStackReplayBuffer(_SkipsMarked):
             self.frames = np.zeros(shape, dtype=np.uint8)
         except MemoryError as error:
             raise ValueError(
-                f"buffer_size is {buffer_size}, for which the frames need {math.prod(shape) / 1e9:.0f} GB of memory: make it "
-                "smaller, or keep the frames on a disk with replay_buffer_kwargs=dict(frames_dir=...)."
+                f"buffer_size is {buffer_size}, for which the frames need {math.prod(shape) / 1e9:.0f} GB of memory: "
+                "make it smaller, or keep the frames on a disk with replay_buffer_kwargs=dict(frames_dir=...)."
             ) from error
         self.frame_slots = np.zeros((*rows, 2, frame_stack), dtype=np.int32)
         self.oldest_frame = np.zeros(self.buffer_size, dtype=np.int64)
