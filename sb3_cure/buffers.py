@@ -206,8 +206,8 @@ class FrameStackReplayBuffer(_SkipsMarked):
         as an infinite horizon task
     :param frame_stack: Number of frames in one observation, which its number of channels cannot tell
     :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
-        a million transitions of 84x84 take 22 GB. The directory is made if there is none. The room is reserved by the
-        first ``add`` and given back at the end
+        a million transitions of 84x84 take 22 GB. The last directory of the path is made if there is none.
+        The room is reserved by the first ``add`` and given back at the end
     :raises ValueError: If the observation space is not made of ``frame_stack`` uint8 images, channels first, or if
         ``optimize_memory_usage`` is set
     """
@@ -305,7 +305,7 @@ class FrameStackReplayBuffer(_SkipsMarked):
         size = math.prod(shape)
         assert self.frames_dir is not None
         try:
-            Path(self.frames_dir).mkdir(parents=True, exist_ok=True)
+            Path(self.frames_dir).mkdir(exist_ok=True)
             with tempfile.TemporaryFile(dir=self.frames_dir) as file:
                 # Reserved, because writing to a mapped file on a full disk kills the process.
                 os.posix_fallocate(file.fileno(), 0, size)

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_cure.mixers import CuriousMixer
@@ -375,6 +375,7 @@ def check_learning(model: "CuReSAC", total_timesteps: Any, callback: Any, log_in
     """
     if model.env is None:
         raise ValueError("learn was called on a model without environment, but it needs one: call set_env(env) first.")
+    check_vec_normalize(model)  # `set_env` may have brought it
     # As in SB3, 1e6 counts as a whole number, and 0 steps are none.
     if not is_number(total_timesteps, low=0) or total_timesteps != int(total_timesteps):
         raise ValueError(
@@ -434,7 +435,7 @@ def check_vec_normalize(model: "CuReSAC") -> None:
     """
     :param model: The model, its arguments and environments set
     :raises ValueError: if bad transitions are to be left out, but ``VecNormalize`` takes them before; or if it lies
-        inside of what SB3 turns images with, so that the replay buffer would get them as they were
+        inside of what changes observations' shape, as the replay buffer gets them as it saw them
     """
     venv = model.get_vec_normalize_env()
     if venv is None:
@@ -444,10 +445,11 @@ def check_vec_normalize(model: "CuReSAC") -> None:
             "on_bad_transition='skip' was given with VecNormalize, but its running averages take a bad value before it "
             "can be left out: leave on_bad_transition='raise', or use environments without VecNormalize."
         )
-    if is_vecenv_wrapped(venv, VecTransposeImage) != is_vecenv_wrapped(model.env, VecTransposeImage):  # type: ignore[arg-type]
+    inner, outer = venv.observation_space.shape, model.observation_space.shape
+    if inner != outer:
         raise ValueError(
-            f"VecNormalize wraps environments with images of shape {venv.observation_space.shape}, channels last, but "
-            "SB3 stores what VecNormalize has seen, and networks need channels first: give "
+            f"VecNormalize lies around observations of shape {inner}, but the agent sees {outer}, and SB3 stores what "
+            "VecNormalize has seen: put it around the other wrappers, for images with the channels last as "
             "VecNormalize(VecTransposeImage(venv), norm_obs=False)."
         )
 
@@ -499,11 +501,12 @@ def check_srl_output(head: nn.Module, output: Any, trains: bool) -> None:
     :raises ValueError: if it is not a loss and an error, or if nothing can be trained on the loss
     """
     name = type(head).__name__
-    if not (isinstance(output, tuple) and len(output) == 2 and all(isinstance(part, th.Tensor) for part in output)):
-        kind = "two other things" if isinstance(output, tuple) and len(output) == 2 else f"a {type(output).__name__}"
+    parts = output if isinstance(output, tuple | list) else [output]
+    if len(parts) != 2 or not all(isinstance(part, th.Tensor) for part in parts):
+        kinds = ", ".join(type(part).__name__ for part in parts)
         raise ValueError(
-            f"{name}.loss returned {kind}, but it must return two tensors, the loss to minimise and the error of each "
-            "sample: return SRLOutput(loss, error)."
+            f"{name}.loss returned ({kinds}), but it must return two tensors, the loss to minimise and the error of "
+            "each sample: return SRLOutput(loss, error)."
         )
     loss = output[0]
     if loss.numel() != 1 or (trains and not loss.requires_grad):

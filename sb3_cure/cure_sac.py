@@ -42,7 +42,6 @@ from sb3_cure.checks import (
     check_shared_encoder_space,
     check_srl_error,
     check_srl_output,
-    check_vec_normalize,
     make_env,
 )
 from sb3_cure.files import PathOrFile
@@ -540,16 +539,17 @@ class CuReSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        if self._vec_normalize_env is not None:
-            check_vec_normalize(self)  # `set_env` may have brought it
-        seen: dict[str, Any] = {"observations": self._last_obs, "actions": buffer_action, "next_observations": new_obs}
+        seen: dict[str, Any] = {"observations": self._last_obs, "actions": buffer_action}
+        seen |= {"next_observations": new_obs, "rewards": reward, "dones": dones}
         seen["terminal_observations"] = {str(i): info.get("terminal_observation") for i, info in enumerate(infos)}
+        if self._vec_normalize_env is not None:
+            # What is stored; clipped, it may look finite.
+            original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+            seen |= {"original_next_observations": original[0], "original_rewards": original[1]}
         try:
-            with post_mortem_of_a_step(self, **seen, rewards=reward, dones=dones):
+            with post_mortem_of_a_step(self, **seen):
                 check_actions(buffer_action, self.num_timesteps)
                 if self._vec_normalize_env is not None:
-                    # What is stored; clipped, it may look finite.
-                    original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
                     self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
                 new_obs, reward, infos = self._transition_guard.admit(
                     self._last_obs,  # type: ignore[arg-type]
@@ -708,7 +708,7 @@ class CuReSAC(SAC):
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features).float()
-                error = srl.loss(batch._replace(observations=batch.next_observations), next_latents).error  # type: ignore[union-attr]
+                _, error = srl.loss(batch._replace(observations=batch.next_observations), next_latents)  # type: ignore[arg-type]
         return error
 
     def _curious_reward(self, error: th.Tensor) -> th.Tensor:

@@ -21,7 +21,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from sb3_cure.files import flush_to_disk
 from sb3_cure.serialization import ArchiveError
@@ -30,6 +30,7 @@ from sb3_cure.serialization import ArchiveError
 CHUNK = 2**22
 #: A manifest lists some dozens of files; what is larger is no manifest
 MAX_MANIFEST = 2**24
+T = TypeVar("T")
 _NAME = re.compile(r"generation-(\d{6,})")
 _MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 
@@ -221,7 +222,7 @@ class Draft:
         #: The files in ``segments/`` that it needs: older ones are to be appended, ``new_segment`` appends its own
         self.segments: list[Entry] = []
         self._new: list[Path] = []
-        self._background = background
+        self._background: ThreadPoolExecutor | None = background
         self._digests: dict[Path, Future[tuple[str, int]]] = {}
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir()
@@ -234,37 +235,50 @@ class Draft:
         """
         path = self.folder / name
         yield path
-        self._digests[path] = self._background.submit(_digest, path)
+        self._digests[path] = self._hash(_digest, path)
 
     def new_segment(self, name: str, chunks: Iterable[memoryview]) -> Entry:
         """Write a file that later generations may share.
 
         :param name: Its name, without a suffix
-        :param chunks: Its content, at least one
+        :param chunks: Its content
         :return: Its entry
         """
         path = self._segments_folder / f"{name}-{self.number:06d}.bin"
         self._new.append(path)
         digest, size = hashlib.sha256(), 0
+        hashed = []
         with path.open("wb") as file:
             for chunk in chunks:
-                hashed = self._background.submit(digest.update, chunk)
+                hashed.append(self._hash(digest.update, chunk))
                 file.write(chunk)
                 size += chunk.nbytes
         flush_to_disk(path)
-        hashed.result()
+        for chunk_hashed in hashed:
+            chunk_hashed.result()
         entry = Entry(path.name, size, digest.hexdigest())
         self.segments.append(entry)
         return entry
 
     def seal(self, path: Path) -> Entry:
         """
-        :param path: A file that ``file`` gave and that has been written
+        :param path: A file that has been written
         :return: Its entry, when all of it is on the disk
         """
         flush_to_disk(path)
-        digest, size = self._digests[path].result()
+        digest, size = self._digests[path].result() if path in self._digests else _digest(path)
         return Entry(path.name, size, digest)
+
+    def _hash(self, function: Callable[..., T], *arguments: Any) -> Future[T]:
+        """Call a function in the background; at once where there can be no thread, as when the main one has ended."""
+        if self._background is not None:
+            try:
+                return self._background.submit(function, *arguments)
+            except RuntimeError:
+                self._background = None
+        done: Future[T] = Future()
+        done.set_result(function(*arguments))
+        return done
 
     def discard(self) -> None:
         """Remove what was written, as far as that works."""

@@ -527,6 +527,17 @@ class TransitionGuard:
         return reason
 
 
+def _arrays(values: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    """Those in nested dictionaries, by the names on the way."""
+    found: dict[str, np.ndarray] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found |= _arrays(value, f"{prefix}{name}.")
+        elif isinstance(value, np.ndarray):
+            found[prefix + name] = value
+    return found
+
+
 def _not_finite(values: Observations) -> npt.NDArray[np.bool_]:
     """Rows in which a number is not finite, [n]."""
     if isinstance(values, dict):
@@ -593,16 +604,12 @@ def post_mortem_of_a_step(model: "CuReSAC", **seen: Any) -> Iterator[None]:
     """What is not finite in a step of the environments is found in this context, and its post-mortem written.
 
     :param model: The model
-    :param seen: What there is of the step: arrays and dictionaries of arrays are kept
+    :param seen: What there is of the step: arrays are kept, also those in dictionaries
     :raises BadTransitionError: which says where the post-mortem lies
     """
     try:
         yield
     except BadTransitionError as error:
-        arrays = {}
-        for name, value in seen.items():
-            parts = {f"{name}.{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
-            arrays.update({key: part for key, part in parts.items() if isinstance(part, np.ndarray)})
         report = {"source": error.reason, "agent_steps": model.num_timesteps}
-        where = _write_post_mortem(model, f"step_{model.num_timesteps}", report, {"step.npz": arrays})
+        where = _write_post_mortem(model, f"step_{model.num_timesteps}", report, {"step.npz": _arrays(seen)})
         raise BadTransitionError(error.reason, error.consequence, error.fix, where) from None

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -264,14 +264,7 @@ class CuRePolicy(SACPolicy):
         """
         :param observations: What the encoder is to see (after ``srl.augment`` or ``srl.center``), images in 0-255
         :return: The encoder's input: images in [0, 1]
-        :raises ValueError: if they have another shape than the encoder was built for
         """
-        if observations.shape[1:] != self.encoder_space.shape:
-            raise ValueError(
-                f"{type(self.srl).__name__}.augment or .center gave the encoder observations of shape "
-                f"{tuple(observations.shape[1:])}, but it was built for {self.encoder_space.shape}: return that shape, "
-                "or name another one in configure_encoder."
-            )
         return preprocess(observations, self.encoder_space)
 
     def augment(self, observations: th.Tensor) -> th.Tensor:
@@ -279,14 +272,28 @@ class CuRePolicy(SACPolicy):
         :param observations: [B, *shape], images in 0-255
         :return: Randomly augmented encoder inputs, as in training
         """
-        return self.preprocess(observations if self.srl is None else self.srl.augment(observations))
+        return self.preprocess(self._changed("augment", observations))
 
     def center(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Encoder inputs without randomness, as when acting
         """
-        return self.preprocess(observations if self.srl is None else self.srl.center(observations))
+        return self.preprocess(self._changed("center", observations))
+
+    def _changed(self, method: str, observations: th.Tensor) -> th.Tensor:
+        """What the head makes of observations, if it is what the encoder was built for."""
+        if self.srl is None:
+            return observations
+        changed: th.Tensor = getattr(self.srl, method)(observations)
+        stored, built_for = get_obs_shape(self.observation_space), get_obs_shape(self.encoder_space)
+        if changed.shape[1:] != built_for and observations.shape[1:] == stored:
+            raise ValueError(
+                f"{type(self.srl).__name__}.{method} made observations of shape {tuple(changed.shape[1:])} of those of "
+                f"shape {stored}, but the encoder was built for {built_for}: return that shape, or name another one in "
+                "configure_encoder."
+            )
+        return changed
 
     def encode(self, observations: th.Tensor) -> th.Tensor:
         """

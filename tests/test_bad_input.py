@@ -16,7 +16,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer
@@ -442,9 +442,17 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "CnnPolicy",
         lambda: VecNormalize(DummyVecEnv([lambda: PixelBox(channels_last=True)]), norm_obs=False),
         {},
-        "VecNormalize wraps environments with images of shape (36, 36, 6), channels last, but SB3 stores what "
-        "VecNormalize has seen, and networks need channels first: give VecNormalize(VecTransposeImage(venv), "
-        "norm_obs=False).",
+        "VecNormalize lies around observations of shape (36, 36, 6), but the agent sees (6, 36, 36), and SB3 stores "
+        "what VecNormalize has seen: put it around the other wrappers, for images with the channels last as "
+        "VecNormalize(VecTransposeImage(venv), norm_obs=False).",
+    ),
+    "VecNormalize inside of stacked frames": (
+        "CnnPolicy",
+        lambda: VecFrameStack(VecNormalize(DummyVecEnv([PixelBox]), norm_obs=False), 2),
+        {},
+        "VecNormalize lies around observations of shape (6, 36, 36), but the agent sees (12, 36, 36), and SB3 stores "
+        "what VecNormalize has seen: put it around the other wrappers, for images with the channels last as "
+        "VecNormalize(VecTransposeImage(venv), norm_obs=False).",
     ),
     "normalised images": (
         "CnnPolicy",
@@ -1093,18 +1101,18 @@ def test_errors_of_a_users_head(error: Callable[[Any], Any], sentence: str) -> N
 @pytest.mark.parametrize(
     "output, sentence",
     [
-        (lambda loss, error: loss, "returned a Tensor, but it must return two tensors, the loss to "),
+        (lambda loss, error: loss, r"returned \(Tensor\), but it must return two tensors, the loss to "),
         (
             lambda loss, error: (loss, error, {}),
-            "returned a tuple, but it must return two tensors, the loss",
+            r"returned \(Tensor, Tensor, dict\), but it must return two tensors, the loss",
         ),
         (
             lambda loss, error: (loss, 0.0),
-            "returned two other things, but it must return two tensors, the loss",
+            r"returned \(Tensor, float\), but it must return two tensors, the loss",
         ),
         (
             lambda loss, error: None,
-            "returned a NoneType, but it must return two tensors, the loss to ",
+            r"returned \(NoneType\), but it must return two tensors, the loss to ",
         ),
         (
             lambda loss, error: (loss.detach(), error),
@@ -1135,8 +1143,8 @@ def test_augmentations_of_a_users_head(method: str) -> None:
     """The encoder would complain of weights, or read a part of the image."""
     Wrong = type("Wrong", (RAE,), {method: lambda self, observations: observations[:, :, 2:]})
     sentence = (
-        r"Wrong\.augment or \.center gave the encoder observations of shape \(6, 34, 36\), but it was built for "
-        r"\(6, 36, 36\): return that shape, or name another one in configure_encoder\."
+        rf"Wrong\.{method} made observations of shape \(6, 34, 36\) of those of shape \(6, 36, 36\), but the encoder was "
+        r"built for \(6, 36, 36\): return that shape, or name another one in configure_encoder\."
     )
     with pytest.raises(ValueError, match=sentence):
         tiny_model("CnnPolicy", PixelBox(), srl=Wrong).learn(12)

@@ -597,10 +597,13 @@ def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
     space = spaces.Box(0, 255, (6, 84, 84), np.uint8)
     stack = np.zeros((1, 6, 84, 84), np.uint8)
     transition: tuple[Any, ...] = (stack, stack, np.ones((1, 2)), np.zeros(1), np.zeros(1), [{}])
-    new = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "not" / "there")
-    assert not (tmp_path / "not").exists()
+    new = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
     new.add(*transition)
-    assert (tmp_path / "not" / "there").is_dir()
+    assert (tmp_path / "new").is_dir()
+    mistyped = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "not" / "there")
+    with pytest.raises(ValueError, match=r"frames_dir is '.*/there', but .* GB for frames cannot be reserved there \(No"):
+        mistyped.add(*transition)
     taken = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "taken")
     (tmp_path / "taken").touch()
     with pytest.raises(ValueError, match=r"frames_dir is '.*/taken', but .* GB for frames cannot be reserved there \("):

@@ -379,26 +379,51 @@ def test_a_state_of_other_environments_is_refused_in_one_sentence() -> None:
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("workers", [False, True])
 @pytest.mark.parametrize(
     "other, sentence",
     [
-        (
-            dict(task="balance"),
-            "DmControlCompatibilityV0 with id='dmc_pixels/cartpole-swingup-v0', and .*-balance-v0",
-        ),
-        (dict(action_repeat=4), "ActionRepeat with num_repeats=8, and here it has 4"),
-        (dict(renderer="dmc"), "DMCPixels with renderer='fast', and here it has 'dmc'"),
-        (dict(camera_id=1), "DMCPixels with camera_id=0, and here it has 1"),
+        (dict(task="balance"), "DmControlCompatibilityV0 with id='dmc_pixels/cartpole-swingup-v0', now .*-balance-v0'"),
+        (dict(action_repeat=4), "ActionRepeat with num_repeats=8, now 4"),
+        (dict(renderer="dmc", camera_id=1), "DMCPixels with camera_id=0, now 1; DMCPixels with renderer='fast', now "),
     ],
 )
-def test_a_state_of_environments_built_otherwise_is_refused(other: dict[str, Any], sentence: str) -> None:
-    """Their states have the same shapes, but the task would be another one from here on."""
+def test_environments_that_were_built_otherwise_are_told(
+    other: dict[str, Any], sentence: str, workers: bool, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Their states have the same shapes, but the task is another one from here on."""
     arguments: dict[str, Any] = dict(domain="cartpole", task="swingup", action_repeat=8, image_size=24, renderer="fast")
-    venv, same = (DummyVecEnv([lambda: make_dmc_env(**arguments)]) for _ in range(2))
+
+    def built(**changed: Any) -> VecEnv:
+        makers = [lambda: Monitor(make_dmc_env(**{**arguments, **changed}))] * 2
+        return SubprocVecEnv(makers, start_method="fork") if workers and changed else DummyVecEnv(makers)  # type: ignore[arg-type]
+
+    venv = built()
     venv.reset()
-    load_vec_env_state(same, vec_env_state(venv))
-    with pytest.raises(ValueError, match=f"does not fit these environments, .*: it is of {sentence}"):
-        load_vec_env_state(DummyVecEnv([lambda: make_dmc_env(**{**arguments, **other})]), vec_env_state(venv))
+    state = vec_env_state(venv)
+    load_vec_env_state(built(), state)
+    assert not recwarn.list
+    wrong = built(**other)
+    with pytest.warns(UserWarning, match=f"^The environments were built otherwise when their state was saved: {sentence}"):
+        load_vec_env_state(wrong, state)
+    wrong.close()
+
+
+def test_arguments_are_compared_by_value_and_harmless_ones_are_not(recwarn: pytest.WarningsRecorder) -> None:
+    def wrapped(bound: Any, length: int, low: Any) -> DummyVecEnv:
+        def make() -> gym.Env:
+            env = wrappers.RecordEpisodeStatistics(wrappers.ClipReward(Dot(), -1, bound), buffer_length=length)
+            return wrappers.RescaleAction(env, low, -low)
+
+        return DummyVecEnv([make])
+
+    venv = wrapped(1, 100, np.array([-0.5, -0.5], np.float32))
+    venv.reset()
+    state = vec_env_state(venv)
+    load_vec_env_state(wrapped(np.float64(1.0), 1000, np.array([-0.5, -0.5], np.float32)), state)
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"RescaleAction with max_action=\[0\.5, 0\.5\], now \[1\.0, 1\.0\]; "):
+        load_vec_env_state(wrapped(1, 100, np.array([-1, -1], np.float32)), state)
 
 
 def test_rl_zoos_time_limit_is_known() -> None:

@@ -13,8 +13,9 @@ vectorised environment) saves what is its own:
 
 import copy
 import functools
+import warnings
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -112,6 +113,9 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
     StackedObservations: ("stacked_obs", "sub_stacked_observations"),
 }
 
+# Arguments of wrappers that change neither observations nor rewards nor the end of episodes
+_HARMLESS = ("buffer_length", "stats_key", "disable_render_order_enforcing")
+
 _SHIMMY = "shimmy.dm_control_compatibility"
 _SUITE = "dm_control.suite."
 _NUMBERS = (bool, int, float, np.generic, np.ndarray)
@@ -151,7 +155,7 @@ def vec_env_state(venv: VecEnv) -> dict[str, Any] | None:
 
 
 def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
-    """Go on from where other environments were, which were built in the same way.
+    """Go on from where other environments were, which were built in the same way; arguments that differ are warned of.
 
     :param venv: Environments to change; they need not have been reset
     :param state: What ``vec_env_state`` gave; it is not changed
@@ -166,13 +170,20 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
         *outer_states, base_state = state["layers"]
         # Before the environments: it sets attributes again that may have changed in them since.
         _load_layer_state(base, base_state)
-        _in_envs(base, _load_env_state, [(env_state,) for env_state in state["envs"]])
+        differences = _in_envs(base, _load_env_state, [(env_state,) for env_state in state["envs"]])
         for layer, layer_state in zip(outer, outer_states, strict=True):
             _load_layer_state(layer, layer_state)
     except Exception as error:
         raise ValueError(
             f"The saved state does not fit these environments, build them as they were built when it was saved: {error}"
         ) from error
+    told = "; ".join(dict.fromkeys(sentence for each in differences for sentence in each or []))
+    if told:
+        warnings.warn(
+            f"The environments were built otherwise when their state was saved: {told}. Training goes on with them as "
+            "they are now; build them as they were if that was not meant.",
+            stacklevel=2,
+        )
 
 
 def why_not_restorable(venv: VecEnv) -> str | None:
@@ -288,31 +299,48 @@ def _env_state(env: gym.Env) -> list[dict[str, Any]]:
     return [_layer_state(layer) for layer in _layers(env)]
 
 
-def _load_env_state(env: gym.Env, states: list[dict[str, Any]]) -> None:
+def _load_env_state(env: gym.Env, states: list[dict[str, Any]]) -> list[str]:
+    """
+    :return: Where the environment was built otherwise
+    """
     layers = _layers(env)
     _check_layers(layers, states)
     # The base first: loading an outer layer may look at what it wraps.
     for layer, state in zip(reversed(layers), reversed(states), strict=True):
         _load_layer_state(layer, state)
+    return [told for layer, state in zip(layers, states, strict=True) for told in _built_otherwise(layer, state)]
 
 
 def _check_layers(layers: list[Any], states: list[dict[str, Any]]) -> None:
     found, saved = [_class_of(type(layer)).__name__ for layer in layers], [state["layer"] for state in states]
     if found != saved:
         raise ValueError(f"it is of {' around '.join(saved)}, and here is {' around '.join(found)}")
-    for layer, state in zip(layers, states, strict=True):
-        here, there = _how_built(layer), state.get("built", {})
-        for name in here.keys() & there.keys():
-            if here[name] != there[name]:
-                raise ValueError(f"it is of {state['layer']} with {name}={there[name]}, and here it has {here[name]}")
 
 
-def _how_built(layer: Any) -> dict[str, str]:
-    """Arguments of the constructor as they print, as far as Gymnasium knows them, and the id of an environment."""
+def _built_otherwise(layer: Any, state: dict[str, Any]) -> Iterator[str]:
+    here, there = _how_built(layer), state.get("built", {})
+    for name in sorted(here.keys() & there.keys()):
+        if here[name] != there[name]:
+            yield f"{state['layer']} with {name}={there[name]!r}, now {here[name]!r}"
+
+
+def _how_built(layer: Any) -> dict[str, Any]:
+    """Plain arguments of the constructor, as far as Gymnasium knows them, and the id of an environment."""
     arguments = getattr(layer, "_saved_kwargs", None) or {}
     if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper) and layer.spec is not None:
         arguments = {"id": layer.spec.id}
-    return {name: repr(value) for name, value in arguments.items() if isinstance(value, bool | int | float | str)}
+    return {
+        name: _builtin(value) for name, value in arguments.items() if is_plain(value) and name not in _HARMLESS
+    }
+
+
+def _builtin(value: Any) -> Any:
+    """With lists and Python's own numbers instead of tuples and numpy's, of which others may be equal."""
+    if isinstance(value, list | tuple):
+        return [_builtin(part) for part in value]
+    if isinstance(value, dict):
+        return {key: _builtin(part) for key, part in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray | np.generic | th.Tensor) else value
 
 
 def _layer_state(layer: Any) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def uncomfortable_frames(
     :raises ValueError: if the observations are not so many frames, grey or in colour
     """
     channels, left_over = divmod(found.observations.shape[1], frame_stack)
-    if left_over or channels not in (1, 3):
+    if left_over or channels not in (1, 3, 4):
         raise ValueError(
             f"frame_stack is {frame_stack}, but the observations have {found.observations.shape[1]} channels, of which "
             "each frame takes 3, or 1 if it is grey: give the environment's frame_stack."

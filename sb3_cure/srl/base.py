@@ -116,7 +116,7 @@ class SRLHead(nn.Module):
         :param latents: The encoder's output for ``center(batch.observations)``, [B, encoder.features_dim]
         :return: Error per sample, [B]
         """
-        return self.loss(batch, latents).error
+        return SRLOutput(*self.loss(batch, latents)).error
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
         """
