@@ -16,6 +16,7 @@ from typing import Any, TypeAlias
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
@@ -231,7 +232,7 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
     watches = console.is_terminal or console.is_jupyter
     stopped = threading.Event()
 
-    def refresh(show: Callable[[Table], object]) -> None:
+    def refresh(show: Callable[[Table | Text], object]) -> None:
         told = _finished(list_units(), results)
         while not stopped.wait(1.0):
             if watches:
@@ -276,7 +277,7 @@ def _count(units: Sequence[Unit], done: Container[Path]) -> str:
 
 
 @contextmanager
-def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]]:
+def _shown(console: Console, table: Table | Text) -> Iterator[Callable[[Table | Text], object]]:
     """A table on a terminal or in a notebook, and what replaces it by another; elsewhere the last one is printed."""
     if console.is_jupyter:  # where rich's Live needs ipywidgets
         from IPython.display import display
@@ -287,11 +288,11 @@ def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]
             yield lambda later: live.update(later, refresh=True)
 
 
-def progress_table(units: Sequence[Unit], results: Path) -> Table:
+def progress_table(units: Sequence[Unit], results: Path) -> Table | Text:
     """
     :param units: The cells of a grid, and its common heads
     :param results: Folder of all results
-    :return: What is done, how fast it goes, when it will be finished
+    :return: What is done, how fast it goes, when it will be finished; no table where nothing is to be listed
     """
     table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
     finished, left, speed = set(), 0.0, 0.0
@@ -323,7 +324,7 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
             )
     pace = f", {speed:.1f} environment steps/s, about {_duration(left / speed)} left" if speed else ""
     table.caption = f"{_count(units, finished)} done{pace}"
-    return table
+    return table if table.row_count else Text(table.caption)
 
 
 def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
