@@ -290,7 +290,7 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
 
 def _check_spaces(name: str, settings: dict[str, Any], env: VecEnv) -> None:
     trained, given = settings["observation_space"], env.observation_space
-    what, fix = "observations", "make it as it was (images: with the same image_size, grayscale and frame_stack)"
+    what, fix = "observations", "make it as for that training (images: the same image_size, grayscale, frame_stack)"
     if trained == given:
         trained, given = settings["action_space"], env.action_space
         what, fix = "actions", "give the environment that it was trained on"

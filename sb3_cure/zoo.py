@@ -181,7 +181,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
         file = Path(storage.removeprefix("sqlite:///").partition("?")[0])
         if storage.startswith("sqlite:///") or storage.endswith(".log"):
             if not file.is_file():  # Optuna would make it
-                raise SettingsError(f"--storage is {storage!r}, but there is no such file: name that of `optimize`.")
+                raise SettingsError(
+                    f"--storage is {storage!r}, but there is no such file: name one that `sb3-cure optimize` wrote."
+                )
         try:
             if storage.endswith(".log"):
                 storage = optuna.storages.JournalStorage(JournalFileBackend(storage))
@@ -254,8 +256,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if isinstance(rate, str) and not re.fullmatch(r"lin_\d*\.?\d+(e-?\d+)?", rate):
             raise SettingsError(
                 f"learning_rate in {self._source('learning_rate')} is {rate!r}, but it must be a number, or "
-                "'lin_<number>' for one that falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 as a "
-                "number)."
+                "'lin_<number>' for one that falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 "
+                "as a number)."
             )
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
@@ -454,7 +456,8 @@ def run(program: str, arguments: Sequence[str]) -> None:
     try:
         programs[program]()
     except gym.error.DependencyNotInstalled as error:
-        window = "add --no-render" if program == "enjoy" else "leave render_mode='human' out"
+        asked = program != "enjoy" or "--no-render" in sys.argv
+        window = "leave render_mode='human' out" if asked else "add --no-render"
         raise SettingsError(f"{_one_line(error)}, or, to open no window, {window}.") from error
     except (AssertionError, ValueError, NameError, SyntaxError, ImportError) as error:
         if isinstance(error, SettingsError) or not _is_of_zoo(error):

@@ -1,5 +1,6 @@
 """What cannot work is refused in one sentence: the value, what was expected, what to do instead."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -1086,6 +1087,14 @@ def model_of(**kwargs: Any) -> CuReSAC:
     return tiny_model("CnnPolicy", PixelBox(), buffer_size=50, **kwargs)
 
 
+def reloaded(env: gym.Env) -> CuReSAC:
+    """A saved model, to go on in an environment."""
+    file = io.BytesIO()
+    model_of().save(file)
+    file.seek(0)
+    return CuReSAC.load(file, env=env)
+
+
 def watched(callback: Any) -> None:
     """What is known with the model: in ``learn``, before its first step."""
     model = model_of()
@@ -1389,6 +1398,17 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
     "save: number": (
         lambda: model_of().save(3),
         "got 3 for a file, but expected a path, or a file that is open in binary mode.",
+    ),
+    "load: other observations": (
+        lambda: reloaded(PixelBox(size=40)),
+        "the file was trained with the observations Box(0, 255, (6, 36, 36), uint8), but the environment has "
+        "Box(0, 255, (6, 40, 40), uint8): make it as for that training (images: the same image_size, grayscale, "
+        "frame_stack), or train anew.",
+    ),
+    "load: other actions": (
+        lambda: reloaded(PixelBox(low=-2)),
+        "the file was trained with the actions Box(-1.0, 1.0, (2,), float32), but the environment has "
+        "Box(-2.0, 1.0, (2,), float32): give the environment that it was trained on, or train anew.",
     ),
     "set_parameters: missing": (
         lambda: model_of().set_parameters("missing"),
