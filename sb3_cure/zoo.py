@@ -12,6 +12,7 @@ import runpy
 import shutil
 import sys
 import time
+import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -459,26 +460,28 @@ def run(program: str, arguments: Sequence[str]) -> None:
         asked = program != "enjoy" or "--no-render" in sys.argv
         window = "leave render_mode='human' out" if asked else "add --no-render"
         raise SettingsError(f"{_one_line(error)}, or, to open no window, {window}.") from error
-    except (AssertionError, ValueError, NameError, SyntaxError, ImportError) as error:
-        if isinstance(error, SettingsError) or not _is_of_zoo(error):
+    except _OF_INPUT as error:
+        if isinstance(error, SettingsError) or (fix := _fix(error, acts)) is None:
             raise
-        fix = ""
-        if isinstance(error, AssertionError | ValueError):
-            fix = ": correct the command line"
-            if acts:
-                fix = ": give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
         raise SettingsError(f"{_explained(error)}{fix}.") from error
     finally:
         sys.argv = own_arguments
 
 
-def _is_of_zoo(error: BaseException) -> bool:
-    """Whether rl-zoo3 itself complains, about the command line, and not what it runs."""
-    frames, frame = [], error.__traceback__
-    while frame is not None:
-        frames.append(str(frame.tb_frame.f_globals.get("__name__")).partition(".")[0])
-        frame = frame.tb_next
-    return _is_about_input(error) and "stable_baselines3" not in frames and frames[-1] != "sb3_cure"
+def _fix(error: BaseException, acts: bool) -> str | None:
+    """What to do, where rl-zoo3 itself complains about the command line; None if what it runs does."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if not _is_about_input(error):
+        return None
+    if any(frame.f_code.co_name == "create_test_env" for frame in frames):  # of `enjoy` and `record`
+        return ": correct --env-kwargs" if isinstance(error, ValueError | TypeError) else ""
+    packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame in frames]
+    if "stable_baselines3" in packages or packages[-1] == "sb3_cure":
+        return None
+    if isinstance(error, AssertionError | ValueError):
+        run = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
+        return f": {run if acts else 'correct the command line'}"
+    return "" if isinstance(error, NameError | SyntaxError | ImportError) else None
 
 
 if __name__ == "__main__":

@@ -375,7 +375,7 @@ class Drawn(PixelBox):
 Denoising = type("Denoising", (RAE,), {"__module__": "my_heads"})
 RUN = "logs/cure_sac/tests-PixelBox-v0"
 ENJOY = f"enjoy --env {TASK} --no-render"
-#: command line -> the whole sentence; the run 1 is of that head, 2 was damaged, 3 is whole
+#: command line -> the whole sentence; the run 1 is of that head, 2 was damaged, 3 is whole, 4 of DMC
 MODELS: dict[str, str] = {
     f"{ENJOY} --exp-id 1": (
         f"sb3-cure enjoy: '{RUN}_1/tests-PixelBox-v0.zip' was saved with the head "
@@ -431,6 +431,15 @@ MODELS: dict[str, str] = {
         "frame_stack), or train anew (settings: settings.yml, but env_kwargs from "
         "--env-kwargs)."
     ),
+    f"record --env {TASK} --exp-id 3 --env-kwargs imagesize:36": (
+        "sb3-cure record: VectorBox.__init__() got an unexpected keyword argument "
+        "'imagesize' was raised from the environment creator for tests/PixelBox-v0 with "
+        "kwargs ({'imagesize': 36, 'render_mode': 'rgb_array'}): correct --env-kwargs."
+    ),
+    "enjoy --env dmc_pixels/finger-spin-v0 --no-render --exp-id 4 --env-kwargs image_size:-1": (
+        "sb3-cure enjoy: image_size=-1 is not an integer of at least 1; use image_size=84, "
+        "for example: correct --env-kwargs."
+    ),
     f"{TRAIN} --env-kwargs render_mode:'human'": (
         'sb3-cure train: pygame is not installed, run `pip install "gymnasium[classic-control]"`, '
         "or, to open no window, leave render_mode='human' out."
@@ -454,6 +463,9 @@ def test_models(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: p
     for number, head in enumerate((Denoising, RAE, RAE), 1):
         Path(f"{RUN}_{number}").mkdir(parents=True)
         tiny_model("CnnPolicy", PixelBox(), srl=head, buffer_size=50).save(f"{RUN}_{number}/tests-PixelBox-v0")
+    other = Path("logs/cure_sac/dmc_pixels-finger-spin-v0_4/dmc_pixels-finger-spin-v0.zip")
+    other.parent.mkdir()
+    other.touch()
     damaged = Path(f"{RUN}_2/tests-PixelBox-v0.zip")
     damaged.write_bytes(damaged.read_bytes()[:3000])
     gym.registry[TASK] = EnvSpec(TASK, Drawn)

@@ -16,7 +16,6 @@ from typing import Any, TypeAlias
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from rich.text import Text
 
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
@@ -232,7 +231,7 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
     watches = console.is_terminal or console.is_jupyter
     stopped = threading.Event()
 
-    def refresh(show: Callable[[Table | Text], object]) -> None:
+    def refresh(show: Callable[[Table], object]) -> None:
         told = _finished(list_units(), results)
         while not stopped.wait(1.0):
             if watches:
@@ -277,7 +276,7 @@ def _count(units: Sequence[Unit], done: Container[Path]) -> str:
 
 
 @contextmanager
-def _shown(console: Console, table: Table | Text) -> Iterator[Callable[[Table | Text], object]]:
+def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]]:
     """A table on a terminal or in a notebook, and what replaces it by another; elsewhere the last one is printed."""
     if console.is_jupyter:  # where rich's Live needs ipywidgets
         from IPython.display import display
@@ -286,13 +285,15 @@ def _shown(console: Console, table: Table | Text) -> Iterator[Callable[[Table | 
     else:
         with Live(table, console=console, auto_refresh=console.is_terminal) as live:
             yield lambda later: live.update(later, refresh=True)
+        if not console.is_terminal:
+            console.line()  # which rich ends a table with on terminals only
 
 
-def progress_table(units: Sequence[Unit], results: Path) -> Table | Text:
+def progress_table(units: Sequence[Unit], results: Path) -> Table:
     """
     :param units: The cells of a grid, and its common heads
     :param results: Folder of all results
-    :return: What is done, how fast it goes, when it will be finished; no table where nothing is to be listed
+    :return: What is done, how fast it goes, when it will be finished; one line where nothing is under way
     """
     table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
     finished, left, speed = set(), 0.0, 0.0
@@ -323,8 +324,13 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table | Text:
                 ),
             )
     pace = f", {speed:.1f} environment steps/s, about {_duration(left / speed)} left" if speed else ""
-    table.caption = f"{_count(units, finished)} done{pace}"
-    return table if table.row_count else Text(table.caption)
+    summary = f"{_count(units, finished)} done{pace}"
+    if not table.row_count:
+        table = Table.grid()
+        table.add_row(summary)
+    else:
+        table.caption = summary
+    return table
 
 
 def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
