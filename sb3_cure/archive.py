@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Any
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.utils import (
-    check_for_correct_spaces,
-    get_system_info,
-)
+from stable_baselines3.common.utils import get_system_info
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.files import PathOrFile, reading, writing
 from sb3_cure.serialization import (
@@ -43,6 +41,23 @@ _PLACEHOLDER = "placeholder"
 _SYSTEM_INFO = "system_info.txt"
 _VARIABLES = "pytorch_variables.pth"
 _SMALLER = "load it with custom_objects={'buffer_size': ...} to have a smaller replay buffer"
+
+
+class ObjectsMissing(ArchiveError):
+    """What no archive holds, such as a head of the user's own, was not given to ``load``.
+
+    :param name: What to call the file
+    :param missing: What each of the settings was
+    """
+
+    def __init__(self, name: str, missing: dict[str, str]):
+        needed = ", ".join(f"{key!r}: ..." for key in missing)
+        super().__init__(
+            f"{name} was saved with what no archive holds ({'; '.join(missing.values())}): give it to load with "
+            f"custom_objects={{{needed}}}."
+        )
+        self.name = name
+        self.missing = missing
 
 
 # ------------------------------------------------------------------- writing
@@ -230,7 +245,7 @@ def load_model(
     settings = _complete(archive, custom_objects or {}, kwargs)
     if env is not None:
         env = cls._wrap_env(env, settings.get("verbose", 0))
-        check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
+        _check_spaces(archive.name, settings, env)
         settings["n_envs"] = env.num_envs
         if force_reset:
             settings["_last_obs"] = None
@@ -261,12 +276,7 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
         raise ArchiveError(f"{archive.name} has {key}, which is no setting: it is damaged, or of another version.")
     missing = sorted(archive.placeholders.keys() - custom_objects.keys() - kwargs.keys())
     if missing:
-        told = "; ".join(archive.placeholders[key] for key in missing)
-        needed = ", ".join(f"{key!r}: ..." for key in missing)
-        raise ArchiveError(
-            f"{archive.name} was saved with what no archive holds ({told}): give it to load with "
-            f"custom_objects={{{needed}}}."
-        )
+        raise ObjectsMissing(archive.name, {key: archive.placeholders[key] for key in missing})
     for key, value in settings.items():
         words, check = SCHEMA.get(key, ("", lambda _: True))
         with sentences(archive.name, _SMALLER):
@@ -289,6 +299,18 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
             f"saved with {policy_kwargs}: leave them out, as the networks are those of the archive."
         )
     return settings
+
+
+def _check_spaces(name: str, settings: dict[str, Any], env: VecEnv) -> None:
+    trained, given = settings["observation_space"], env.observation_space
+    what, fix = "observations", "make it as for that training (images: the same image_size, grayscale, frame_stack)"
+    if trained == given:
+        trained, given = settings["action_space"], env.action_space
+        what, fix = "actions", "give the environment that it was trained on"
+    if trained != given:
+        raise ArchiveError(
+            f"{name} was trained with the {what} {trained}, but the environment has {given}: {fix}, or train anew."
+        )
 
 
 def _apply(model: "CuReSAC", settings: dict[str, Any], archive: ModelArchive, trusted: bool) -> list[str]:

@@ -12,6 +12,7 @@ import runpy
 import shutil
 import sys
 import time
+import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,6 +25,7 @@ import gymnasium as gym
 try:
     import optuna
     import yaml
+    from optuna.storages.journal import JournalFileBackend
     from rl_zoo3 import ALGOS, exp_manager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
     from rl_zoo3.utils import get_class_by_name
@@ -33,6 +35,7 @@ except ModuleNotFoundError as missing:
     ) from missing
 
 from sb3_cure.allocator import tune_allocator
+from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
 from sb3_cure.values import arguments_of, check_keywords, is_integer, is_number
@@ -68,11 +71,15 @@ class ActingCuReSAC(CuReSAC):
         :param args: Arguments of ``CuReSAC.load``
         :param kwargs: Its keyword arguments
         :return: The model; its ``replay_buffer`` is None
+        :raises SettingsError: if it cannot be loaded
         """
         # rl-zoo3 asks for a buffer of 1 too, but only for the off-policy algorithms that it knows by name.
         objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects}
         kwargs.update(custom_objects=objects, buffer_size=1)
-        model = CuReSAC.load(*args, **kwargs)
+        try:
+            model = CuReSAC.load(*args, **kwargs)
+        except ValueError as error:
+            raise SettingsError(f"{_explained(error, 'add --srl {}')}.") from error
         model.replay_buffer = None
         return model
 
@@ -88,27 +95,63 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - settings that cannot work are one sentence, and leave no folder behind.
     """
 
-    def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
         save_path = Path(self.save_path)
-        fresh = [path for path in (save_path, *save_path.parents) if not path.exists()]
+        self._fresh = [path for path in (save_path, *save_path.parents) if not path.exists()]
+        #: What flags of the command line set instead of the file, by its names
+        self._flags: dict[str, dict[str, Any]] = {
+            "-params": self.custom_hyperparams or {},
+            "--env-kwargs": {"env_kwargs": self.env_kwargs} if self.env_kwargs else {},
+            "--eval-env-kwargs": {"env_kwargs": self._eval_env_kwargs_args} if self._eval_env_kwargs_args else {},
+            "--device": {"device": self.device} if self.device != "auto" else {},
+        }
+
+    def setup_experiment(self) -> tuple[Any, dict[str, Any]] | None:
         try:
             if self.optimize_hyperparameters and self.storage is not None:
                 self._open_storage(self.storage)
             return super().setup_experiment()
         except Exception as error:
-            if save_path in fresh:
-                shutil.rmtree(save_path, ignore_errors=True)
-                for folder in fresh[1:]:
-                    if folder.is_dir() and not any(folder.iterdir()):
-                        folder.rmdir()
+            self._remove_run()
             if isinstance(error, SettingsError) or not _is_about_input(error):
                 raise
-            raise SettingsError(f"{_explained(error)} (settings: {self.config}).") from error
+            sentence = _explained(error)
+            raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
+
+    def _remove_run(self) -> None:
+        """Remove the folder of a run that cannot begin, unless it was there before."""
+        if self._fresh[:1] != [Path(self.save_path)]:
+            return
+        shutil.rmtree(self.save_path, ignore_errors=True)
+        for folder in self._fresh[1:]:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+
+    def _source(self, name: str) -> str:
+        """Where a setting was given."""
+        return next((flag for flag, given in self._flags.items() if name in given), self.config)
+
+    def _sources(self, sentence: str) -> str:
+        """The file, and which of the settings that a sentence speaks of were given elsewhere."""
+        words = {*re.findall(r"\w+", sentence)}
+        elsewhere = [
+            f"{name} from {flag}"
+            for flag, given in self._flags.items()
+            for name, value in given.items()
+            if words & {name, *(value if isinstance(value, dict) else ())}
+        ]
+        return self.config + (f", but {' and '.join(elsewhere)}" if elsewhere else "")
 
     def learn(self, model: Any) -> None:
         if self.log_interval == 0:  # the constructor's own default, by which SB3 divides
             self.log_interval = -1
-        super().learn(model)
+        try:
+            super().learn(model)
+        except gym.error.DependencyNotInstalled:
+            if model.num_timesteps == 0:  # as for a window, which is opened by the first reset
+                self._remove_run()
+            raise
 
     def _open_storage(self, storage: str) -> None:
         try:
@@ -133,14 +176,37 @@ class ExperimentManager(exp_manager.ExperimentManager):
 
     def _trial(self) -> dict[str, Any]:
         """Arguments of the trial that the command line names."""
-        where = f"--trial-id {self.trial_id} of --study-name {self.study_name!r} in --storage {self.storage!r}"
-        database = re.fullmatch(r"sqlite:///(.+)", self.storage or "")
+        if not self.storage or not self.study_name:
+            raise SettingsError(f"--trial-id is {self.trial_id}, but of no study: add --storage and --study-name.")
+        storage: Any = self.storage
+        file = Path(storage.removeprefix("sqlite:///").partition("?")[0])
+        if storage.startswith("sqlite:///") or storage.endswith(".log"):
+            if not file.is_file():  # Optuna would make it
+                raise SettingsError(
+                    f"--storage is {storage!r}, but there is no such file: name one that `sb3-cure optimize` wrote."
+                )
         try:
-            if not self.storage or not self.study_name or (database and not Path(database[1]).is_file()):
-                raise FileNotFoundError("there is no such study")
-            return self.load_trial(self.storage, self.study_name, self.trial_id)
+            if storage.endswith(".log"):
+                storage = optuna.storages.JournalStorage(JournalFileBackend(storage))
+            studies = optuna.get_all_study_names(storage)
+            known = self.study_name in studies
+            n_trials = len(optuna.load_study(study_name=self.study_name, storage=storage).trials) if known else 0
+            if self.trial_id in range(n_trials):
+                return self.load_trial(self.storage, self.study_name, self.trial_id)
         except Exception as error:  # of Optuna or of the database's driver, whichever that is
-            raise SettingsError(f"{where} cannot be read ({_one_line(error)}): name a trial that is there.") from error
+            raise SettingsError(
+                f"--trial-id {self.trial_id} of --study-name {self.study_name!r} in --storage {self.storage!r} cannot "
+                f"be read ({_one_line(error)}): name a trial that is there."
+            ) from error
+        if not known:
+            raise SettingsError(
+                f"--study-name is {self.study_name!r}, but --storage {self.storage!r} has the studies "
+                f"{', '.join(studies) or '(none)'}: name one of them."
+            )
+        raise SettingsError(
+            f"--trial-id is {self.trial_id}, but --study-name {self.study_name!r} has {n_trials} trials, the first of "
+            "which is 0: name one of them."
+        )
 
     def _check_file(self) -> None:
         path = Path(self.config)
@@ -167,27 +233,32 @@ class ExperimentManager(exp_manager.ExperimentManager):
 
     def _check_values(self, hyperparams: dict[str, Any]) -> None:
         known = arguments_of(ALGOS[ALGO])
-        check_keywords("the settings file", hyperparams, known and known | _ZOO_KEYS, CuReSAC.__name__)
+        for name, value in hyperparams.items():
+            try:
+                check_keywords(self._source(name), {name: value}, known and known | _ZOO_KEYS, CuReSAC.__name__)
+            except (ValueError, TypeError) as error:
+                raise SettingsError(str(error)) from error
         if not is_number(hyperparams.get("n_timesteps"), low=1):
             raise SettingsError(
-                f"n_timesteps in {self.config} is {hyperparams.get('n_timesteps')!r}, but it must be a number of agent "
-                "steps of at least 1: write for example n_timesteps: 12500."
+                f"n_timesteps in {self._source('n_timesteps')} is {hyperparams.get('n_timesteps')!r}, but it must be a "
+                "number of agent steps of at least 1: write for example n_timesteps: 12500."
             )
         if not is_integer(hyperparams.get("n_envs", 1), 1):
             raise SettingsError(
-                f"n_envs in {self.config} is {hyperparams['n_envs']!r}, but it must be a whole number of at least 1: "
-                "change n_envs."
+                f"n_envs in {self._source('n_envs')} is {hyperparams['n_envs']!r}, but it must be a whole number of at "
+                "least 1: change n_envs."
             )
         if not isinstance(hyperparams.get("env_kwargs") or {}, dict):
             raise SettingsError(
-                f"env_kwargs in {self.config} is {hyperparams['env_kwargs']!r}, but it must be a mapping (key: value): "
-                "change env_kwargs."
+                f"env_kwargs in {self._source('env_kwargs')} is {hyperparams['env_kwargs']!r}, but it must be a "
+                "mapping (key: value): change env_kwargs."
             )
         rate = hyperparams.get("learning_rate", 0.0)
         if isinstance(rate, str) and not re.fullmatch(r"lin_\d*\.?\d+(e-?\d+)?", rate):
             raise SettingsError(
-                f"learning_rate in {self.config} is {rate!r}, but it must be a number, or 'lin_<number>' for one that "
-                "falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 as a number)."
+                f"learning_rate in {self._source('learning_rate')} is {rate!r}, but it must be a number, or "
+                "'lin_<number>' for one that falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 "
+                "as a number)."
             )
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
@@ -197,13 +268,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             if self._eval_env_kwargs_args is None:
                 self.eval_env_kwargs = self.args.env_kwargs
         if "." in str(hyperparams.get("srl")):
-            try:
-                hyperparams["srl"] = get_class_by_name(hyperparams["srl"])
-            except (ImportError, AttributeError) as error:
-                raise SettingsError(
-                    f"srl is {hyperparams['srl']!r}, which cannot be imported ({_one_line(error)}): name a class as "
-                    "module.Class, in a module of the working directory or an installed one."
-                ) from error
+            hyperparams["srl"] = _head("srl", hyperparams["srl"])
         return super()._preprocess_hyperparams(hyperparams)
 
     def hyperparameters_optimization(self) -> None:
@@ -213,14 +278,28 @@ class ExperimentManager(exp_manager.ExperimentManager):
         super().hyperparameters_optimization()
 
 
+def _head(where: str, name: Any) -> Any:
+    """The class of a user's own head."""
+    try:
+        return get_class_by_name(name)
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:  # ValueError: no module
+        raise SettingsError(
+            f"{where} is {name!r}, which cannot be imported ({_one_line(error)}): name a class as module.Class, in a "
+            "module of the working directory or an installed one."
+        ) from error
+
+
 def _one_line(error: Exception) -> str:
     """What an error says, without the full stop or question mark at its end."""
     text = error.args[0] if isinstance(error, KeyError) and error.args else error
     return " ".join(str(text).split()).rstrip(".?")
 
 
-def _explained(error: Exception) -> str:
-    """The same, with what to do where Python does not say it."""
+def _explained(error: Exception, add_head: str = "add srl: {} to the settings") -> str:
+    """The same, with what to do where Python, or a program's sentence, does not say it."""
+    if isinstance(error, ObjectsMissing) and error.missing.keys() == {"srl"}:
+        head = error.missing["srl"].rpartition(" ")[2]
+        return f"{error.name} was saved with the head {head}, which no archive holds: {add_head.format(head)}"
     if isinstance(error, NameError | SyntaxError):
         return (
             f"a text that is to be evaluated is no Python ({_one_line(error)}): correct it; text in it needs quotes "
@@ -361,7 +440,7 @@ def run(program: str, arguments: Sequence[str]) -> None:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--srl")
         own, arguments = parser.parse_known_args(arguments)
-        ActingCuReSAC.objects = {} if own.srl is None else {"srl": get_class_by_name(own.srl)}
+        ActingCuReSAC.objects = {} if own.srl is None else {"srl": _head("--srl", own.srl)}
     register(ActingCuReSAC if acts else CuReSAC)
     # argparse takes the last of repeated flags, so that these are defaults.
     defaults = ["--algo", ALGO] + (["--folder", "logs"] if acts else [])
@@ -377,26 +456,32 @@ def run(program: str, arguments: Sequence[str]) -> None:
     sys.argv = [f"sb3-cure {program}", *defaults, *arguments]
     try:
         programs[program]()
-    except (AssertionError, ValueError, NameError, SyntaxError, ImportError) as error:
-        if isinstance(error, SettingsError) or not _is_of_zoo(error):
+    except gym.error.DependencyNotInstalled as error:
+        asked = program != "enjoy" or "--no-render" in sys.argv
+        window = "leave render_mode='human' out" if asked else "add --no-render"
+        raise SettingsError(f"{_one_line(error)}, or, to open no window, {window}.") from error
+    except _OF_INPUT as error:
+        if isinstance(error, SettingsError) or (fix := _fix(error, acts)) is None:
             raise
-        fix = ""
-        if isinstance(error, AssertionError | ValueError):
-            fix = ": correct the command line"
-            if acts:
-                fix = ": give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
         raise SettingsError(f"{_explained(error)}{fix}.") from error
     finally:
         sys.argv = own_arguments
 
 
-def _is_of_zoo(error: BaseException) -> bool:
-    """Whether rl-zoo3 itself complains, about the command line, and not what it runs."""
-    frames, frame = [], error.__traceback__
-    while frame is not None:
-        frames.append(str(frame.tb_frame.f_globals.get("__name__")).partition(".")[0])
-        frame = frame.tb_next
-    return _is_about_input(error) and "stable_baselines3" not in frames and frames[-1] != "sb3_cure"
+def _fix(error: BaseException, acts: bool) -> str | None:
+    """What to do, where rl-zoo3 itself complains about the command line; None if what it runs does."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    if not _is_about_input(error):
+        return None
+    if any(frame.f_code.co_name == "create_test_env" for frame in frames):  # of `enjoy` and `record`
+        return ": correct --env-kwargs" if isinstance(error, ValueError | TypeError) else ""
+    packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame in frames]
+    if "stable_baselines3" in packages or packages[-1] == "sb3_cure":
+        return None
+    if isinstance(error, AssertionError | ValueError):
+        run = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
+        return f": {run if acts else 'correct the command line'}"
+    return "" if isinstance(error, NameError | SyntaxError | ImportError) else None
 
 
 if __name__ == "__main__":

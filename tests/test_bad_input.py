@@ -1,5 +1,6 @@
 """What cannot work is refused in one sentence: the value, what was expected, what to do instead."""
 
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -1143,8 +1144,8 @@ def test_augmentations_of_a_users_head(method: str) -> None:
     """The encoder would complain of weights, or read a part of the image."""
     Wrong = type("Wrong", (RAE,), {method: lambda self, observations: observations[:, :, 2:]})
     sentence = (
-        rf"Wrong\.{method} made observations of shape \(6, 34, 36\) of those of shape \(6, 36, 36\), but the encoder was "
-        r"built for \(6, 36, 36\): return that shape, or name another one in configure_encoder\."
+        rf"Wrong\.{method} made observations of shape \(6, 34, 36\) of those of shape \(6, 36, 36\), but the encoder "
+        r"was built for \(6, 36, 36\): return that shape, or name another one in configure_encoder\."
     )
     with pytest.raises(ValueError, match=sentence):
         tiny_model("CnnPolicy", PixelBox(), srl=Wrong).learn(12)
@@ -1162,6 +1163,14 @@ def saved(method: str) -> str:
     getattr(model_of(), method)("saved.zip")
     os.replace("saved.zip", "there")
     return "there"
+
+
+def reloaded(env: gym.Env) -> CuReSAC:
+    """A saved model, to go on in an environment."""
+    file = io.BytesIO()
+    model_of().save(file)
+    file.seek(0)
+    return CuReSAC.load(file, env=env)
 
 
 def watched(callback: Any) -> None:
@@ -1487,6 +1496,17 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
     "save: number": (
         lambda: model_of().save(3),
         "got 3 for a file, but expected a path, or a file that is open in binary mode.",
+    ),
+    "load: other observations": (
+        lambda: reloaded(PixelBox(size=40)),
+        "the file was trained with the observations Box(0, 255, (6, 36, 36), uint8), but the environment has "
+        "Box(0, 255, (6, 40, 40), uint8): make it as for that training (images: the same image_size, grayscale, "
+        "frame_stack), or train anew.",
+    ),
+    "load: other actions": (
+        lambda: reloaded(PixelBox(low=-2)),
+        "the file was trained with the actions Box(-1.0, 1.0, (2,), float32), but the environment has "
+        "Box(-2.0, 1.0, (2,), float32): give the environment that it was trained on, or train anew.",
     ),
     "set_parameters: missing": (
         lambda: model_of().set_parameters("missing"),

@@ -4,15 +4,20 @@ import copy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
+import optuna
 import pytest
 import yaml
-from envs_for_tests import PixelBox
+from envs_for_tests import PixelBox, tiny_model
+from gymnasium.envs.registration import EnvSpec
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from test_bad_input import files_in, is_one_sentence
 
 from sb3_cure import cli
+from sb3_cure.srl import RAE
 
 TASK = "tests/PixelBox-v0"
 SETTINGS: dict[str, Any] = {
@@ -82,8 +87,7 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     ),
     "a misspelt argument": (
         {"curiousity": None},
-        "sb3-cure train: the settings file has 'curiousity', but CuReSAC has no such "
-        "argument: write 'curiosity' (settings: settings.yml).",
+        "sb3-cure train: settings.yml has 'curiousity', but CuReSAC has no such argument: write 'curiosity'.",
     ),
     "a number as text": (
         {"batch_size": "8"},
@@ -223,7 +227,7 @@ COMMANDS: dict[str, str] = {
     ),
     f"{TRAIN} --device gpu": (
         "sb3-cure train: device is 'gpu', which PyTorch cannot use here: use 'auto', 'cpu', "
-        "or 'cuda' on a machine with a GPU (settings: settings.yml)."
+        "or 'cuda' on a machine with a GPU (settings: settings.yml, but device from --device)."
     ),
     f"{TRAIN} --seed one": "sb3-cure train: error: argument --seed: invalid int value: 'one'",
     f"{TRAIN} -i no.zip": (
@@ -238,8 +242,40 @@ COMMANDS: dict[str, str] = {
         "correct the name, or install it."
     ),
     f"{TRAIN} --storage sqlite:///no.db --study-name mine --trial-id 3": (
-        "sb3-cure train: --trial-id 3 of --study-name 'mine' in --storage 'sqlite:///no.db' "
-        "cannot be read (there is no such study): name a trial that is there."
+        "sb3-cure train: --storage is 'sqlite:///no.db', but there is no such file: name one "
+        "that `sb3-cure optimize` wrote."
+    ),
+    f"{TRAIN} --storage no.log --study-name mine --trial-id 3": (
+        "sb3-cure train: --storage is 'no.log', but there is no such file: name one that `sb3-cure optimize` wrote."
+    ),
+    f"{TRAIN} --trial-id 3": "sb3-cure train: --trial-id is 3, but of no study: add --storage and --study-name.",
+    f"{TRAIN} --storage study.log --study-name min --trial-id 0": (
+        "sb3-cure train: --study-name is 'min', but --storage 'study.log' has the studies "
+        "mine, yours: name one of them."
+    ),
+    f"{TRAIN} --storage study.log --study-name mine --trial-id 1": (
+        "sb3-cure train: --trial-id is 1, but --study-name 'mine' has 1 trials, the first of "
+        "which is 0: name one of them."
+    ),
+    f"{TRAIN} --storage no-study.log --study-name mine --trial-id 0": (
+        "sb3-cure train: --trial-id 0 of --study-name 'mine' in --storage 'no-study.log' "
+        "cannot be read (Expecting value: line 1 column 1 (char 0)): name a trial that is there."
+    ),
+    f"{TRAIN} -params curiosity_prb:0.5": (
+        "sb3-cure train: -params has 'curiosity_prb', but CuReSAC has no such argument: write 'curiosity_prob'."
+    ),
+    f"{TRAIN} -params curiosity_prob:2 batch_size:8": (
+        "sb3-cure train: curiosity_prob is 2 (progress remaining 1.00), but it is the "
+        "probability p_c with which the curious actor acts: give a number, or a schedule, "
+        "within [0, 1] (settings: settings.yml, but curiosity_prob from -params)."
+    ),
+    f"{TRAIN} -params n_envs:0": (
+        "sb3-cure train: n_envs in -params is 0, but it must be a whole number of at least 1: change n_envs."
+    ),
+    f"{TRAIN} --env-kwargs imagesize:36": (
+        "sb3-cure train: VectorBox.__init__() got an unexpected keyword argument 'imagesize' "
+        "was raised from the environment creator for tests/PixelBox-v0 with kwargs "
+        "({'imagesize': 36}) (settings: settings.yml, but env_kwargs from --env-kwargs)."
     ),
     f"optimize --env {TASK} --conf-file settings.yml --storage nosql:///no --study-name mine": (
         "sb3-cure optimize: --storage is 'nosql:///no', which cannot be opened (Can't load "
@@ -315,7 +351,127 @@ COMMANDS: dict[str, str] = {
 def test_command_lines(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
     Path("grid.yml").write_text(yaml.safe_dump(GRID))
+    Path("no-study.log").write_text(yaml.safe_dump(SETTINGS))
+    storage = JournalStorage(JournalFileBackend("study.log"))
+    for name in ("mine", "yours"):
+        optuna.create_study(study_name=name, storage=storage).ask()
     assert refusal(command, capsys) == COMMANDS[command].replace("{folder}", str(tmp_path))
+
+
+class Drawn(PixelBox):
+    """It can be filmed, and hence be shown in a window."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        return self.background.transpose(1, 2, 0)
+
+
+#: As if it were a class of the module ``my_heads``, which cannot be imported
+Denoising = type("Denoising", (RAE,), {"__module__": "my_heads"})
+RUN = "logs/cure_sac/tests-PixelBox-v0"
+ENJOY = f"enjoy --env {TASK} --no-render"
+#: command line -> the whole sentence; the run 1 is of that head, 2 was damaged, 3 is whole, 4 of DMC
+MODELS: dict[str, str] = {
+    f"{ENJOY} --exp-id 1": (
+        f"sb3-cure enjoy: '{RUN}_1/tests-PixelBox-v0.zip' was saved with the head "
+        "my_heads.Denoising, which no archive holds: add --srl my_heads.Denoising."
+    ),
+    f"record --env {TASK} --exp-id 1": (
+        f"sb3-cure record: '{RUN}_1/tests-PixelBox-v0.zip' was saved with the head "
+        "my_heads.Denoising, which no archive holds: add --srl my_heads.Denoising."
+    ),
+    f"{TRAIN} -i {RUN}_1/tests-PixelBox-v0.zip": (
+        f"sb3-cure train: '{RUN}_1/tests-PixelBox-v0.zip' was saved with the head "
+        "my_heads.Denoising, which no archive holds: add srl: my_heads.Denoising to the "
+        "settings (settings: settings.yml)."
+    ),
+    f"{ENJOY} --srl my_head.Denoising": (
+        "sb3-cure enjoy: --srl is 'my_head.Denoising', which cannot be imported (No module "
+        "named 'my_head'): name a class as module.Class, in a module of the working "
+        "directory or an installed one."
+    ),
+    f"record --env {TASK} --srl Denoising": (
+        "sb3-cure record: --srl is 'Denoising', which cannot be imported (Empty module "
+        "name): name a class as module.Class, in a module of the working directory or an "
+        "installed one."
+    ),
+    f"{ENJOY} --srl sb3_cure.srl.Denoising": (
+        "sb3-cure enjoy: --srl is 'sb3_cure.srl.Denoising', which cannot be imported (module "
+        "'sb3_cure.srl' has no attribute 'Denoising'): name a class as module.Class, in a "
+        "module of the working directory or an installed one."
+    ),
+    f"{ENJOY} --exp-id 1 --srl os.path": (
+        f"sb3-cure enjoy: '{RUN}_1/tests-PixelBox-v0.zip' cannot be loaded: srl is <module "
+        "'posixpath' (frozen)>, but it must be one of 'rae', 'curl', None, or a subclass of "
+        "sb3_cure.srl.SRLHead (the class itself, not an instance)."
+    ),
+    f"{ENJOY} --exp-id 2": (
+        f"sb3-cure enjoy: '{RUN}_2/tests-PixelBox-v0.zip' is no zip file, or the end of it "
+        "is missing: it was not written by this package, or was damaged since."
+    ),
+    f"record --env {TASK} --exp-id 2": (
+        f"sb3-cure record: '{RUN}_2/tests-PixelBox-v0.zip' is no zip file, or the end of it "
+        "is missing: it was not written by this package, or was damaged since."
+    ),
+    f"record --env {TASK} --exp-id 3 --env-kwargs size:40": (
+        f"sb3-cure record: '{RUN}_3/tests-PixelBox-v0.zip' was trained with the observations "
+        "Box(0, 255, (6, 36, 36), uint8), but the environment has Box(0, 255, (6, 40, 40), "
+        "uint8): make it as for that training (images: the same image_size, grayscale, "
+        "frame_stack), or train anew."
+    ),
+    f"{TRAIN} -i {RUN}_3/tests-PixelBox-v0.zip --env-kwargs frame_stack:1": (
+        f"sb3-cure train: '{RUN}_3/tests-PixelBox-v0.zip' was trained with the observations "
+        "Box(0, 255, (6, 36, 36), uint8), but the environment has Box(0, 255, (3, 36, 36), "
+        "uint8): make it as for that training (images: the same image_size, grayscale, "
+        "frame_stack), or train anew (settings: settings.yml, but env_kwargs from "
+        "--env-kwargs)."
+    ),
+    f"record --env {TASK} --exp-id 3 --env-kwargs imagesize:36": (
+        "sb3-cure record: VectorBox.__init__() got an unexpected keyword argument "
+        "'imagesize' was raised from the environment creator for tests/PixelBox-v0 with "
+        "kwargs ({'imagesize': 36, 'render_mode': 'rgb_array'}): correct --env-kwargs."
+    ),
+    "enjoy --env dmc_pixels/finger-spin-v0 --no-render --exp-id 4 --env-kwargs image_size:-1": (
+        "sb3-cure enjoy: image_size=-1 is not an integer of at least 1; use image_size=84, "
+        "for example: correct --env-kwargs."
+    ),
+    f"{TRAIN} --env-kwargs render_mode:'human'": (
+        'sb3-cure train: pygame is not installed, run `pip install "gymnasium[classic-control]"`, '
+        "or, to open no window, leave render_mode='human' out."
+    ),
+    f"{ENJOY} --exp-id 3 --env-kwargs render_mode:'human'": (
+        'sb3-cure enjoy: pygame is not installed, run `pip install "gymnasium[classic-control]"`, '
+        "or, to open no window, leave render_mode='human' out."
+    ),
+    f"enjoy --env {TASK} --exp-id 3": (
+        'sb3-cure enjoy: pygame is not installed, run `pip install "gymnasium[classic-control]"`, '
+        "or, to open no window, add --no-render."
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
+@pytest.mark.parametrize("command", MODELS)
+def test_models(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that are loaded, and the windows that show them."""
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    for number, head in enumerate((Denoising, RAE, RAE), 1):
+        Path(f"{RUN}_{number}").mkdir(parents=True)
+        tiny_model("CnnPolicy", PixelBox(), srl=head, buffer_size=50).save(f"{RUN}_{number}/tests-PixelBox-v0")
+    other = Path("logs/cure_sac/dmc_pixels-finger-spin-v0_4/dmc_pixels-finger-spin-v0.zip")
+    other.parent.mkdir()
+    other.touch()
+    damaged = Path(f"{RUN}_2/tests-PixelBox-v0.zip")
+    damaged.write_bytes(damaged.read_bytes()[:3000])
+    gym.registry[TASK] = EnvSpec(TASK, Drawn)
+    monkeypatch.setitem(sys.modules, "pygame", None)  # as if it were not installed
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert refusal(command, capsys) == MODELS[command]
 
 
 def arm(**method: Any) -> dict[str, Any]:

@@ -602,7 +602,9 @@ def test_frames_dir_without_room_is_one_sentence(tmp_path: Path) -> None:
     new.add(*transition)
     assert (tmp_path / "new").is_dir()
     mistyped = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "not" / "there")
-    with pytest.raises(ValueError, match=r"frames_dir is '.*/there', but .* GB for frames cannot be reserved there \(No"):
+    with pytest.raises(
+        ValueError, match=r"frames_dir is '.*/there', but .* GB for frames cannot be reserved there \(No"
+    ):
         mistyped.add(*transition)
     taken = FrameStackReplayBuffer(20, space, ACTIONS, frame_stack=2, frames_dir=tmp_path / "taken")
     (tmp_path / "taken").touch()

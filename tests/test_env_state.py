@@ -404,7 +404,9 @@ def test_environments_that_were_built_otherwise_are_told(
     load_vec_env_state(built(), state)
     assert not recwarn.list
     wrong = built(**other)
-    with pytest.warns(UserWarning, match=f"^The environments were built otherwise when their state was saved: {sentence}"):
+    with pytest.warns(
+        UserWarning, match=f"^The environments were built otherwise when their state was saved: {sentence}"
+    ):
         load_vec_env_state(wrong, state)
     wrong.close()
 

@@ -419,7 +419,9 @@ def test_a_failing_cell_does_not_stop_the_others(
 
     monkeypatch.setattr(CuReSAC, "learn", learn_or_fail)
     assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 1
-    assert "seed0 failed: RuntimeError: no luck" in capsys.readouterr().out.replace("\n", " ")
+    told = capsys.readouterr().out
+    assert "seed0 failed: RuntimeError: no luck" in told.replace("\n", " ")
+    assert "┃ method ┃" in told and "1 of 2 cells done" in told  # a table of what is not done
     folder = out / "tiny" / "PixelBox" / "cure"
     assert "learn_or_fail" in (folder / "seed0" / "error.txt").read_text()
     assert (folder / "seed1" / "DONE").exists() and not (folder / "seed0" / "DONE").exists()
@@ -427,6 +429,8 @@ def test_a_failing_cell_does_not_stop_the_others(
     assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 0
     assert (folder / "seed0" / "DONE").exists() and not (folder / "seed0" / "error.txt").exists()
     capsys.readouterr()
+    assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 0
+    assert capsys.readouterr().out == "2 of 2 cells done\n"
     assert run.main([str(path), "--out", str(out), "--dry-run"]) == 0
     assert capsys.readouterr().out.count(": done") == 2
 

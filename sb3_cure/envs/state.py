@@ -329,9 +329,7 @@ def _how_built(layer: Any) -> dict[str, Any]:
     arguments = getattr(layer, "_saved_kwargs", None) or {}
     if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper) and layer.spec is not None:
         arguments = {"id": layer.spec.id}
-    return {
-        name: _builtin(value) for name, value in arguments.items() if is_plain(value) and name not in _HARMLESS
-    }
+    return {name: _builtin(value) for name, value in arguments.items() if is_plain(value) and name not in _HARMLESS}
 
 
 def _builtin(value: Any) -> Any:

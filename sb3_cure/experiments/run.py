@@ -285,13 +285,15 @@ def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]
     else:
         with Live(table, console=console, auto_refresh=console.is_terminal) as live:
             yield lambda later: live.update(later, refresh=True)
+        if not console.is_terminal:
+            console.line()  # which rich ends a table with on terminals only
 
 
 def progress_table(units: Sequence[Unit], results: Path) -> Table:
     """
     :param units: The cells of a grid, and its common heads
     :param results: Folder of all results
-    :return: What is done, how fast it goes, when it will be finished
+    :return: What is done, how fast it goes, when it will be finished; one line where nothing is under way
     """
     table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
     finished, left, speed = set(), 0.0, 0.0
@@ -322,7 +324,12 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
                 ),
             )
     pace = f", {speed:.1f} environment steps/s, about {_duration(left / speed)} left" if speed else ""
-    table.caption = f"{_count(units, finished)} done{pace}"
+    summary = f"{_count(units, finished)} done{pace}"
+    if not table.row_count:
+        table = Table.grid()
+        table.add_row(summary)
+    else:
+        table.caption = summary
     return table
 
 
