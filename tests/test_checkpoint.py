@@ -473,6 +473,31 @@ def test_a_log_that_nothing_goes_on_with_is_told(tmp_path: Path) -> None:
         model.learn(60)
 
 
+@pytest.mark.parametrize("why", ["main thread", "thread limit"])
+def test_checkpoints_need_no_second_thread(why: str, tmp_path: Path) -> None:
+    """There can be none when the main thread has ended while a training goes on in another, or at a limit."""
+    program = f"""
+import sys, threading
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_checkpoint import CASES, Path, train
+
+def refuse(*_):
+    raise RuntimeError("can't start new thread")
+
+def run():
+    threading.main_thread().join() if {why!r} == "main thread" else setattr(threading.Thread, "start", refuse)
+    train(CASES["frames on disk, small ring"], Path({str(tmp_path)!r}))
+    print("done", flush=True)
+
+threading.Thread(target=run).start() if {why!r} == "main thread" else run()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
+    assert done.stdout.strip().endswith("done"), done.stderr
+    kept = Generations(tmp_path / "checkpoints")
+    assert kept.numbers() == [3, 4, 5]
+    assert all(kept.damaged(kept.read(number)) == [] for number in kept.numbers())
+
+
 def script(folder: Path, resume: bool, kill_at: int = 0) -> CuReSAC:
     """One that pretrains, and learns twice."""
     env = pixels()()
@@ -555,8 +580,7 @@ def test_what_a_stranger_put_into_a_checkpoint_reaches_no_file_and_no_code(tmp_p
     def copy(draft: Draft) -> dict[str, Any]:
         for path in folder.iterdir():
             if path.name != "manifest.json":
-                with draft.file(path.name) as place:
-                    shutil.copyfile(path, place)
+                shutil.copy(path, draft.folder)
         return {"frames": []}
 
     kept.write(copy, 1)

@@ -54,6 +54,25 @@ def agent_of(agent: str, env: Any, **kwargs: Any) -> SAC:
     return SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, **{**defaults, **kwargs})
 
 
+class Rooms(gym.ObservationWrapper):
+    """Tells only in which of two rooms the agent is."""
+
+    def __init__(self) -> None:
+        super().__init__(VectorBox())
+        self.observation_space = spaces.Discrete(2)
+
+    def observation(self, observation: np.ndarray) -> Any:
+        return np.int64(observation[0] > 0)
+
+
+@AGENTS
+def test_discrete_observations(agent: str) -> None:
+    """They are stored as numbers and seen one-hot."""
+    model = agent_of(agent, DummyVecEnv([Rooms])).learn(20)
+    assert set(np.unique(model.replay_buffer.observations[:20])) <= {0, 1}
+    assert model.predict(np.int64(1))[0].shape == (2,)
+
+
 # ------------------------------------------------------------------------------ callbacks
 
 

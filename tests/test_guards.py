@@ -503,6 +503,16 @@ def test_the_post_mortem_of_a_step_shows_what_was_not_finite(
         assert step["observations"].shape == (2, 2) and step["actions"].shape == (2, 2)
 
 
+def test_the_post_mortem_of_a_step_shows_what_normalization_has_hidden(tmp_path: Path) -> None:
+    """Frozen VecNormalize clips an infinite reward to 10."""
+    venv = VecNormalize(DummyVecEnv([functools.partial(FlawedBox, {3: "reward"}, INF)]), training=False, norm_obs=False)
+    model = tiny_model("MlpPolicy", venv)
+    with pytest.raises(BadTransitionError) as caught:
+        model.learn(10)
+    with np.load(Path(caught.value.post_mortem) / "step.npz", allow_pickle=False) as step:
+        assert np.isinf(step["original_rewards"]).all() and np.isfinite(step["rewards"]).all()
+
+
 def test_after_a_bad_transition_training_starts_with_a_reset() -> None:
     """Otherwise the next transition stored would span the steps between."""
     env = FlawedBox({7: "reward"})

@@ -350,6 +350,20 @@ def test_curious_reward_is_about_the_target(curiosity: str, target: str, monkeyp
     assert dumps[0]["train/curious_reward_raw_max"] == pytest.approx(expected.max().item(), rel=1e-6)
 
 
+@pytest.mark.parametrize("kind", [tuple, list])
+def test_a_head_may_return_any_pair(kind: type) -> None:
+    """Loss and error, whatever holds them: for the update, the next observations' error, and for measuring."""
+
+    class Pair(Brightness):
+        def loss(self, batch: Any, latents: th.Tensor) -> Any:
+            return kind(super().loss(batch, latents))
+
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Pair, curiosity_target="next_observation").learn(14)
+    batch = model.replay_buffer.sample(8)
+    error = model.policy.srl.error(batch, th.zeros(8, model.policy.encoder.features_dim))
+    th.testing.assert_close(error, brightness(batch.observations))
+
+
 @both_updates
 @pytest.mark.parametrize("curiosity", ["separate", "bonus"])
 def test_rewards_of_the_critics(curiosity: str, update: str, monkeypatch: pytest.MonkeyPatch) -> None:
