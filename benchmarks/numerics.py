@@ -74,6 +74,7 @@ def measure(updates: int = 2000, tail: int = 200, seeds: tuple[int, ...] = tuple
             name: {
                 "fp32": round(float(found["fp32"][:, column].mean()), 6),
                 **{f"{arm}, change": _describe(values[:, column]) for arm, values in changes.items()},
+                "by seed": {arm: [float(f"{value:.6g}") for value in found[arm][:, column]] for arm in ARMS},
             }
             for column, name in enumerate(COLUMNS.values())
         }

@@ -38,50 +38,56 @@ LARGEST_NORM = math.sqrt(np.finfo(np.float32).max)
 BATCHES_REMEMBERED = 4096
 
 
-class NonFiniteError(ValueError):
-    """A loss or a gradient was not finite; the step was not taken.
+class _WithPostMortem(ValueError):
+    """An error of which more than a sentence may have been written down."""
+
+    #: Where that is
+    post_mortem = ""
+
+    @property
+    def _look(self) -> str:
+        return f"look at {self.post_mortem}, then " if self.post_mortem else ""
+
+
+class NonFiniteError(_WithPostMortem):
+    """A loss or a gradient was not finite; the step was not taken. ``post_mortem`` says where more is written.
 
     :param source: What it was, say ``"task critic's loss"`` or ``"gradient of the SRL loss"``
     :param value: Its value
     :param update: Number of the update
-    :param post_mortem: Where more about it was written
     """
 
-    def __init__(self, source: str, value: float, update: int, post_mortem: str = ""):
-        super().__init__(source, value, update, post_mortem)
+    def __init__(self, source: str, value: float, update: int):
+        super().__init__(source, value, update)
         self.source = source
         self.value = value
         self.update = update
-        self.post_mortem = post_mortem
 
     def __str__(self) -> str:
-        look = f"look at {self.post_mortem}, then " if self.post_mortem else ""
         return (
             f"the {self.source} was {self.value:g} in update {self.update}, but losses and gradients (their squares, "
-            f"too) must be finite: the parameters did not take it; {look}lower the learning rate, or fix the SRL head "
-            "or the rewards."
+            f"too) must be finite: the parameters did not take it; {self._look}lower the learning rate, or fix the SRL "
+            "head or the rewards."
         )
 
 
-class BadTransitionError(ValueError):
-    """A reward, an observation or an action was not finite; it was neither stored nor executed.
+class BadTransitionError(_WithPostMortem):
+    """A reward, an observation or an action was not finite; it was neither stored nor executed. ``post_mortem`` says
+    where more is written.
 
     :param reason: What was not finite, where and when
     :param consequence: What was not done with it
     :param fix: What to do
-    :param post_mortem: Where more about it was written
     """
 
-    def __init__(self, reason: str, consequence: str, fix: str, post_mortem: str = ""):
-        super().__init__(reason, consequence, fix, post_mortem)
+    def __init__(self, reason: str, consequence: str, fix: str):
+        super().__init__(reason, consequence, fix)
         self.reason = reason
         self.consequence = consequence
         self.fix = fix
-        self.post_mortem = post_mortem
 
     def __str__(self) -> str:
-        look = f"look at {self.post_mortem}, then " if self.post_mortem else ""
-        return f"{self.reason}: {self.consequence}; {look}{self.fix}."
+        return f"{self.reason}: {self.consequence}; {self._look}{self.fix}."
 
 
 class Check(NamedTuple):
@@ -236,7 +242,8 @@ class Guard:
                 buffer.copy_(before)
             model.policy.encoder_optimizer.discard()
             draw = _draw(model, len(batch.rewards), random_state)
-            raise self._post_mortem(model, error, draw, batch, "as it was sampled") from None
+            self._post_mortem(model, error, draw, batch, "as it was sampled")
+            raise
         for buffer, before in statistics:
             if self._bad is not None:
                 buffer.copy_(self.choose(buffer, before))
@@ -268,14 +275,14 @@ class Guard:
         error = _error(name, first)
         draw = next((draw for draw in draws if draw.update == error.update), None)
         draw = draw or Draw(error.update, model.num_timesteps, None, None)
-        error = self._post_mortem(model, error, draw, *_batch_of(model, draw))
+        self._post_mortem(model, error, draw, *_batch_of(model, draw))
         self._checks = {}
         raise error
 
     def _post_mortem(
         self, model: "CuReSAC", error: NonFiniteError, draw: Draw, batch: ReplayBufferSamples | None, origin: str
-    ) -> NonFiniteError:
-        """The error, which now says where the batch, the losses and the settings lie."""
+    ) -> None:
+        """Write down batch, losses and settings, and let the error say where."""
         losses = {
             name: {"loss": _plain(check.loss), "gradient_norm": _plain(check.norm)}
             for name, check in self._checks.items()
@@ -293,8 +300,7 @@ class Guard:
         }
         batch_arrays = {} if batch is None else batch._asdict()
         arrays = {name: value.cpu().numpy() for name, value in batch_arrays.items() if isinstance(value, th.Tensor)}
-        where = _write_post_mortem(model, str(error.update), report, {"batch.npz": arrays} if arrays else {})
-        return NonFiniteError(error.source, error.value, error.update, where)
+        error.post_mortem = _write_post_mortem(model, str(error.update), report, "batch.npz", arrays)
 
 
 def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> None:
@@ -315,7 +321,8 @@ def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimi
         except NonFiniteError as error:
             rows, env_inds = getattr(model.replay_buffer, "last_sampled", None) or (None, None)
             draw = Draw(error.update, model.num_timesteps, rows, env_inds)
-            raise guard._post_mortem(model, error, draw, *_batch_of(model, draw)) from None
+            guard._post_mortem(model, error, draw, *_batch_of(model, draw))
+            raise
 
     for name, optimizer in optimizers.items():
         if optimizer is not None:
@@ -323,7 +330,7 @@ def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimi
 
 
 def _write_post_mortem(
-    model: "CuReSAC", name: str, report: dict[str, Any], archives: dict[str, dict[str, np.ndarray]]
+    model: "CuReSAC", name: str, report: dict[str, Any], archive: str, arrays: dict[str, np.ndarray]
 ) -> str:
     """Beside the logs, or among temporary files; without pickle.
 
@@ -336,7 +343,7 @@ def _write_post_mortem(
         folder = Path(tempfile.mkdtemp(prefix=f"post_mortem_{name}_", dir=directory))
         report = {**report, "config": _settings(model), "versions": versions}
         (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False))
-        for archive, arrays in archives.items():
+        if arrays:
             np.savez_compressed(folder / archive, **arrays)  # type: ignore[arg-type]
     except OSError as failure:
         return f"the logs (a post-mortem could not be written: {failure})"
@@ -611,5 +618,5 @@ def post_mortem_of_a_step(model: "CuReSAC", **seen: Any) -> Iterator[None]:
         yield
     except BadTransitionError as error:
         report = {"source": error.reason, "agent_steps": model.num_timesteps}
-        where = _write_post_mortem(model, f"step_{model.num_timesteps}", report, {"step.npz": _arrays(seen)})
-        raise BadTransitionError(error.reason, error.consequence, error.fix, where) from None
+        error.post_mortem = _write_post_mortem(model, f"step_{model.num_timesteps}", report, "step.npz", _arrays(seen))
+        raise

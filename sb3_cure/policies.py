@@ -286,12 +286,13 @@ class CuRePolicy(SACPolicy):
         if self.srl is None:
             return observations
         changed: th.Tensor = getattr(self.srl, method)(observations)
-        stored, built_for = get_obs_shape(self.observation_space), get_obs_shape(self.encoder_space)
-        if changed.shape[1:] != built_for and observations.shape[1:] == stored:
+        built_for = get_obs_shape(self.encoder_space)
+        # Observations that were wrong before the head saw them are not its fault.
+        if changed.shape[1:] != built_for and observations.shape[1:] == get_obs_shape(self.observation_space):
             raise ValueError(
                 f"{type(self.srl).__name__}.{method} made observations of shape {tuple(changed.shape[1:])} of those of "
-                f"shape {stored}, but the encoder was built for {built_for}: return that shape, or name another one in "
-                "configure_encoder."
+                f"shape {tuple(observations.shape[1:])}, but the encoder was built for {built_for}: return that shape, "
+                "or name another one in configure_encoder."
             )
         return changed
 

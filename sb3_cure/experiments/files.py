@@ -32,7 +32,7 @@ def describe_run() -> dict[str, Any]:
         },
         "machine": f"{_processor()}, {threads} threads, {th.backends.cpu.get_cpu_capability()}",
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
-        "commit": _commit(),
+        "commit": _COMMIT,
     }
 
 
@@ -56,6 +56,10 @@ def _commit() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+# Of what runs: later the checkout may have moved on.
+_COMMIT = _commit()
 
 
 def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
