@@ -29,6 +29,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_cure import CuReSAC
+from sb3_cure.experiments.files import describe_run
 from sb3_cure.serialization import ArchiveError, read_state, write_state
 
 #: What a load may take besides what it took before, bytes
@@ -330,6 +331,7 @@ def main() -> None:
         "seed": arguments.seed,
         "totals": dict(totals),
         "by_file_and_mutation": counts,
+        **describe_run(),
     }
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "fuzz.json").write_text(json.dumps({**report, "failures": failures}, indent=2) + "\n")
