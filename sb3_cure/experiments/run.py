@@ -229,6 +229,8 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
     """Show how far all units are, as their files tell, whichever process or machine runs them."""
     console = Console()
     watches = console.is_terminal or console.is_jupyter
+    if not watches:
+        console = Console(width=120)  # rich's 80 are too few for the table, whose columns it would cut
     stopped = threading.Event()
 
     def refresh(show: Callable[[Table], object]) -> None:
