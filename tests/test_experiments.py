@@ -573,6 +573,34 @@ def test_common_heads_are_made_once_and_again_of_other_cells(visits: Path, monke
     assert [len(rows) for rows in common_rows(out).values()] == [3] * 4
 
 
+def test_variants_of_an_arm_do_not_outweigh_the_others_in_common_heads(
+    visits: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mix has random, task and curious observations alike, of the first arm of each; all arms are judged by it."""
+    grid = yaml.safe_load(visits.read_text())
+    (first,) = grid["methods"].values()
+    grid["methods"] = {"first": first, "variant": {**first, "overrides": {"curiosity_prob": 0.5}}}
+    visits.write_text(yaml.safe_dump({**grid, "baseline": "first", "seeds": 2}))
+    rolled_out: list[tuple[str, str]] = []
+    mixed: list[int] = []
+    fit, roll_out = heads.fit_head, heads.roll_out
+
+    def fit_and_count(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
+        mixed.append(len(observations))
+        yield from fit(model, observations, updates)
+
+    def count(model: CuReSAC, cell: Any, env: Any, actor: str) -> Any:
+        rolled_out.append((cell.method, actor))
+        return roll_out(model, cell, env, actor)
+
+    monkeypatch.setattr(heads, "fit_head", fit_and_count)
+    monkeypatch.setattr(heads, "roll_out", count)
+    assert run.run_grid(load_grid(visits), visits.parent / "out", pictures=False) == []
+    assert mixed == [3 * heads.COMMON_SHARE] * 2
+    for actor in ("random", "task", "curious"):  # of both seeds: once for the mix, once to be judged
+        assert (rolled_out.count(("first", actor)), rolled_out.count(("variant", actor))) == (4, 2)
+
+
 def test_common_heads_of_other_settings_are_refused(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As cells are: one that was fitted by fewer updates is not taken for another."""
     assert run.run_grid(load_grid(visits), visits.parent / "out", pictures=False) == []

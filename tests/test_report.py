@@ -67,8 +67,9 @@ def write_pretraining(folder: Path) -> None:
     """One seed of two arms; the paper reports 833 and 846."""
     arms = {"vanilla": 300, "cure_pretraining": 350, "random_pretraining": 0}
     write_grid(folder, kind="pretraining", seeds=1, methods=arms, baseline="vanilla")
+    phase = {"cure_pretraining": {"pretrain": {"collector": "curious", "budget": 500_000}}}
     for arm, final in list(arms.items())[:2]:
-        write_cell(folder, TASK, arm, 0, curve(0, final), arguments=RAE)
+        write_cell(folder, TASK, arm, 0, curve(0, final), arguments=RAE, **phase.get(arm, {}))
 
 
 def write_media(cell: Path) -> None:
@@ -96,7 +97,7 @@ def rows_of(path: Path, heading: str) -> list[list[str]]:
     """Header and rows of a table in a Markdown file."""
     table = path.read_text().split(f"### {heading}", 1)[1].split("\n\n")[1]
     header, _, *rows = [[text.strip() for text in line.split(" | ")] for line in table.splitlines()]
-    return [[text.strip("| ").replace("\\", "") for text in row] for row in (header, *rows)]
+    return [[html.unescape(text.strip("| ").replace("\\", "")) for text in row] for row in (header, *rows)]
 
 
 def test_tables_of_curves(results: Path) -> None:
@@ -105,7 +106,7 @@ def test_tables_of_curves(results: Path) -> None:
     assert baseline[2:7] == ["2", "75 ± 35", "150 ± 71", "50", "25"]
     assert cure[2:7] == ["2", "150 ± 71", "300 ± 141", "100", "50"]
     assert baseline[7:] == ["not reached"] * 3
-    assert cure[7:] == ["100,000 (1 of 2)", "not reached", "not reached"]
+    assert cure[7:] == ["> 100,000 (1 of 2)", "not reached", "not reached"]
     assert unfinished[2:5] == ["0", "unfinished: 0; failed: 1", "unfinished: 0; failed: 1"]
     assert not_run[2:5] == ["0", "not run", "not run"]
     (difference,) = rows_of(results / "curves" / "table.md", "Paired difference from sac\\_ae: area")[1:]
@@ -148,18 +149,32 @@ def test_visitation_tables(results: Path) -> None:
     rows = rows_of(results / "visitation" / "table.md", "SRL error per step")[1:]
     by_key = {(row[2], row[3]): row[4:] for row in rows}
     paper = "0.0531 / 0.0540 / 0.0548"
-    assert by_key["own", "curious"] == ["3", "2.00e-03", "4.00e-03", "8.00e-03", "4.00 [4.00, 4.00]", paper]
+    assert by_key["own", "curious"] == [
+        "3",
+        "2.00e-03",
+        "4.00e-03",
+        "8.00e-03",
+        "4.00 [4.00, 4.00]",
+        "\N{EN DASH}",
+        paper,
+    ]
     assert by_key["mean image", "curious"][4] == "1.00 [1.00, 1.00]"
     random, curious = rows_of(results / "visitation" / "table.md", "Coverage of the true state space")[1:]
     assert (random[2], curious[2], random[4], curious[4]) == ("random", "curious", "200", "200")
-    assert float(curious[6].split()[0]) > 1.1 and float(curious[7]) > float(random[7])
+    assert float(curious[6].split()[0]) > 1.1 and float(curious[8]) > float(random[8])
     assert "4.00 \\[4.00, 4.00\\] times the SRL error under the own head" in (results / "summary.md").read_text()
 
 
 def test_conditions_and_plots(results: Path) -> None:
+    """Seeds that were run alike share a row; a pair whose arms were not is named; pretraining is told."""
     _, row, *_ = rows_of(results / "curves" / "table.md", "Run conditions")
     machine = ["cpu", "bf16", "x86_64, 2 threads, AVX512"]
-    assert row[2:] == ["0, 1", "100,000", "1.0 h", *machine, "sb3_cure 0.1.0, torch 2.13.0", "abc1234", "1"]
+    none = "\N{EN DASH}"
+    assert row[2:] == ["0, 1", "100,000", none, "1.0 h, 1.0 h", *machine, "A", "abc1234", "1"]
+    text = (results / "curves" / "table.md").read_text()
+    assert "Versions A: sb3\\_cure 0.1.0, torch 2.13.0." in text and "different commits" not in text
+    rows = rows_of(results / "pretraining" / "table.md", "Run conditions")[1:]
+    assert {row[1]: row[4] for row in rows} == {"vanilla": none, "cure_pretraining": "500,000 (curious)"}
     for name in ("curves/learning_curves", "curves/paired_difference", "curves/aggregates", "visitation/coverage"):
         with Image.open(results / f"{name}.png") as image:
             assert min(image.size) > 100

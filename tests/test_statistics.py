@@ -174,21 +174,51 @@ def test_rliable_aggregates(tmp_path: Path) -> None:
     folder = tmp_path / "curves"
     write_grid(folder, tasks=["a/x-y-v0", "a/z-w-v0"], seeds=4)
     for task in ("x-y", "z-w"):
-        for seed, final in enumerate((0, 100, 200, 1000)):
-            write_cell(folder, task, "sac_ae", seed, curve(0, final))
-            write_cell(folder, task, "cure_sac_ae", seed, curve(0, final + 2000))
+        for seed, (base, final) in enumerate(zip((0, 50, 100, 500), (600, 700, 800, 1000), strict=True)):
+            write_cell(folder, task, "sac_ae", seed, curve(0, base))
+            write_cell(folder, task, "cure_sac_ae", seed, curve(0, final))
     (experiment,) = read_results(folder)
     state = np.random.get_state()[1].copy()  # type: ignore[index, union-attr]
     aggregates = statistics.aggregate(experiment)
     assert aggregates is not None
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # type: ignore[index]
     assert (aggregates.tasks, aggregates.seeds) == (("x-y", "z-w"), 4)
-    assert aggregates.iqm["sac_ae"].value == pytest.approx(0.15)  # of 0 0 .1 .1 .2 .2 1 1 the middle four
-    assert aggregates.iqm["sac_ae"].low < 0.15 < aggregates.iqm["sac_ae"].high  # type: ignore[operator]
+    assert aggregates.iqm["sac_ae"].value == pytest.approx(0.075)  # of 0 0 .05 .05 .1 .1 .5 .5 the middle four
+    assert aggregates.iqm["sac_ae"].low < 0.075 < aggregates.iqm["sac_ae"].high  # type: ignore[operator]
     assert aggregates.improvement == {"cure_sac_ae": statistics.Estimate(1, 1, 1, 4)}
-    at_half = int(np.argmin(np.abs(aggregates.taus - 0.5)))
-    assert aggregates.profiles["sac_ae"][0][at_half] == pytest.approx(0.25)
+    at = int(np.argmin(np.abs(aggregates.taus - 0.3)))
+    assert aggregates.profiles["sac_ae"][0][at] == pytest.approx(0.25)
     assert statistics.aggregate(experiment).iqm == aggregates.iqm  # type: ignore[union-attr]
+
+
+def test_returns_of_another_scale_are_no_scores(tmp_path: Path) -> None:
+    """Pendulum's returns are negative: divided by 1000 they would make an empty profile and a senseless IQM."""
+    folder = tmp_path / "curves"
+    write_grid(folder)
+    for seed in (0, 1):
+        for method in ("sac_ae", "cure_sac_ae"):
+            write_cell(folder, TASK, method, seed, curve(-1500, -900))
+    with pytest.raises(ResultsError, match=f"a return on {TASK} is -900"):
+        statistics.aggregate(read_results(folder)[0])
+
+
+def test_an_arm_may_have_a_baseline_of_its_own(tmp_path: Path) -> None:
+    """Two arms that differ in one thing are compared with each other, the others with the experiment's baseline."""
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=1, methods={"base": {}, "one": {}, "two": {"baseline": "one"}}, baseline="base")
+    for method, final in (("base", 100), ("one", 300), ("two", 340)):
+        write_cell(folder, TASK, method, 0, curve(0, final))
+    (experiment,) = read_results(folder)
+    found = {(row.method, row.other): row.t.value for row in statistics.paired_differences(experiment, "finals")}
+    assert found == {("one", "base"): 200, ("two", "one"): 40}
+
+
+def test_experiments_are_found_at_any_depth(tmp_path: Path) -> None:
+    """Two of one name (100k steps, 500k steps) lie in folders that tell them apart."""
+    for place in ("curves", "500k/curves"):
+        write_grid(tmp_path / place)
+    assert [experiment.name for experiment in read_results(tmp_path)] == ["500k/curves", "curves"]
+    assert [experiment.name for experiment in read_results(tmp_path / "500k" / "curves")] == ["curves"]
 
 
 @given(st.integers(2, 6), st.integers(1, 4), st.integers(0, 1000))
@@ -227,14 +257,55 @@ def test_errors_and_their_ratio(tmp_path: Path) -> None:
     assert curious.ratio.value == pytest.approx(6)
     spread = stats.t.ppf(0.975, 1) * np.log(9 / 4) / 2
     assert curious.ratio.high == pytest.approx(6 * np.exp(spread))
-    assert np.isnan(random.ratio.value)
+    assert np.isnan(random.ratio.value) and np.isnan(curious.task_ratio.value)
+
+
+def test_curious_policies_are_compared_with_the_baselines_task_policy_of_their_seed(tmp_path: Path) -> None:
+    """Errors 8 and 18 over 4 and 2: 2 and 9, whose geometric mean is sqrt(18); cells 3 over 1."""
+    folder = tmp_path / "visitation"
+    write_grid(folder, kind="visitation")
+    corners = np.array([[0.0, 0.0], [1.0, 1.0], [9.0, 9.0]])
+    still, roaming = np.repeat(corners[:1], 30, axis=0), np.repeat(corners, 10, axis=0)
+    for seed, (task, curious) in enumerate(((4.0, 8.0), (2.0, 18.0))):
+        for method, actor, error, visited in (
+            ("sac_ae", "task", task, still),
+            ("cure_sac_ae", "curious", curious, roaming),
+        ):
+            rows = [("random", "own", 0, 1, 1, 1, 1), (actor, "own", 0, error, error, error, 1)]
+            states = {"random": still, actor: visited}
+            write_cell(folder, TASK, method, seed, {}, visitation=rows, states=states)
+    (experiment,) = read_results(folder)
+    errors = {(row.method, row.actor): row.task_ratio for row in statistics.summarise_errors(experiment)}
+    assert errors["cure_sac_ae", "curious"].value == pytest.approx(np.sqrt(18))
+    assert np.isnan([errors[key].value for key in errors if key != ("cure_sac_ae", "curious")]).all()
+    coverage = {(row.method, row.actor): row.task_ratio for row in statistics.state_coverage(experiment)}
+    assert coverage["cure_sac_ae", "curious"].value == pytest.approx(3)
+    assert np.isnan([coverage[key].value for key in coverage if key != ("cure_sac_ae", "curious")]).all()
+
+
+def test_nobodys_coverage_depends_on_where_other_arms_went(tmp_path: Path) -> None:
+    """And what lies beyond the random policy's range is counted in cells of its own, not in those at the border."""
+    rng, found = np.random.default_rng(0), []
+    near, far = rng.normal(0, 1, (500, 3)), np.repeat(np.arange(50.0), 10)[:, None] * [100.0, 0, 0]
+    for others in ((), ("wild",)):
+        folder = tmp_path / f"visitation{len(others)}"
+        write_grid(
+            folder, kind="visitation", seeds=1, methods={name: {} for name in ("calm", *others)}, baseline="calm"
+        )
+        for method in ("calm", *others):
+            curious = 2 * near if method == "calm" else far
+            write_cell(folder, TASK, method, 0, {}, states={"random": near, "curious": curious})
+        rows = {(row.method, row.actor): row for row in statistics.state_coverage(read_results(folder)[0])}
+        found.append((rows["calm", "random"].occupied[0], rows["calm", "curious"].occupied[0]))
+    assert found[0] == found[1] and found[0][1] > 1.3 * found[0][0]
+    assert rows["wild", "curious"].occupied[0] == 50
 
 
 def test_coverage_counts_cells_of_equally_many_states(tmp_path: Path) -> None:
     """Random stays in one corner, curious visits two opposite ones; a longer run does not count for more."""
     folder = tmp_path / "visitation"
     write_grid(folder, kind="visitation", seeds=1)
-    corners = np.array([[0.0, 0.0], [1.0, 1.0]])
+    corners = np.array([[0.0, 0.0], [1.0, 1.0]])  # a policy that stays in one point has no range: cells of size 1
     states = {"random": np.repeat(corners[:1], 100, axis=0), "curious": np.tile(corners, (200, 1))}
     write_cell(folder, TASK, "cure_sac_ae", 0, {}, states=states)
     random, curious = statistics.state_coverage(read_results(folder)[0])

@@ -7,7 +7,7 @@ of the task's *other* seeds saw. It is a unit of work like a cell, with a folder
 import json
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,6 +30,8 @@ from sb3_cure.files import replacing
 COMMON_UPDATES = 3000
 #: Observations per policy in the mix to which a common head is fitted
 COMMON_SHARE = 1000
+#: Whose observations these are: with further arms of the same kind, such as variants, it would outweigh the others
+POLICIES = "random, task and curious, each of the first arm that has it"
 #: The file that tells that a common head is finished, and of what it was made
 RECORD = "common_head.json"
 
@@ -75,7 +77,8 @@ class CommonHead:
 
     def config(self) -> dict[str, Any]:
         """What its ``config.json`` holds."""
-        return {"task": self.task, "seed": self.seed, "updates": self.updates, "observations_per_policy": self.share}
+        settings = {"updates": self.updates, "observations_per_policy": self.share, "policies": POLICIES}
+        return {"task": self.task, "seed": self.seed, **settings}
 
     def is_done(self, results: Path) -> bool:
         """
@@ -148,8 +151,8 @@ def run_head(head: CommonHead, results: Path) -> None:
             shutil.rmtree(_mix_folder(head, seed, results), ignore_errors=True)
 
 
-def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
-    """The episodes of ``measure_visits`` again, by policy."""
+def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
+    """The episodes of ``measure_visits`` again, by policy, but for those policies that are known."""
     path = results / cell.folder / "model.zip"
     if is_pickled_model(path):
         raise GridError(
@@ -160,7 +163,8 @@ def _episodes(cell: Cell, results: Path) -> Iterator[tuple[str, list[Episode]]]:
     model = CuReSAC.load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
     env = gym.make(cell.task, **cell.env_kwargs)
     for actor in visiting_actors(model, cell):
-        yield actor, roll_out(model, cell, env, actor)
+        if actor not in known:
+            yield actor, roll_out(model, cell, env, actor)
     env.close()
 
 
@@ -177,9 +181,9 @@ def _mix_folder(head: CommonHead, seed: int, results: Path) -> Path:
 
 
 def _mix(head: CommonHead, seed: int, results: Path) -> np.ndarray:
-    """Observations of one seed's policies, as many of each of random, task and curious; kept for the other heads."""
+    """Observations of one seed's policies, as many of each kind; kept for the other heads."""
     folder, cells = _mix_folder(head, seed, results), head.cells_of(seed)
-    made_of = json.dumps([head.share, {str(cell.folder): head.finished[str(cell.folder)] for cell in cells}])
+    made_of = json.dumps([POLICIES, head.share, {str(cell.folder): head.finished[str(cell.folder)] for cell in cells}])
     folder.mkdir(exist_ok=True)
     with alone_in(folder, wait=True):
         path = folder / "mix.npz"
@@ -187,15 +191,12 @@ def _mix(head: CommonHead, seed: int, results: Path) -> np.ndarray:
             with np.load(path) as kept:
                 if kept["made_of"] == made_of:
                     return kept["observations"]
-        seen: dict[str, list[np.ndarray]] = {}
+        seen: dict[str, np.ndarray] = {}
         for cell in cells:
-            for actor, episodes in _episodes(cell, results):
-                seen.setdefault(actor, []).append(np.concatenate([episode.observations for episode in episodes]))
-        evenly = []
-        for parts in seen.values():
-            observations = np.concatenate(parts)
-            evenly.append(observations[np.linspace(0, len(observations) - 1, head.share).astype(int)])
-        mix = np.concatenate(evenly)
+            for actor, episodes in _episodes(cell, results, seen):
+                observations = np.concatenate([episode.observations for episode in episodes])
+                seen[actor] = observations[np.linspace(0, len(observations) - 1, head.share).astype(int)]
+        mix = np.concatenate(list(seen.values()))
         with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(file, made_of=made_of, observations=mix)
         return mix

@@ -379,62 +379,63 @@ def aggregate_scores(
 
 def visitation_bars(
     path: Path | IO[bytes],
-    panels: Mapping[str, Sequence[tuple[str, str, float, float, float]]],
+    panels: Mapping[str, Sequence[tuple[str, str, tuple[float, float], np.ndarray, str]]],
     lines: Mapping[str, Mapping[str, float]],
 ) -> None:
     """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
-    :param panels: By title: arm, actor, minimum, mean and maximum of each bar
+    :param panels: By title: arm, actor, minimum and maximum, mean by seed, and what is written above, of each policy
     :param lines: By title: values to compare with, by name
     """
-    bars = {
-        title: [(arm, actor, mean, (low, high), np.zeros(0)) for arm, actor, low, mean, high in rows]
-        for title, rows in panels.items()
-    }
-    _actor_bars(path, bars, "SRL error per step (mean, min, max)", lines)
+    _actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
 
 
 def coverage_bars(
-    path: Path | IO[bytes], panels: Mapping[str, Sequence[tuple[str, str, np.ndarray]]], ylabel: str
+    path: Path | IO[bytes], panels: Mapping[str, Sequence[tuple[str, str, np.ndarray, str]]], ylabel: str
 ) -> None:
     """How much of the true state space each policy visits: mean over seeds, and each seed as a dot.
 
     :param path: File to write
-    :param panels: By title: arm, actor, and the measure by seed, of each bar
+    :param panels: By title: arm, actor, the measure by seed, and what is written above, of each bar
     :param ylabel: What is measured
     """
     bars = {
-        title: [(arm, actor, float(values.mean()), None, values) for arm, actor, values in rows]
-        for title, rows in panels.items()
+        title: [(arm, actor, None, values, text) for arm, actor, values, text in rows] for title, rows in panels.items()
     }
     _actor_bars(path, bars, ylabel)
 
 
 def _actor_bars(
     path: Path | IO[bytes],
-    panels: Mapping[str, Sequence[tuple[str, str, float, tuple[float, float] | None, np.ndarray]]],
+    panels: Mapping[str, Sequence[tuple[str, str, tuple[float, float] | None, np.ndarray, str]]],
     ylabel: str,
     lines: Mapping[str, Mapping[str, float]] | None = None,
 ) -> None:
-    """Bars in groups of arms, coloured by actor: arm, actor, height, ends of the error bar, dots.
+    """Policies in groups of arms, coloured by actor: arm, actor, ends of the error bar, values by seed, text above.
 
-    With lines across them to compare with, the axis is logarithmic.
+    A bar is as high as the mean; with lines across to compare with the axis is logarithmic, where bars have no foot, so
+    that a mark shows the mean.
     """
-    figure, places = _panels(len(panels), height=3.0)
+    figure, places = _panels(len(panels), height=3.3)
     for axes, (title, rows) in zip(places, panels.items(), strict=True):
         arms = list(dict.fromkeys(arm for arm, *_ in rows))
         ticks, position = [], 0.0
         for arm in arms:
             group = [row for row in rows if row[0] == arm]
             ticks.append(position + (len(group) - 1) / 2)
-            for _, actor, height, ends, dots in group:
-                color = COLORS.get(actor, "#2ca02c")
-                axes.bar(position, height, 0.85, color=color, alpha=0.8, label=_plain(actor))
-                if ends is not None:
-                    spread = [[max(height - ends[0], 0)], [max(ends[1] - height, 0)]]
-                    axes.errorbar(position, height, yerr=spread, color="#222222", capsize=4, linewidth=1)
-                axes.plot(np.full(len(dots), position), dots, "o", color="#222222", markersize=3)
+            for _, actor, ends, values, text in group:
+                color, mean = COLORS.get(actor, "#2ca02c"), float(values.mean())
+                low, high = ends or (mean, float(values.max()))
+                if lines is None:
+                    axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=_plain(actor))
+                else:
+                    axes.plot([position, position], [low, high], color=color, linewidth=1.2)
+                    axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
+                axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
+                axes.annotate(
+                    text, (position, high), (0, 3), textcoords="offset points", ha="center", va="bottom", fontsize=6.5
+                )
                 position += 1
             position += 0.7
         axes.set_xticks(ticks, [_plain(arm) for arm in arms], fontsize=8.5)
@@ -443,8 +444,12 @@ def _actor_bars(
         axes.set(title=_plain(title), ylabel=ylabel)
         for (label, value), style in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
             axes.axhline(value, color="#333333", linewidth=1, linestyle=style, label=_plain(label))
-        if lines is not None and any(height > 0 for _, _, height, *_ in rows):
+        if lines is not None and any((values > 0).any() for *_, values, _ in rows):
             axes.set_yscale("log")
+        bottom, top = axes.get_ylim()  # room for the texts
+        axes.set_ylim(
+            top=top * (top / bottom) ** 0.15 if axes.get_yscale() == "log" else bottom + 1.15 * (top - bottom)
+        )
         _tidy(axes)
     _shared_legend(figure, places)
     figure.savefig(path, dpi=150)

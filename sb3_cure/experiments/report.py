@@ -10,6 +10,7 @@ import argparse
 import base64
 import io
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +25,16 @@ from PIL import Image
 import sb3_cure
 from sb3_cure.experiments import plots, published, statistics, tables
 from sb3_cure.experiments.statistics import Experiment, ResultsError
-from sb3_cure.experiments.tables import Table, interval_text, markdown_text, number_text, of_tasks, plural, ratio_text
+from sb3_cure.experiments.tables import (
+    Table,
+    difference_label,
+    interval_text,
+    markdown_text,
+    number_text,
+    of_tasks,
+    plural,
+    ratio_text,
+)
 
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
@@ -109,7 +119,7 @@ def difference_figure(
     lines = [
         (
             row.method,
-            f"{row.method}, {of_tasks(row)}",
+            f"{difference_label(row, experiment)}, {of_tasks(row)}",
             np.concatenate(list(row.differences.values())),
             (row.t.value, row.t.low, row.t.high),
         )
@@ -150,19 +160,24 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
     parts: list[Table | Figure | str] = []
     if coverage:
         panels = {
-            task: [(row.method, row.actor, row.occupied) for row in coverage if row.task == task]
+            task: [
+                (row.method, row.actor, row.occupied, _times_random(row.ratio)) for row in coverage if row.task == task
+            ]
             for task in dict.fromkeys(row.task for row in coverage)
         }
-        caption = "Occupied cells of a grid over the true physics state, by policy: mean over seeds, each seed a dot."
+        caption = (
+            "Occupied cells of a grid over the true physics state, by policy (sampled actions): mean over seeds, each "
+            "seed a dot; above, how many times the random policy's, with its 95 % interval."
+        )
         parts.append(
             _figure("coverage", caption, plots.coverage_bars, panels, "occupied cells of the true state space")
         )
-        parts.append(tables.coverage_table(coverage))
+        parts.append(tables.coverage_table(experiment, coverage))
     for head in [head for head in statistics.HEADS if any(row.head == head for row in errors)]:
         judged = [row for row in errors if row.head == head]
         bars = {
             task: [
-                (row.method, row.actor, row.error_min, row.error_mean, row.error_max)
+                (row.method, row.actor, (row.error_min, row.error_max), row.means, _times_random(row.ratio))
                 for row in judged
                 if row.task == task
             ]
@@ -170,8 +185,10 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
         }
         lines = {task: _yardsticks(experiment, task, errors) for task in bars}
         caption = (
-            f"SRL error per step under the {head} head, by policy: mean, with minimum and maximum as error bars. "
-            "Lines: the mean error of always predicting zero, or the mean image, and the paper's value for curiosity."
+            f"SRL error per step under the {head} head, by policy (sampled actions): mean over seeds (bar), each seed "
+            "(dot), lowest and highest of all steps (line), and how many times the random policy's, with its 95 % "
+            "interval. Lines across: the mean error of always predicting zero, or the mean image, and the paper's "
+            "value for curiosity."
         )
         parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
     if errors:
@@ -189,27 +206,38 @@ def _yardsticks(experiment: Experiment, task: str, errors: Sequence[statistics.E
     return {**lines, "paper's cure": theirs["curious"].mean} if theirs else lines
 
 
+def _times_random(ratio: statistics.Estimate) -> str:
+    if not math.isfinite(ratio.value):
+        return ""
+    interval = "" if ratio.low is None else f"\n{interval_text(ratio, 1)}"
+    return f"{number_text(ratio.value, 2)}\N{MULTIPLICATION SIGN}{interval}"
+
+
 def _visitation_headlines(
     experiment: Experiment, coverage: Sequence[statistics.Coverage], errors: Sequence[statistics.ErrorSummary]
 ) -> Iterator[str]:
-    """One sentence per arm and task that has a curious policy."""
+    """Of each arm with a curious policy a sentence against the random policy, and one against the task policy."""
     for task in experiment.tasks:
         for method in experiment.methods:
             key = (task, method, "curious")
-            found = [
-                f"{ratio_text(row.ratio)} times as many cells of the true state space"
+            rows = [
+                (row, "as many cells of the true state space")
                 for row in coverage
                 if (row.task, row.method, row.actor) == key
             ]
-            found += [
-                f"{ratio_text(row.ratio)} times the SRL error under the {row.head} head"
+            rows += [
+                (row, f"the SRL error under the {row.head} head")
                 for row in errors
                 if (row.task, row.method, row.actor) == key and row.head in statistics.HEADS
             ]
-            if found:
-                seeds = plural(len(experiment.done(task, method)), "seed")
-                compared = ", ".join(found)
-                yield f"{method} on {task}, {seeds}: compared to the random policy, the curious one meets {compared}."
+            seeds = plural(len(experiment.done(task, method)), "seed")
+            others = {"random policy": "ratio", f"task policy of {experiment.baseline}": "task_ratio"}
+            for other, name in others.items():
+                ratios = [(getattr(row, name), what) for row, what in rows]
+                found = [f"{ratio_text(ratio)} times {what}" for ratio, what in ratios if math.isfinite(ratio.value)]
+                if found:
+                    compared = f"compared to the {other}, the curious one meets {', '.join(found)}"
+                    yield f"{method} on {task}, {seeds}: {compared}."
 
 
 def _curves(
@@ -231,7 +259,7 @@ def _curves(
             where = f"{plural(row.t.n, 'paired seed')} on {of_tasks(row)}"
             shown = f" {interval_text(row.t, 1)}" if row.t.low is not None else ""
             headlines.append(
-                f"{row.method} minus {experiment.baseline}: area under the curve {number_text(row.t.value, 1)}"
+                f"{row.method} minus {row.other}: area under the curve {number_text(row.t.value, 1)}"
                 f"{shown}, {where}: {row.t.verdict}."
             )
     if not differences:

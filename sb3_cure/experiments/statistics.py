@@ -31,8 +31,8 @@ HEADS = ("own", "common")
 HIGHEST_RETURN = 1000.0
 #: Below this part of a published mean, a return is suspected to be a bug of ours.
 SUSPECT_BELOW = 0.75
-#: At most so many cells has the grid on which visited states are counted, whatever their dimension: not more than an
-#: actor takes steps (10 episodes of cartpole are 1250), or all would do equally well, each step in a cell of its own.
+#: At most so many cells has the part of the grid that the random policy spans, whatever the dimension of states: not
+#: more than an actor takes steps (10 episodes of cartpole are 1250), or each step would have a cell of its own.
 GRID_CELLS = 1000
 DRAWS = 100_000
 RLIABLE_REPS = 2000
@@ -127,18 +127,16 @@ class CellResult:
 class Experiment:
     """All cells of a grid, run or not.
 
+    :param name: Its folder below the one that was read (``"500k/curves"``), or its own name
     :param folder: Where it lies
     :param grid: ``grid.json``
     :param cells: By (task, method, seed), in the grid's order; cells on disk that the grid does not name come last
     """
 
+    name: str
     folder: Path
     grid: dict[str, Any]
     cells: dict[tuple[str, str, int], CellResult]
-
-    @property
-    def name(self) -> str:
-        return str(self.grid["experiment"])
 
     @property
     def kind(self) -> str:
@@ -151,6 +149,15 @@ class Experiment:
     @property
     def baseline(self) -> str:
         return str(self.grid["baseline"])
+
+    def baseline_of(self, method: str) -> str:
+        """
+        :param method: Name of an arm
+        :return: The arm with which it is compared: its own baseline if the grid gives it one
+        """
+        methods = self.grid["methods"]
+        described = methods.get(method) if isinstance(methods, dict) else None
+        return str(described.get("baseline", self.baseline)) if isinstance(described, dict) else self.baseline
 
     @property
     def tasks(self) -> list[str]:
@@ -196,23 +203,25 @@ class Experiment:
 def read_results(folder: str | Path) -> list[Experiment]:
     """Read everything that ``sb3-cure experiment`` wrote.
 
-    :param folder: A folder of experiments, or the folder of one
+    :param folder: A folder with experiments anywhere below it, or the folder of one
     :return: The experiments, by name
     :raises ResultsError: with one sentence that names the folder or file and what is wrong with it
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise ResultsError(f"{folder} is no folder: give the one that `sb3-cure experiment` wrote.")
-    grids = [folder / "grid.json"] if (folder / "grid.json").exists() else sorted(folder.glob("*/grid.json"))
+    if (folder / "grid.json").exists():
+        return [_read_experiment(folder / "grid.json")]
+    grids = sorted(folder.rglob("grid.json"))
     if not grids:
         raise ResultsError(
-            f"{folder} holds no experiment (no grid.json in it, nor in a folder of it): give the folder that "
+            f"{folder} holds no experiment (no grid.json in it, nor anywhere below it): give the folder that "
             "`sb3-cure experiment` wrote."
         )
-    return [_read_experiment(path) for path in grids]
+    return [_read_experiment(path, path.parent.relative_to(folder).as_posix()) for path in grids]
 
 
-def _read_experiment(path: Path) -> Experiment:
+def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     grid = _read_json(path)
     for key, kind in (("experiment", str), ("kind", str), ("budget", int), ("baseline", str), ("tasks", list)):
         if not isinstance(grid.get(key), kind) or isinstance(grid.get(key), bool):
@@ -225,9 +234,9 @@ def _read_experiment(path: Path) -> Experiment:
     if not isinstance(seeds, list) or not all(isinstance(seed, int) for seed in seeds):
         raise ResultsError(f"{path} has seeds {grid.get('seeds')!r}, but they must be a list of numbers: correct it.")
     tasks = [short_name(str(task)) for task in grid["tasks"]]
-    for name in (*tasks, *methods):
-        if name in ("", ".", "..") or any(mark in name for mark in "/\\\0"):
-            raise ResultsError(f"{path} names {name!r}, which cannot be the name of a folder: correct it.")
+    for part in (*tasks, *methods):
+        if part in ("", ".", "..") or any(mark in part for mark in "/\\\0"):
+            raise ResultsError(f"{path} names {part!r}, which cannot be the name of a folder: correct it.")
     root = path.parent
     keys = [(task, method, seed) for task in tasks for method in methods for seed in seeds]
     for found in sorted(root.glob("*/*/seed*")):
@@ -236,7 +245,8 @@ def _read_experiment(path: Path) -> Experiment:
             keys.append((found.parent.parent.name, found.parent.name, int(number)))
     cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"]) for key in keys}
     order = {task: index for index, task in reversed(list(enumerate(task for task, _, _ in cells)))}
-    return Experiment(root, grid, dict(sorted(cells.items(), key=lambda item: order[item[0][0]])))
+    in_order = dict(sorted(cells.items(), key=lambda item: order[item[0][0]]))
+    return Experiment(name or grid["experiment"], root, grid, in_order)
 
 
 def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int) -> CellResult:
@@ -527,11 +537,11 @@ class PairedDifference:
 def paired_differences(
     experiment: Experiment, measure: str = "areas", baseline: str | None = None
 ) -> list[PairedDifference]:
-    """Every other arm against one: per task, and over all tasks where there are several.
+    """Every arm against another: per task, and over all tasks where there are several.
 
     :param experiment: An experiment
     :param measure: ``"areas"`` or ``"finals"``
-    :param baseline: The arm that is subtracted, by default the experiment's baseline
+    :param baseline: The arm that is subtracted from all others, by default of each its baseline in the grid
     :return: Arm by arm, all tasks together first; arms without a single pair are left out
     """
     arms = {
@@ -539,14 +549,14 @@ def paired_differences(
         for task in experiment.tasks
         for method in experiment.methods
     }
-    baseline = experiment.baseline if baseline is None else baseline
     found = []
     for method in experiment.methods:
-        if method == baseline:
+        other = experiment.baseline_of(method) if baseline is None else baseline
+        if method == other:
             continue
         by_task, same = {}, {}
         for task in experiment.tasks:
-            arm, base = arms[task, method], arms.get((task, baseline))
+            arm, base = arms[task, method], arms.get((task, other))
             shared = [seed for seed in arm.seeds if base is not None and seed in base.seeds]
             if base is not None and shared:
                 by_task[task], starts = (
@@ -560,7 +570,7 @@ def paired_differences(
             name = None if row is by_task else next(iter(row))
             starts_alike = sum(same[task] for task in row)
             intervals = t_interval(groups), percentile_interval(groups)
-            found.append(PairedDifference(method, baseline, name, row, *intervals, starts_alike))
+            found.append(PairedDifference(method, other, name, row, *intervals, starts_alike))
     return found
 
 
@@ -624,11 +634,18 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
     """
     :param experiment: An experiment
     :return: rliable's aggregates, None if no task has two seeds of every arm
-    :raises ResultsError: if rliable cannot be imported
+    :raises ResultsError: if there are returns that are no scores between 0 and 1, or rliable cannot be imported
     """
     scores, tasks = score_matrices(experiment)
     if not scores:
         return None
+    for index, task in enumerate(tasks):
+        for score in np.concatenate([values[:, index] for values in scores.values()]):
+            if not -1e-6 <= score <= 1 + 1e-6:
+                raise ResultsError(
+                    f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
+                    f"suite, but a return on {task} is {score * HIGHEST_RETURN:.0f}."
+                )
     library = _import_rliable()
     n = len(next(iter(scores.values())))
     taus = np.linspace(0, 1, 51)
@@ -713,19 +730,25 @@ def _fixed_numpy_seed() -> Iterator[None]:
 class ErrorSummary:
     """SRL error per step that an actor meets, judged by one head, over all seeds and episodes.
 
+    :param means: Mean over the episodes by seed, [seeds]
     :param ratio: Its mean over the random actor's of the same cell (geometric mean over seeds, t interval of the
         logarithms). Measured errors are free of dither, so this is the ratio of the excesses over the dither floor
+    :param task_ratio: The same over what the baseline's task policy of the same seed meets under its head
     """
 
     task: str
     method: str
     actor: str
     head: str
-    seeds: int
     error_min: float
-    error_mean: float
     error_max: float
+    means: np.ndarray
     ratio: Estimate
+    task_ratio: Estimate
+
+    @property
+    def error_mean(self) -> float:
+        return float(self.means.mean())
 
 
 def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
@@ -736,29 +759,31 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
     rows = []
     for task in experiment.tasks:
         for method in experiment.methods:
-            cells = experiment.done(task, method).values()
-            pairs = dict.fromkeys((visit.head, visit.actor) for cell in cells for visit in cell.visitation)
+            cells, baseline = experiment.done(task, method), experiment.done(task, experiment.baseline)
+            pairs = dict.fromkeys((visit.head, visit.actor) for cell in cells.values() for visit in cell.visitation)
             heads = list(dict.fromkeys(head for head, _ in pairs))
             for head, actor in sorted(pairs, key=lambda pair: (heads.index(pair[0]), _place(pair[1]))):
                 visits = [
-                    [visit for visit in cell.visitation if (visit.head, visit.actor) == (head, actor)] for cell in cells
+                    visit
+                    for cell in cells.values()
+                    for visit in cell.visitation
+                    if (visit.head, visit.actor) == (head, actor)
                 ]
-                ratios = [
-                    own / random
-                    for cell in cells
-                    if (own := _mean_error(cell, head, actor)) > 0 and (random := _mean_error(cell, head, "random")) > 0
-                ]
+                means = {seed: _mean_error(cell, head, actor) for seed, cell in cells.items()}
+                randoms = {seed: _mean_error(cell, head, "random") for seed, cell in cells.items()}
+                tasks = {seed: _mean_error(cell, head, "task") for seed, cell in baseline.items()}
+                is_trained, is_baseline = actor != "random", (method, actor) == (experiment.baseline, "task")
                 rows.append(
                     ErrorSummary(
                         task,
                         method,
                         actor,
                         head,
-                        sum(1 for each in visits if each),
-                        min(visit.error_min for each in visits for visit in each),
-                        float(np.mean([np.mean([visit.error_mean for visit in each]) for each in visits if each])),
-                        max(visit.error_max for each in visits for visit in each),
-                        geometric_mean(ratios if actor != "random" else []),
+                        min(visit.error_min for visit in visits),
+                        max(visit.error_max for visit in visits),
+                        np.array([mean for mean in means.values() if np.isfinite(mean)]),
+                        paired_ratio(means if is_trained else {}, randoms),
+                        paired_ratio(means if is_trained and not is_baseline else {}, tasks),
                     )
                 )
     return rows
@@ -774,11 +799,14 @@ def _mean_error(cell: CellResult, head: str, actor: str) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def geometric_mean(ratios: Sequence[float]) -> Estimate:
+def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Estimate:
     """
-    :param ratios: One per seed, > 0
-    :return: Geometric mean, with the t interval of the logarithms; nan without ratios
+    :param ours: A positive number by seed
+    :param theirs: Another
+    :return: Geometric mean of ours / theirs over the seeds that have both, with the t interval of the logarithms; nan
+        without such a seed
     """
+    ratios = [ours[seed] / theirs[seed] for seed in ours if ours[seed] > 0 and theirs.get(seed, 0) > 0]
     estimate = t_interval([np.log(ratios)]) if len(ratios) else Estimate(float("nan"))
     low, high = (None if end is None else float(np.exp(end)) for end in (estimate.low, estimate.high))
     return Estimate(float(np.exp(estimate.value)), low, high, estimate.n)
@@ -791,8 +819,9 @@ class Coverage:
     :param occupied: Occupied cells of the task's grid, [seeds]
     :param entropy: Entropy of the visits over these cells in bits, [seeds]
     :param ratio: Occupied cells over the random actor's of the same cell (geometric mean, t interval); nan for random
+    :param task_ratio: Occupied cells over those of the baseline's task policy of the same seed; nan for both of these
     :param steps: States counted, of each seed and actor alike
-    :param grid: Intervals per dimension of the state
+    :param grid: Intervals per dimension in the range of the random actor
     :param dimensions: Dimension of the state
     """
 
@@ -802,6 +831,7 @@ class Coverage:
     occupied: np.ndarray
     entropy: np.ndarray
     ratio: Estimate
+    task_ratio: Estimate
     steps: int
     grid: int
     dimensions: int
@@ -810,22 +840,19 @@ class Coverage:
 def grid_intervals(dimensions: int) -> int:
     """
     :param dimensions: Of the state
-    :return: Intervals per dimension, so that the grid has at most ``GRID_CELLS`` cells (but 2 intervals at least)
+    :return: Intervals per dimension, so that they make at most ``GRID_CELLS`` cells (but 2 intervals at least)
     """
     return max(2, int(GRID_CELLS ** (1 / dimensions) + 1e-9))
 
 
-def occupied_cells(states: np.ndarray, low: np.ndarray, high: np.ndarray, intervals: int) -> np.ndarray:
+def occupied_cells(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> np.ndarray:
     """
     :param states: True states, [n, d]
-    :param low: Where the grid begins, [d]; what lies below counts to the first interval
-    :param high: Where it ends, [d]; what lies above counts to the last
-    :param intervals: Per dimension
+    :param low: Where a cell of the grid begins, [d]; the grid has no end on any side
+    :param width: Of its cells, > 0, [d]
     :return: How many states lie in each occupied cell
     """
-    span = np.where(high > low, high - low, 1.0)
-    cells = np.clip(((states - low) / span * intervals).astype(np.int64), 0, intervals - 1)
-    return np.unique(cells, axis=0, return_counts=True)[1]
+    return np.unique(np.floor((states - low) / width).astype(np.int64), axis=0, return_counts=True)[1]
 
 
 def entropy_bits(counts: np.ndarray) -> float:
@@ -840,8 +867,10 @@ def entropy_bits(counts: np.ndarray) -> float:
 def state_coverage(experiment: Experiment) -> list[Coverage]:
     """Coverage of the true states by every actor.
 
-    The grid of a task spans the 1st to the 99th percentile of each component over all its actors, arms and seeds, and
-    of every actor and seed equally many states are counted (drawn at random): else the longer run covers more.
+    The random policy is the yardstick of a task's grid: so many intervals make up the range between the 1st and the
+    99th percentile of each component over its episodes of all seeds, and cells of that size go on without end. Thus
+    nobody's cells depend on where the other arms went. Of every actor and seed equally many states are counted (drawn
+    at random): else the longer run covers more.
 
     :param experiment: An experiment
     :return: One row per task, arm and actor
@@ -850,50 +879,60 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
     rows = []
     for task in experiment.tasks:
         visits = {
-            (method, seed): states
+            (method, seed, actor): states
             for method in experiment.methods
             for seed, cell in experiment.done(task, method).items()
-            if (states := cell.states())
+            for actor, states in cell.states().items()
+            if len(states)
         }
-        arrays = [states for cell in visits.values() for states in cell.values() if len(states)]
-        if not arrays:
+        if not visits:
             continue
-        dimensions = arrays[0].shape[1]
-        if dimensions == 0 or any(states.shape[1] != dimensions for states in arrays):
+        dimensions = next(iter(visits.values())).shape[1]
+        if dimensions == 0 or any(states.shape[1] != dimensions for states in visits.values()):
             raise ResultsError(
                 f"the visits.npz files of {experiment.folder / task} have states of different dimension: run again."
             )
-        low, high = np.percentile(np.concatenate(arrays), [1, 99], axis=0)
-        steps, intervals = min(len(states) for states in arrays), grid_intervals(dimensions)
+        steps, intervals = min(len(states) for states in visits.values()), grid_intervals(dimensions)
+        low, width = _yardstick(visits, intervals)
         rng = np.random.default_rng(0)
         counts = {
-            (method, seed, actor): occupied_cells(rng.choice(states, steps, replace=False), low, high, intervals)
-            for (method, seed), cell in visits.items()
-            for actor, states in cell.items()
-            if len(states)
+            key: occupied_cells(rng.choice(states, steps, replace=False), low, width) for key, states in visits.items()
         }
         arms = dict.fromkeys((method, actor) for method, _, actor in counts)
+
+        def occupied(method: str, actor: str, counts: Mapping = counts) -> dict[int, float]:
+            return {seed: len(found) for (arm, seed, who), found in counts.items() if (arm, who) == (method, actor)}
+
+        tasks = occupied(experiment.baseline, "task")
         for method, actor in sorted(arms, key=lambda arm: (experiment.methods.index(arm[0]), _place(arm[1]))):
-            seeds = [seed for arm, seed, who in counts if (arm, who) == (method, actor)]
-            ratios = [
-                len(counts[method, seed, actor]) / len(counts[method, seed, "random"])
-                for seed in seeds
-                if actor != "random" and (method, seed, "random") in counts
-            ]
+            own = occupied(method, actor)
+            is_trained, is_baseline = actor != "random", (method, actor) == (experiment.baseline, "task")
             rows.append(
                 Coverage(
                     task,
                     method,
                     actor,
-                    np.array([len(counts[method, seed, actor]) for seed in seeds]),
-                    np.array([entropy_bits(counts[method, seed, actor]) for seed in seeds]),
-                    geometric_mean(ratios),
+                    np.array(list(own.values())),
+                    np.array([entropy_bits(counts[method, seed, actor]) for seed in own]),
+                    paired_ratio(own if is_trained else {}, occupied(method, "random")),
+                    paired_ratio(own if is_trained and not is_baseline else {}, tasks),
                     steps,
                     intervals,
                     dimensions,
                 )
             )
     return rows
+
+
+def _yardstick(visits: Mapping[tuple[str, int, str], np.ndarray], intervals: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the grid begins and how wide its cells are: by the random policy's episodes, those of each seed once.
+
+    (All arms of a seed have the same ones.)
+    """
+    randoms = {seed: states for (_, seed, actor), states in visits.items() if actor == "random"}
+    yardstick = np.concatenate(list(randoms.values() if randoms else visits.values()))
+    low, high = np.percentile(yardstick, [1, 99], axis=0)
+    return low, np.where(high > low, (high - low) / intervals, 1.0)
 
 
 # Beside published numbers

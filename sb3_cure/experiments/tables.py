@@ -134,11 +134,16 @@ def _list(values: Sequence[Any]) -> str:
     return ", ".join(dict.fromkeys(str(value) for value in values if value not in (None, ""))) or NONE
 
 
-def _duration(seconds: Sequence[float]) -> str:
-    if not seconds:
+def _duration(seconds: Any) -> str:
+    if not isinstance(seconds, int | float):
         return NONE
-    mean = float(np.mean(seconds))
-    return f"{mean / 3600:.1f} h" if mean >= 3600 else f"{mean / 60:.1f} min" if mean >= 60 else f"{mean:.0f} s"
+    return (
+        f"{seconds / 3600:.1f} h"
+        if seconds >= 3600
+        else f"{seconds / 60:.0f} min"
+        if seconds >= 60
+        else f"{seconds:.0f} s"
+    )
 
 
 # Tables
@@ -176,22 +181,28 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
             row = [task, method, str(len(arm.seeds))]
             row += [_mean_std(values) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
             row += [number_text(statistics.interquartile_range(arm.finals)), number_text(arm.curve_iqr)]
-            rows.append(row + [_reached(arm.reached[limit]) for limit in thresholds])
+            rows.append(row + [_reached(arm, limit, experiment.budget) for limit in thresholds])
     return Table(
         "Learning curves",
         columns,
         rows,
         "Mean ± standard deviation (n - 1) over seeds. Area under the curve: mean return over the environment steps of "
-        "training. IQR: interquartile range over seeds, of the final return and averaged over the curve. Steps: median "
-        "over the seeds that reach the return at an evaluation, and how many do.",
+        "training. IQR: interquartile range over seeds, of the final return and averaged over the curve. Steps: of the "
+        "first evaluation with the return, median over all seeds (those that never get there count as later than the "
+        "end of training), and how many of them get there.",
     )
 
 
-def _reached(steps: np.ndarray) -> str:
+def _reached(arm: statistics.ArmSummary, limit: float, budget: int) -> str:
+    steps = arm.reached[limit]
     if not len(steps):
         return NONE
-    there = steps[np.isfinite(steps)]
-    return f"{number_text(float(np.median(there)))} ({len(there)} of {len(steps)})" if len(there) else "not reached"
+    count = int(np.isfinite(steps).sum())
+    if not count:
+        return "not reached"
+    median = float(np.median(steps))
+    shown = number_text(median) if np.isfinite(median) else f"> {number_text(budget)}"
+    return f"{shown} ({count} of {len(steps)})"
 
 
 def difference_table(
@@ -207,9 +218,18 @@ def difference_table(
     :param note: What to know about them
     :return: The differences with both intervals
     """
-    texts = [[row.method, of_tasks(row), *_difference(row)] for row in rows]
+    texts = [[difference_label(row, experiment), of_tasks(row), *_difference(row)] for row in rows]
     columns = ["arm", "task", *_DIFFERENCE_COLUMNS]
     return Table(f"Paired difference from {experiment.baseline}: {measure}", columns, texts, note)
+
+
+def difference_label(row: statistics.PairedDifference, experiment: Experiment) -> str:
+    """
+    :param row: A paired difference
+    :param experiment: Of which experiment
+    :return: The arm, and what it is compared with if that is another than the experiment's baseline
+    """
+    return row.method if row.other == experiment.baseline else f"{row.method} minus {row.other}"
 
 
 def pairs_table(rows: Sequence[statistics.PairedDifference]) -> Table:
@@ -280,19 +300,25 @@ def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSumm
         shown = NONE if theirs is None or row.head != "own" else " / ".join(f"{value:.4f}" for value in theirs)
         errors = [_error(value) for value in (row.error_min, row.error_mean, row.error_max)]
         head = row.head.replace("_", " ")
-        rows.append([row.task, row.method, head, row.actor, str(row.seeds), *errors, ratio_text(row.ratio), shown])
-    columns = ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", ">mean / random's [95 %]", ">paper"]
+        ratios = [ratio_text(row.ratio), ratio_text(row.task_ratio)]
+        rows.append([row.task, row.method, head, row.actor, str(len(row.means)), *errors, *ratios, shown])
     return Table(
         "SRL error per step",
-        columns,
+        ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_ratio_columns(experiment), ">paper"],
         rows,
-        "Heads: own, the arm's own; common, one fitted to an even mix of all policies' frames from other seeds; zero "
-        "and mean image, yardsticks that always predict the same. Errors are measured against the mean of the dither: "
+        "Actions are sampled, as in training. Heads: own, the arm's own; common, one fitted to an even mix of frames "
+        "of the random, task and curious policies from other seeds; zero and mean image, yardsticks that always "
+        "predict the same. Errors are measured against the mean of the dither: "
         f"an autoencoder's error is its excess over the dither floor already ({published.DITHER_FLOOR:.1e} of the "
-        "training loss), and the ratio that of the excesses: over the random actor's under the same head, "
-        "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
+        "training loss), and the ratios those of the excesses: over the random actor's under the same head, and over "
+        f"that of the task policy of {experiment.baseline} with the same seed (under its own head, or the same common "
+        "one); geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
         f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}.",
     )
+
+
+def _ratio_columns(experiment: Experiment) -> list[str]:
+    return [">/ random's [95 %]", f">/ {experiment.baseline} task policy's [95 %]"]
 
 
 def ratio_text(estimate: Estimate) -> str:
@@ -306,24 +332,29 @@ def ratio_text(estimate: Estimate) -> str:
     return f"{number_text(estimate.value, 2)} {shown}"
 
 
-def coverage_table(rows: Sequence[statistics.Coverage]) -> Table:
+def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) -> Table:
     """
+    :param experiment: An experiment
     :param rows: Coverage by actor
     :return: Occupied cells and entropy
     """
     grids = _list([f"{row.task}: {row.grid} intervals in each of {row.dimensions} dimensions" for row in rows])
-    columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells", ">/ random's [95 %]", ">entropy, bits"]
+    columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells"]
     shown = []
     for row in rows:
         numbers = [str(len(row.occupied)), number_text(row.steps), _mean_std(row.occupied)]
         entropy = number_text(float(row.entropy.mean()), 2)
-        shown.append([row.task, row.method, row.actor, *numbers, ratio_text(row.ratio), entropy])
+        shown.append(
+            [row.task, row.method, row.actor, *numbers, ratio_text(row.ratio), ratio_text(row.task_ratio), entropy]
+        )
     return Table(
         "Coverage of the true state space",
-        columns,
+        [*columns, *_ratio_columns(experiment), ">entropy, bits"],
         shown,
-        f"Positions and velocities of the simulator, of which the agents see only images. Grid: {grids}, between the "
-        "1st and 99th percentile over all actors of the task. Equally many states are counted of each actor and seed.",
+        "Positions and velocities of the simulator, of which the agents see only images; actions are sampled, as in "
+        f"training. Grid: {grids} between the random policy's 1st and 99th percentile, and cells of that size beyond. "
+        "Equally many states are counted of each actor and seed. Ratios: geometric mean over seeds, t interval of the "
+        "logarithms.",
     )
 
 
@@ -393,26 +424,45 @@ def published_table(comparisons: Sequence[statistics.Comparison]) -> Table:
 def conditions_table(experiment: Experiment) -> Table:
     """
     :param experiment: An experiment
-    :return: Under which conditions each curve was obtained
+    :return: Under which conditions each curve was obtained; seeds of an arm that had the same ones share a row
     """
-    rows = []
-    for task in experiment.tasks:
-        for method in experiment.methods:
-            cells = experiment.done(task, method)
-            if not cells:
-                continue
-            runs = [cell.run for cell in cells.values()]
-            steps = [int(cell.evaluations["environment_steps"][-1]) for cell in cells.values() if _has_rows(cell)]
-            versions = [run["versions"] for run in runs if isinstance(run.get("versions"), dict)]
-            packages = [", ".join(f"{name} {number}" for name, number in each.items()) for each in versions]
-            seconds = [run["seconds"] for run in runs if isinstance(run.get("seconds"), int | float)]
-            curve = [", ".join(map(str, cells)), _list([number_text(count) for count in steps]), _duration(seconds)]
-            machine = [_list([run.get(key) for run in runs]) for key in ("device", "precision", "machine")]
-            commit, attempts = (_list([run.get(key) for run in runs]) for key in ("commit", "attempts"))
-            rows.append([task, method, *curve, *machine, _list(packages), commit, attempts])
-    columns = ["task", "arm", "seeds", ">environment steps", ">wall-clock per seed", "device", "precision", "machine"]
-    return Table("Run conditions", [*columns, "versions", "commit", ">attempts"], rows)
+    letters: dict[str, str] = {}
+    rows: dict[tuple[str, ...], list[statistics.CellResult]] = {}
+    commits: dict[tuple[str, int], set[str]] = {}
+    for cell in experiment.cells.values():
+        if not cell.done:
+            continue
+        versions = cell.run.get("versions")
+        packages = ", ".join(f"{name} {number}" for name, number in versions.items()) if versions else ""
+        letter = letters.setdefault(packages, _letters(len(letters))) if packages else NONE
+        conditions = [
+            str(cell.run.get(key) or NONE) for key in ("device", "precision", "machine", "commit", "attempts")
+        ]
+        key = (cell.task, cell.method, _steps(cell), _pretraining(cell), *conditions[:3], letter, *conditions[3:])
+        rows.setdefault(key, []).append(cell)
+        commits.setdefault((cell.task, cell.seed), set()).add(conditions[3])
+    shown = []
+    for (task, method, steps, pretraining, *conditions), cells in rows.items():
+        seeds = ", ".join(str(cell.seed) for cell in cells)
+        times = ", ".join(_duration(cell.run.get("seconds")) for cell in cells)
+        shown.append([task, method, seeds, steps, pretraining, times, *conditions])
+    note = " ".join(f"Versions {letter}: {packages}." for packages, letter in letters.items())
+    mixed = sorted(f"{task} seed {seed}" for (task, seed), found in commits.items() if len(found) > 1)
+    if mixed:
+        note += f" Arms of one seed that were run at different commits: {', '.join(mixed)}."
+    columns = ["task", "arm", "seeds", ">environment steps", ">pretraining steps", ">wall-clock", "device", "precision"]
+    return Table("Run conditions", [*columns, "machine", "versions", "commit", ">attempts"], shown, note)
 
 
-def _has_rows(cell: statistics.CellResult) -> bool:
-    return len(cell.evaluations.get("environment_steps", ())) > 0
+def _letters(index: int) -> str:
+    return chr(ord("A") + index) if index < 26 else f"Z{index - 25}"
+
+
+def _steps(cell: statistics.CellResult) -> str:
+    steps = cell.evaluations.get("environment_steps", ())
+    return number_text(float(steps[-1])) if len(steps) else NONE
+
+
+def _pretraining(cell: statistics.CellResult) -> str:
+    phase = cell.config.get("pretrain")
+    return f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
