@@ -385,7 +385,8 @@ def visitation_bars(
     """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
-    :param panels: By title: arm, actor, minimum and maximum, mean by seed, and what is written above, of each policy
+    :param panels: By title: arm, actor, minimum and maximum, the values whose mean is shown (one per seed), and what is
+        written above, of each policy
     :param lines: By title: values to compare with, by name
     """
     _actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
