@@ -1,8 +1,11 @@
 """The files in `cluster/` fit the package: one who copies them gets a running grid."""
 
+import os
 import re
+import subprocess
 from pathlib import Path
 
+import pytest
 import yaml
 
 from sb3_cure.experiments.run import main
@@ -52,3 +55,59 @@ def test_grids_command_of_the_manifest_is_understood(tmp_path: Path, capsys) -> 
     arguments[arguments.index("--out") + 1] = str(tmp_path)
     assert main([str(grid), *arguments[1:], "--dry-run"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 60
+
+
+@pytest.mark.parametrize(
+    ("told", "fix"),
+    [
+        ("Could not find any running Ray instance.", "start one (ray start --head)"),
+        ("InvalidAuthToken: RAY_AUTH_MODE is currently\n'disabled' (not 'token')", "set RAY_AUTH_MODE=token"),
+    ],
+)
+def test_unreachable_clusters_tell_what_to_do(
+    told: str, fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A cluster that only wants its token is not said to be absent."""
+    ray = pytest.importorskip("ray")
+
+    def refuse(**arguments: object) -> None:
+        raise ConnectionError(told)
+
+    monkeypatch.setattr(ray, "init", refuse)
+    grid = str(ROOT / "zoo_configs" / "experiments" / "fast" / "curves.yml")
+    with pytest.raises(SystemExit):
+        main([grid, "--engine", "ray", "--address", "10.0.0.1:6379", "--out", str(tmp_path), "--seeds", "1"])
+    sentence = capsys.readouterr().err.splitlines()[-1]
+    assert "'10.0.0.1:6379'" in sentence and " ".join(told.split()) in sentence and fix in sentence
+
+
+def test_slurm_script_starts_ray_on_all_nodes_and_passes_the_grid_on(tmp_path: Path) -> None:
+    """With stand-ins for SLURM's and Ray's commands: one head, the others join it by one token; no Ray, no waiting."""
+    commands = {
+        "scontrol": "printf 'node1\\nnode2\\n'",
+        "srun": 'for id in 0 1; do SLURM_PROCID=$id "$@"; done; [ -z "$RAY_FAILS" ] && sleep 30',
+        # `ray status` answers when all nodes have begun.
+        "ray": '[ -z "$RAY_FAILS" ] || exit 1; [ "$1" = status ] && exec test -e started1; touch started$SLURM_PROCID; '
+        'echo "$@ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN}"',
+        "sb3-cure": 'echo "$@ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN}"',
+    }
+    for name, script in commands.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{script}\n")
+        (tmp_path / name).chmod(0o755)
+    job = {"SLURM_JOB_NODELIST": "node[1-2]", "SLURM_CPUS_PER_TASK": "16", "SLURM_JOB_ID": "7"}
+    path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
+
+    def submit(**more: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            ["bash", CLUSTER / "slurm.sh", "grid.yml", "--out", "/shared/my results"],
+            env={**os.environ, **job, "PATH": path, **more}, cwd=tmp_path, capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+
+    done = submit()
+    assert done.stdout == "experiment grid.yml --out /shared/my results --engine ray --address node1:6379 token 64\n"
+    assert (tmp_path / "ray-7.log").read_text().splitlines() == [
+        "start --head --port=6379 --num-cpus 16 --block token 64",
+        "start --address=node1:6379 --num-cpus 16 --block token 64",
+    ]
+    failed = submit(RAY_FAILS="1")
+    assert (failed.returncode, failed.stdout) == (1, "Ray did not start: see ray-7.log\n")

@@ -156,10 +156,14 @@ def _run_with_ray(
     try:
         ray.init(address=address or "local", **own)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise GridError(
-            f"--address is {address!r}, but no Ray cluster answers there ({error}): start one (ray start --head), or "
-            "leave --address out for this machine alone."
-        ) from None
+        reason = " ".join(str(error).split())
+        if "auth" in reason.lower():
+            fix = "set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or ~/.ray/auth_token to what its nodes were started with"
+            sentence = f"the Ray cluster there asks for its token ({reason}): {fix}."
+        else:
+            fix = "start one (ray start --head), or leave --address out for this machine alone"
+            sentence = f"no Ray cluster answers there ({reason}): {fix}."
+        raise GridError(f"--address is {address!r}, but {sentence}") from None
     try:
         _check_resources(ray.nodes(), resources)
         # A process for each: what one leaves behind does not burden the next.
