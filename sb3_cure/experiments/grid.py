@@ -324,8 +324,8 @@ def _scale(phase: Pretraining, own_budget: int, budget: int, path: Path) -> Pret
     """A phase as long in proportion to another budget as it is to the file's."""
     if own_budget == 0:
         raise GridError(
-            f"budget in {path} is 0 (pretraining alone), to which the {budget} that were asked for have no proportion: "
-            "change the budgets in the file instead."
+            f"budget in {path} is 0 (pretraining alone), but {budget} was asked for, to which pretraining cannot be "
+            "scaled: change the budgets in the file instead."
         )
     return Pretraining(phase.collector, max(round(phase.budget * budget / own_budget), 1))
 
