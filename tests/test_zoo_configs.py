@@ -133,7 +133,6 @@ def test_every_grid_has_a_fast_one(name: str) -> None:
     """Which asks the same: the same methods from the fast files, pretrained in the same proportion."""
     slow, fast = (load_grid(folder / name) for folder in (FOLDER / "experiments", FOLDER / "experiments" / "fast"))
     assert (fast.kind, fast.baseline) == (slow.kind, slow.baseline)
-    assert set(fast.description["tasks"]) <= set(slow.description["tasks"])
     methods = copy.deepcopy(slow.description["methods"])
     for method in methods.values():
         method["config"] = method["config"].replace("../", "../../fast/")
