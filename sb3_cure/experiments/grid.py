@@ -110,7 +110,7 @@ class Grid:
 
     :param experiment: Its name, the folder of its results
     :param kind: One of ``KINDS``
-    :param baseline: The arm with which the others are compared
+    :param baseline: The arm with which those are compared that name no ``baseline`` of their own
     :param cells: What was chosen, seed by seed, so that whole comparisons are finished early
     :param complete: All that the file (or an earlier choice of seeds) makes of it
     :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
