@@ -886,7 +886,8 @@ class CuReSAC(SAC):
 
         Trains no task networks. Keeps encoder, target encoder, head and their optimisers (and the curious agent, if
         curiosity is on), empties the replay buffer and starts counting anew: the ``learn`` that follows is vanilla
-        unless curiosity is on.
+        unless curiosity is on. Of a model with a seed it also begins with the environments and random numbers that it
+        would begin with without pretraining, so that both have the same random warm-up.
 
         :param total_timesteps: Agent steps
         :param collector: Who collects: ``"curious"``, a policy trained by the SRL error alone (built for the purpose
@@ -950,6 +951,15 @@ class CuReSAC(SAC):
         self.num_timesteps = self._n_updates = 0
         self._warmed_up = False
         self._last_obs = None
+        self._restart_random_streams()
+
+    def _restart_random_streams(self) -> None:
+        """All of them are to be where they are when a model of this seed has been made."""
+        if self.seed is not None:
+            self.set_random_seed(self.seed)
+            # Draws the initial weights once more; nothing else of it is needed.
+            arguments = {**self.policy_kwargs, **self._policy_blueprint()}
+            self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **arguments)
 
     # --------------------------------------------------------------- logging
 

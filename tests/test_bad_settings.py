@@ -548,7 +548,7 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
     "a key of a method": (
         arm(override={}),
         "sb3-cure experiment: error: 'override' in methods.a in grid.yml is unknown, but the "
-        "keys are config, overrides, pretrain, train: correct it.",
+        "keys are baseline, config, overrides, pretrain, train: correct it.",
     ),
     "an argument": (
         arm(overrides={"prob": 1}),
@@ -611,6 +611,11 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
     "baseline": (
         {"baseline": ["cure"]},
         "sb3-cure experiment: error: baseline in grid.yml is ['cure'], but the methods are cure: name one of them.",
+    ),
+    "a method's baseline": (
+        arm(baseline="a"),
+        "sb3-cure experiment: error: baseline of methods.a in grid.yml is 'a', but a method is compared with another "
+        "one (there is none): name one, or remove it.",
     ),
     "evaluation": (
         {"evaluation": {"every": 0}},

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -16,9 +17,11 @@ import gymnasium as gym
 import numpy as np
 import psutil
 import pytest
+import torch as th
 import yaml
 from envs_for_tests import PixelBox, differences, state_of
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC, files, generations
 from sb3_cure.experiments import cells, heads, run, yardsticks
@@ -87,6 +90,50 @@ def test_a_grid_is_every_task_with_every_method_and_seed(tmp_path: Path) -> None
     assert few.description["methods"].keys() == {"a", "b"}, "what was not chosen is still part of the experiment"
 
 
+@pytest.mark.parametrize(
+    ("own", "asked", "expected"),
+    [(400, 400, (400, 100)), (400, 40, (40, 10)), (400, 1, (1, 1)), (300, 1000, (1000, 333)), (0, 0, (0, 100))],
+)
+def test_another_budget_is_one_of_pretraining_too(
+    tmp_path: Path, own: int, asked: int, expected: tuple[int, int]
+) -> None:
+    """In proportion, at least a step, in cells and in the description; a method that does not pretrain has no phase."""
+    pretrain = {"collector": "random", "budget": 100}
+    methods = {
+        "none": {"config": "zoo.yml"},
+        "both": {"config": "zoo.yml", "pretrain": pretrain},
+        "alone": {"config": "zoo.yml", "pretrain": pretrain, "train": False},
+    }
+    path = write_grid(tmp_path, budget=own, methods=methods)
+    grid = load_grid(path, budget=asked)
+    phases = [(cell.budget, cell.pretrain and cell.pretrain.budget) for cell in grid.cells]
+    assert phases == [(asked, None), expected, (0, expected[1])]
+    described = grid.description["methods"]
+    assert "pretrain" not in described["none"] and grid.description["budget"] == asked
+    assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}
+    assert load_grid(path).description["methods"] == methods
+
+
+def test_nothing_is_in_proportion_to_no_training(tmp_path: Path) -> None:
+    """A file's budget of 0 is pretraining alone; another one can be asked for if there is no pretraining."""
+    path = write_grid(tmp_path, budget=0)
+    assert [cell.budget for cell in load_grid(path, budget=80).cells] == [80]
+    method = {"config": "zoo.yml", "pretrain": {"collector": "random", "budget": 100}}
+    write_grid(tmp_path, budget=0, methods={"p": method})
+    with pytest.raises(GridError, match=r"is 0 \(pretraining alone\), but 80 was asked for, .*: change the budgets in"):
+        load_grid(path, budget=80)
+
+
+def test_a_method_may_have_a_baseline_of_its_own(tmp_path: Path) -> None:
+    """Reports find it in ``grid.json``; the cells, which it does not change, are those without it."""
+    methods: dict[str, Any] = {name: {"config": "zoo.yml"} for name in "abc"}
+    cells_without = load_grid(write_grid(tmp_path, methods=methods)).cells
+    methods["c"]["baseline"] = "b"
+    grid = load_grid(write_grid(tmp_path, methods=methods))
+    assert grid.baseline == "a" and grid.description["methods"] == methods
+    assert grid.cells == cells_without
+
+
 @pytest.mark.parametrize("path", sorted(GRIDS.rglob("*.yml")), ids=lambda path: str(path.relative_to(GRIDS)))
 def test_the_projects_grids_can_be_built(path: Path) -> None:
     """Every arm's arguments are accepted by CuReSAC in the task's own spaces (networks made small)."""
@@ -139,6 +186,18 @@ def test_the_projects_grids_can_be_built(path: Path) -> None:
             "srl of methods.a .* is 'my_heads.Nowhere', which cannot be imported",
         ),
         (dict(baseline="sac"), "baseline in .* is 'sac', but the methods are cure"),
+        (
+            dict(methods={"a": {"config": "zoo.yml"}, "b": {"config": "zoo.yml", "baseline": "c"}}),
+            r"baseline of methods.b in .* is 'c', but a method is compared with another one \(a\): name one, or remove",
+        ),
+        (
+            dict(methods={"a": {"config": "zoo.yml", "baseline": "a"}, "b": {"config": "zoo.yml"}}),
+            r"baseline of methods.a in .* is 'a', but a method is compared with another one \(b\): name one, or remove",
+        ),
+        (
+            dict(methods={"a": {"config": "zoo.yml", "baseline": ["a"]}}),
+            r"baseline of methods.a in .* is \['a'\], but .* another one \(there is none\): name one, or remove it",
+        ),
         (dict(evaluation={"every": 0}), "evaluation.every in .* is 0, but it must be a whole number, 1 or more"),
         (dict(budgets=3), "'budgets' in .* is unknown"),
     ],
@@ -232,6 +291,95 @@ def test_warm_ups_of_the_arms_are_the_same(tmp_path: Path) -> None:
         buffer = model.replay_buffer
         buffers.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy(), buffer.frames[:15].copy()))
     assert differences(buffers[0], buffers[1]) == differences(buffers[0], buffers[2]) == []
+
+
+def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **changes: Any) -> Grid:
+    """The three arms of the paper's table, in two environments each; every phase has the same budget."""
+    phases: dict[str, Any] = {"vanilla": {}}
+    for collector in ("random", "curious"):
+        phases[collector] = {"pretrain": {"collector": collector, "budget": budget}}
+    overrides = {"curiosity": None, "learning_starts": warm_up, "n_envs": 2}
+    methods = {arm: {"config": "zoo.yml", "overrides": overrides, **phase} for arm, phase in phases.items()}
+    evaluation = dict(every=budget, episodes=1)
+    return load_grid(write_grid(folder, tasks=[task], methods=methods, budget=budget, evaluation=evaluation, **changes))
+
+
+def transitions_of(run_of_cell: Any) -> Any:
+    """All that its replay buffer holds."""
+    buffer = run_of_cell.model.replay_buffer
+    return buffer.transitions(*np.divmod(np.arange(2 * buffer.pos), 2))
+
+
+@pytest.mark.parametrize(("task", "budget"), [(TASK, 200), ("dmc_pixels/cartpole-swingup-v0", 400)])
+def test_pretrained_arms_have_the_same_warm_up(
+    task: str, budget: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After pretraining, environments and all random numbers begin as they do in the arm without it.
+
+    On the tiny task each environment is in its second episode, whose start is drawn, when the warm-up ends.
+    """
+    warm_up = 46
+    begun, warm_ups = [], []
+    finish = cells._CellRun._keep_results
+
+    class See(BaseCallback):
+        def _on_training_start(self) -> None:
+            begun.append((np.random.get_state(), th.get_rng_state(), random.getstate(), self.model._last_obs))
+
+        def _on_step(self) -> bool:
+            return True
+
+    def keep(run_of_cell: Any) -> None:
+        warm_ups.append([each[:warm_up] for each in transitions_of(run_of_cell) if each is not None])
+        finish(run_of_cell)
+
+    learn = CuReSAC.learn
+    monkeypatch.setattr(CuReSAC, "learn", lambda self, steps, callback: learn(self, steps, callback=[See(), *callback]))
+    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+    for cell in pretrained_grid(tmp_path, task, warm_up, budget, seeds=2).cells[:4]:
+        run_cell(cell, tmp_path, pictures=False)
+    assert differences(begun[0], begun[1]) == differences(begun[0], begun[2]) == []
+    assert differences(warm_ups[0], warm_ups[1]) == differences(warm_ups[0], warm_ups[2]) == []
+    assert len(differences(warm_ups[0], warm_ups[3])) >= 4, "another seed has another warm-up"
+
+
+@pytest.mark.parametrize("minutes", [0, 10], ids=["each step is kept", "only starts are kept"])
+def test_a_pretrained_cell_that_was_killed_ends_like_one_that_was_not(
+    minutes: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Random numbers begin anew when training does, neither before nor when it is gone on with."""
+    *_, cell = pretrained_grid(tmp_path, TASK, warm_up=20, budget=120).cells
+    step, finish = PixelBox.step, cells._CellRun._keep_results
+    n_steps, kill_at, kept = 0, 0, []
+
+    def count(self: PixelBox, action: np.ndarray) -> Any:
+        nonlocal n_steps
+        n_steps += 1
+        if n_steps == kill_at:
+            raise RuntimeError("the power went")
+        return step(self, action)
+
+    def keep(run_of_cell: Any) -> None:
+        kept.append((transitions_of(run_of_cell), np.random.random(3), th.rand(3)))
+        finish(run_of_cell)
+
+    monkeypatch.setattr(PixelBox, "step", count)
+    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+
+    def outcome(folder: Path) -> Any:
+        episodes = (folder / "episodes.csv").read_text()
+        return state_of(CuReSAC.load(folder / "model.zip")), kept.pop(), episodes, steps_of(folder / "eval.csv")
+
+    expected = outcome(run_cell(cell, tmp_path / "whole", minutes, pictures=False))
+    assert n_steps == 30 + 20 + 30 + 20
+    # In pretraining's warm-up, among its updates; in the first evaluation, in training's warm-up, among its updates
+    for kill_at in (10, 26, 40, 60, 76):
+        n_steps, folder = 0, tmp_path / f"killed-{kill_at}"
+        with pytest.raises(RuntimeError, match="the power went"):
+            run_cell(cell, folder, minutes, pictures=False)
+        np.random.seed(99)  # whatever another process begins with
+        th.manual_seed(99)
+        assert differences(expected, outcome(run_cell(cell, folder, minutes, pictures=False))) == [], kill_at
 
 
 def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The YAML files hold the paper's settings, or the demo's, and rl-zoo3 trains from each of them."""
 
 import copy
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import yaml
 
 from sb3_cure import CuReSAC, zoo
 from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
+from sb3_cure.experiments.grid import load_grid
 
 FOLDER = Path(__file__).parent.parent / "zoo_configs"
 METHODS = {
@@ -29,6 +31,8 @@ SIX_TASKS = {
 }
 # A task that no file names
 ANY_OTHER = "dmc_pixels/cheetah-run-v0"
+# What a file says nothing of
+CURE_DEFAULTS = {name: each.default for name, each in inspect.signature(CuReSAC).parameters.items()}
 # Networks of the files' own sizes take a second to initialise.
 SMALL = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4}}
 
@@ -122,3 +126,42 @@ def test_each_file_trains(path: str, tmp_path: Path) -> None:
     assert evaluation.observation_space == model.observation_space
     assert evaluation.get_attr("renderer") == ["fast" if "fast/" in path else "dmc"]
     evaluation.close()
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))
+def test_every_grid_has_a_fast_one(name: str) -> None:
+    """Which asks the same: the same methods from the fast files, pretrained in the same proportion."""
+    slow, fast = (load_grid(folder / name) for folder in (FOLDER / "experiments", FOLDER / "experiments" / "fast"))
+    assert (fast.kind, fast.baseline) == (slow.kind, slow.baseline)
+    methods = copy.deepcopy(slow.description["methods"])
+    for method in methods.values():
+        method["config"] = method["config"].replace("../", "../../fast/")
+        if "pretrain" in method:
+            share = method["pretrain"]["budget"] / slow.description["budget"]
+            method["pretrain"]["budget"] = share * fast.description["budget"]
+    assert list(fast.description["methods"].items()) == list(methods.items())
+
+
+@pytest.mark.parametrize("folder", ["experiments", "experiments/fast"])
+def test_an_ablation_is_one_change(folder: str) -> None:
+    """Against the method that its difference is taken from."""
+    grid = load_grid(FOLDER / folder / "ablations.yml", seeds=1)
+    settings = {cell.method: {**CURE_DEFAULTS, **cell.arguments} for cell in grid.cells}
+    changes = {}
+    for arm, method in grid.description["methods"].items():
+        other = settings[method.get("baseline", grid.baseline)]
+        changes[arm] = [name for name in other if settings[arm][name] != other[name]]
+    assert changes.pop(grid.baseline) == []
+    assert changes == {
+        "prob_005": ["curiosity_prob"],
+        "prob_05": ["curiosity_prob"],
+        "beta_01": ["curiosity_beta"],
+        "beta_10": ["curiosity_beta"],
+        "gamma_0": ["curiosity_gamma"],
+        "next_observation": ["curiosity_target"],
+        "not_normalized": ["normalize_curiosity"],
+        "bonus": ["curiosity"],
+        "no_encoder_gradient": ["curiosity_encoder_grad"],
+        "sequential": ["update"],
+        "alternating": ["srl_schedule"],
+    }

@@ -22,7 +22,7 @@ DONE = "DONE"
 KINDS = ("curves", "visitation", "pretraining")
 COLLECTORS = ("curious", "random")
 _GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "methods", "baseline"}
-_METHOD_KEYS = {"config", "overrides", "pretrain", "train"}
+_METHOD_KEYS = {"config", "overrides", "pretrain", "train", "baseline"}
 # Of a zoo entry: what is no argument of CuReSAC. `n_timesteps` is rl-zoo's; here the grid's budget says how long.
 _ENTRY_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
 _ARGUMENTS = (arguments_of(CuReSAC) or set()) - {"env", "seed", "_init_setup_model"}
@@ -110,7 +110,7 @@ class Grid:
 
     :param experiment: Its name, the folder of its results
     :param kind: One of ``KINDS``
-    :param baseline: The arm with which the others are compared
+    :param baseline: The arm with which those are compared that name no ``baseline`` of their own
     :param cells: What was chosen, seed by seed, so that whole comparisons are finished early
     :param complete: All that the file (or an earlier choice of seeds) makes of it
     :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
@@ -142,11 +142,14 @@ def load_grid(
 ) -> Grid:
     """Read a grid and the zoo files it names.
 
+    A file's budget of 0 means pretraining alone: nothing is trained after it. No other budget is in proportion to that,
+    so that one can be asked for only where no method pretrains.
+
     :param path: YAML file
     :param seeds: Instead of the file's: how many (from 0), or which
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
-    :param budget: Environment steps, instead of the file's
+    :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
     :return: The grid
     :raises GridError: with one sentence about what is wrong
     """
@@ -156,7 +159,8 @@ def load_grid(
     if content["kind"] not in KINDS:
         raise GridError(f"kind in {path} is {content['kind']!r}, but it must be one of {', '.join(KINDS)}: change it.")
     _check_name("experiment", content["experiment"], path)
-    budget = _whole_number("budget", content["budget"] if budget is None else budget, path, least=0)
+    own_budget = _whole_number("budget", content["budget"], path, least=0)
+    budget = own_budget if budget is None else _whole_number("budget", budget, path, least=0)
     evaluation = _mapping("evaluation", content.get("evaluation", {}), path)
     _check_keys(evaluation, {"every", "episodes"}, set(), f"evaluation in {path}")
     every = _whole_number("evaluation.every", evaluation.get("every", 10_000), path, least=1)
@@ -180,6 +184,18 @@ def load_grid(
         for task in dict.fromkeys(all_tasks.values())
         for arm in arms
     }
+    for arm, method in arms.items():
+        others = [name for name in arms if name != arm]
+        if "baseline" in method and method["baseline"] not in others:
+            raise GridError(
+                f"baseline of methods.{arm} in {path} is {method['baseline']!r}, but a method is compared with another "
+                f"one ({', '.join(others) or 'there is none'}): name one, or remove it."
+            )
+    if budget != own_budget:
+        for (_, arm), settings in resolved.items():
+            if settings["pretrain"] is not None:
+                settings["pretrain"] = _scale(settings["pretrain"], own_budget, budget, path)
+                arms[arm] = {**arms[arm], "pretrain": asdict(settings["pretrain"])}
     every_seed = sorted({*all_seeds, *chosen_seeds})
     complete = tuple(
         Cell(
@@ -302,6 +318,16 @@ def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[st
         "pretrain": pretrain,
         "train": trains,
     }
+
+
+def _scale(phase: Pretraining, own_budget: int, budget: int, path: Path) -> Pretraining:
+    """A phase as long in proportion to another budget as it is to the file's."""
+    if own_budget == 0:
+        raise GridError(
+            f"budget in {path} is 0 (pretraining alone), but {budget} was asked for, to which pretraining cannot be "
+            "scaled: change the budgets in the file instead."
+        )
+    return Pretraining(phase.collector, max(round(phase.budget * budget / own_budget), 1))
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
