@@ -316,7 +316,7 @@ def test_nothing_is_broken_in_a_browser(chromium: str, results: Path, tmp_path: 
     sizes, console = look(chromium, page, tmp_path)
     assert console == []
     assert len(sizes["images"]) == page.count("<img ") > 8 and min(sizes["images"]) > 0
-    assert sizes["videos"] == [64]
+    assert sizes["videos"] == [64, 64]
 
 
 def test_the_browser_check_finds_what_is_broken(chromium: str, results: Path, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
     :return: Return, SRL loss and SRL error of the policies over training, where there is anything to draw
     """
     columns = {
-        "return_mean": ("learning_curves", "episode return (deterministic actions)", False,
+        "return_mean": ("learning_curves", "episode return\n(deterministic actions)", False,
                         "Return of the task policy, which acts deterministically,"),
         "srl_loss": ("srl_loss", "SRL loss", True, "SRL loss of the batches of training"),
     }  # fmt: skip
@@ -106,7 +106,7 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
     if errors:
         caption = "SRL error, under the agent's own head, that the task policy (solid lines) and the curious policy "
         caption = _of(f"{caption}(dashed) meet, each acting alone and deterministically,", errors)
-        label = "SRL error (deterministic actions)"
+        label = "SRL error\n(deterministic actions)"
         yield _figure("srl_error", caption, plots.srl_error_curves, errors, colors, label)
 
 

@@ -87,7 +87,7 @@ _font = functools.cache(ImageFont.load_default)
 def _wrapped(text: str, size: int, width: int) -> list[str]:
     """As few lines as fit into a width; words are broken only where one alone is wider."""
     for length in range(len(text), 1, -1):
-        lines = textwrap.wrap(text, length)
+        lines = textwrap.wrap(text, length, break_on_hyphens=False)
         if all(_font(size).getlength(line) <= width for line in lines):
             return lines
     return [text] if text else []
