@@ -197,6 +197,10 @@ class _PictureCallback(PeriodicCallback):
         return asked
 
 
+def _actions(deterministic: bool) -> str:
+    return "deterministic actions" if deterministic else "sampled actions"
+
+
 def _check_seed(user: str, seed: Any) -> None:
     if seed is not None and not is_integer(seed, 0):
         raise ValueError(f"{user} got seed={seed!r}, but it must be None or a whole number >= 0: change seed.")
@@ -286,7 +290,8 @@ class PolicyVideoCallback(_PictureCallback):
                 render=True,
             )
             path = self._path(f"{actor}_policy_{steps}_steps.mp4")
-            video.write_video(path, episode, self.fps, repeat, f"{actor} policy after {steps:,} agent steps")
+            title = f"{actor} policy, {_actions(self.deterministic)}, after {steps:,} agent steps"
+            video.write_video(path, episode, self.fps, repeat, title)
 
 
 class ReconstructionCallback(_PictureCallback):
@@ -359,7 +364,9 @@ class ReconstructionCallback(_PictureCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        if self.observations is not None and not self.rows:
+        # A resumed training has had its first row, or nothing to fit a decoder to.
+        resumed = self.model._run.resumed is not None  # type: ignore[attr-defined]
+        if self.observations is not None and not self.rows and not resumed:
             with _untouched_randomness(self.model.device):
                 self.on_period()
 
@@ -518,7 +525,7 @@ class CuriosityMapCallback(_PictureCallback):
             self._path(f"curiosity_map_{steps}_steps.png"),
             self.visits,
             self.names,
-            f"Where policies go after {steps:,} agent steps",
+            f"Where policies go with {_actions(self.deterministic)} after {steps:,} agent steps",
             coordinates=self.coordinates,
             units=self.units,
             bins=self.bins,

@@ -22,9 +22,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_cure import make_dmc_env
+from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.callbacks import (
     CuriosityMapCallback,
+    ExactCheckpoint,
     PeriodicCallback,
     PolicyVideoCallback,
     ReconstructionCallback,
@@ -184,6 +185,35 @@ def test_overlay_shows_the_error_and_leaves_the_picture_alone() -> None:
     assert heights[1] == heights[3] and (np.diff(np.array(heights)[[0, 1, 2, 5, 4]]) > 0).all()
 
 
+@given(
+    title=st.text("cure_sac-ae, swingup", min_size=60, max_size=160),
+    reward=st.sampled_from([1.0, -1e15]),
+    width=st.sampled_from([64, 130, 300]),
+)
+@settings(max_examples=25, deadline=None)
+def test_text_of_a_video_fits(title: str, reward: float, width: int) -> None:
+    """Nothing is cut off at the right: there is a margin, the end of the title is seen, pictures are of one size."""
+    frames = [np.zeros((40, width, 3), np.uint8)] * 3
+
+    def pictures(end: str) -> np.ndarray:
+        episode = Episode(np.array([reward, 0, -reward]), np.zeros(0), np.zeros(3), frames)
+        return np.stack(list(annotated_frames(episode, action_repeat=8, title=title + end)))
+
+    one, other = pictures("A"), pictures("B")
+    top = 40 * -(-256 // width)
+    assert (one[:, top:, -one.shape[2] // 64 :] > 250).all() and (one[:, top:] < 80).any()
+    assert one.shape != other.shape or (one != other).any()
+
+
+def test_long_numbers_in_a_video_fit() -> None:
+    """A large SRL error is written in full, as it is smaller."""
+    frames = [np.zeros((40, 64, 3), np.uint8)] * 2
+    errors = [np.array([1.0, 123_456_789_012_345.25 + more]) for more in (0, 0.25)]
+    one, other = (list(annotated_frames(Episode(np.ones(2), each, np.zeros(2), frames)))[-1] for each in errors)
+    text = slice(160, 160 + 2 * 16)
+    assert (one[text, -4:] > 250).all() and (one[text] != other[text]).any(), "the last digits are seen"
+
+
 def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Path) -> None:
     """Each row is what the head draws then of the observations of the first row, newest frames only."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=2))
@@ -220,6 +250,34 @@ def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_pa
     tiny_model("CnnPolicy", env).learn(20, callback=[callback, Measure()])
     assert [steps for steps, _ in callback.rows] == [0, 4, 8, 12, 16, 20]
     assert heights[0] < heights[4] < heights[8] == heights[-1]
+
+
+def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
+    """With a head that needs a decoder there is no row of the untrained model, nor one of the moment of resuming."""
+    env = PixelBox()
+    observations = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 13:
+                raise InterruptedError
+            return True
+
+    def watching(folder: str) -> ReconstructionCallback:
+        return ReconstructionCallback(tmp_path / folder, 15, observations, probe_updates=1)
+
+    def checkpoints() -> ExactCheckpoint:
+        return ExactCheckpoint(save_freq=5, path=tmp_path / "checkpoints")
+
+    curl: dict[str, Any] = dict(srl="curl", srl_kwargs=dict(bank_size=12))
+    whole, first, second = watching("whole"), watching("parts"), watching("parts")
+    tiny_model("CnnPolicy", PixelBox(), **curl).learn(31, callback=whole)
+    with pytest.raises(InterruptedError):
+        tiny_model("CnnPolicy", PixelBox(), **curl).learn(31, callback=[checkpoints(), first, Stop()])
+    CuReSAC.resume(tmp_path / "checkpoints", PixelBox()).learn(31, callback=[checkpoints(), second])
+    assert [steps for steps, _ in second.rows] == [steps for steps, _ in whole.rows] == [15, 30]
+    for (_, drawn), (_, other) in zip(whole.rows, second.rows, strict=True):
+        np.testing.assert_array_equal(drawn, other)
 
 
 def test_heads_that_do_not_draw_get_a_probe_or_one_sentence(tmp_path: Path) -> None:

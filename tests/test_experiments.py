@@ -24,7 +24,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC, files, generations
-from sb3_cure.experiments import cells, heads, run, yardsticks
+from sb3_cure.experiments import cells, heads, media, plots, probe, run, yardsticks
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
@@ -408,6 +408,34 @@ def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
     assert json.loads((out / "tiny" / "grid.json").read_text())["seeds"] == [0, 1]
 
 
+def test_arms_reconstruct_the_same_observations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that their errors compare; and a cell that is drawn is trained as one that is not."""
+    methods = {
+        "sac_ae": {"config": "zoo.yml", "overrides": {"curiosity": None}},
+        "cure": {"config": "zoo.yml"},
+        "curl": {"config": "zoo.yml", "overrides": {"srl": "curl", "srl_kwargs": {"bank_size": 8}}},
+    }
+    fit = probe.fit_probe
+    monkeypatch.setattr(probe, "fit_probe", lambda model, updates: fit(model, 1))  # not 500
+    observed, rows = [], []
+    monkeypatch.setattr(
+        plots,
+        "reconstructions_over_training",
+        lambda path, shown, drawn, title: (observed.append(shown), rows.append([steps for steps, _ in drawn])),
+    )
+    every = load_grid(write_grid(tmp_path, budget=160, methods=methods)).cells
+    for cell in every:
+        run_cell(cell, tmp_path / "drawn")
+        run_cell(cell, tmp_path / "not drawn", pictures=False)
+        both = [tmp_path / name / cell.folder for name in ("drawn", "not drawn")]
+        drawn, plain = (CuReSAC.load(folder / "model.zip").get_parameters() for folder in both)
+        assert differences(drawn, plain) == []
+    assert rows[8] == [0, 5, 10, 15, 20, 25, 30, 35, 40], "with the untrained autoencoder"
+    assert rows[9] == [40], "drawn at the end where no picture was left by training"
+    assert all(np.array_equal(shown, observed[0]) for shown in observed) and len(observed) == 10 + 10 + 9
+    assert len(np.unique(observed[0], axis=0)) == len(observed[0]) == 8
+
+
 @pytest.mark.parametrize("kind", ["curves", "visitation"])
 def test_arms_without_srl_or_curiosity_are_measured_too(tmp_path: Path, kind: str) -> None:
     """SB3's own SAC, and a shared encoder without head, as baselines: returns and visits without SRL errors."""
@@ -583,6 +611,47 @@ def test_a_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out.count(": done") == 2
 
 
+def test_logs_tell_how_far_everything_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Without a terminal one line now and then, although no cell is finished; not between these moments."""
+    done, running, waiting = load_grid(write_grid(tmp_path, seeds=3)).cells
+    for cell in (done, running):
+        (tmp_path / cell.folder).mkdir(parents=True)
+    (tmp_path / done.folder / "DONE").touch()
+    cells.write_progress(tmp_path / done.folder, environment_steps=400, seconds=80, best_return=4.2)
+    cells.write_progress(tmp_path / running.folder, environment_steps=100, seconds=10, best_return=7.4)
+    line = "1 of 3 cells done, 1 running, 10.0 environment steps/s, about 1 min left, best return 7 "
+    line += f"({running.folder})"  # 300 and 400 steps are left: 70 s
+    ticks: list[None] = []
+
+    def list_units() -> list[heads.Unit]:
+        ticks.append(None)
+        return [done, running, waiting]
+
+    printed = ""
+    with cells.alone_in(tmp_path / running.folder):
+        with run._live_progress(list_units, tmp_path):
+            wait_for(lambda: len(ticks) > 5)
+        assert "best return 7 " not in capsys.readouterr().out, "five minutes are not over"
+        monkeypatch.setattr(run, "SUMMARY_SECONDS", 0.0)
+        with run._live_progress(list_units, tmp_path):
+            while line not in printed:
+                printed += wait_for(lambda: capsys.readouterr().out)
+    assert printed.splitlines().count(line) == 1
+
+
+def test_a_list_of_cells_may_be_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``sb3-cure experiment --dry-run | head -1`` ends without a traceback, then and when Python ends."""
+    path = write_grid(tmp_path)
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as pipe, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", pipe)
+        assert run.main([str(path), "--out", str(tmp_path / "out"), "--dry-run"]) == 0
+        print("more", flush=True)
+
+
 def test_only_of_other_machines_the_clock_tells_what_runs(tmp_path: Path) -> None:
     """Their locks may be unknown here; of this machine a lock that nobody holds says that nothing runs."""
     (cell,) = load_grid(write_grid(tmp_path)).cells
@@ -657,6 +726,37 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
         for cell in grid.cells
     ]
     assert returns[0] == returns[1] and returns[2] == returns[3] and returns[0].isdisjoint(returns[2])
+
+
+def test_pictures_show_every_policy_and_name_the_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films of both policies; the map is that of the measured visits, of sampled and random actions, in any kind."""
+    maps: list[dict[str, Any]] = []
+    titles: list[str] = []
+    draw, write = plots.curiosity_map, media.write_video
+    monkeypatch.setattr(plots, "curiosity_map", lambda *args, **how: (maps.append(args[1]), titles.append(args[3])))
+    monkeypatch.setattr(media, "write_video", lambda *args: (titles.append(args[-1]), write(*args)))
+    settings: dict[str, Any] = dict(tasks=["dmc_pixels/cartpole-swingup-v0"], evaluation=dict(every=240, episodes=1))
+    for kind in ("curves", "visitation"):
+        (cell,) = load_grid(write_grid(tmp_path, kind=kind, budget=80, experiment=kind, **settings)).cells
+        run_cell(cell, tmp_path)
+        assert sorted(path.name for path in (tmp_path / cell.folder).glob("*.mp4")) == [
+            "curious_policy.mp4",
+            "task_policy.mp4",
+        ]
+    named = "cartpole-swingup, cure, seed 0"
+    assert titles[:3] == titles[3:] == [
+        f"Where policies go with sampled actions: {named}",
+        f"task policy, deterministic actions: {named}",
+        f"curious policy, deterministic actions: {named}",
+    ]  # fmt: skip
+    anew, measured = maps
+    assert list(anew) == list(measured) == ["task", "curious", "random"]
+    for actor, arrays in measured.items():
+        for one, other in zip(anew[actor], arrays, strict=True):
+            assert len(one) == 125
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)  # one of them from a file of float32
+    draw(tmp_path / "map.png", measured, [str(number) for number in range(4)], "", coordinates=("0", "1"))
+    assert (tmp_path / "map.png").exists()
 
 
 @pytest.fixture

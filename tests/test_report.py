@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from PIL import Image
 from results_for_tests import CURE, RAE, write_cell, write_grid
 
-from sb3_cure.experiments import report
+from sb3_cure.experiments import plots, report
 from sb3_cure.experiments.statistics import read_results
 
 TASK = "cartpole-swingup"
@@ -72,12 +73,13 @@ def write_pretraining(folder: Path) -> None:
         write_cell(folder, TASK, arm, 0, curve(0, final), arguments=RAE, **phase.get(arm, {}))
 
 
-def write_media(cell: Path) -> None:
+def write_media(cell: Path, videos: tuple[str, ...] = ("task_policy", "curious_policy")) -> None:
     for name in ("reconstructions", "uncomfortable", "curiosity_map"):
         Image.new("RGB", (60, 40), "teal").save(cell / f"{name}.png")
-    with imageio.get_writer(cell / "policy.mp4", fps=5) as writer:
-        for shade in range(5):
-            writer.append_data(np.full((64, 64, 3), 40 * shade, np.uint8))  # type: ignore[attr-defined]
+    for video in videos:
+        with imageio.get_writer(cell / f"{video}.mp4", fps=5) as writer:
+            for shade in range(5):
+                writer.append_data(np.full((64, 64, 3), 40 * shade, np.uint8))  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")
@@ -219,13 +221,58 @@ def test_names_are_text_only(tmp_path: Path) -> None:
 
 
 def test_which_media(tmp_path: Path) -> None:
-    """Of the first seed by default; all or none on demand."""
+    """Of each arm the first seed that has some, which is named; all or none on demand; older cells' videos too."""
     write_curves(tmp_path / "curves")
-    for seed in (0, 1):
-        write_media(tmp_path / "curves" / TASK / "sac_ae" / f"seed{seed}")
+    of_task = tmp_path / "curves" / TASK
+    write_media(of_task / "sac_ae" / "seed1")
+    write_media(of_task / "cure_sac_ae" / "seed0")
+    write_media(of_task / "cure_sac_ae" / "seed1", videos=("policy",))
     (experiment,) = read_results(tmp_path)
-    counts = {which: report.media_html(experiment, which).count("<video") for which in ("none", "first", "all")}
-    assert counts == {"none": 0, "first": 1, "all": 2}
+    pages = {which: report.media_html(experiment, which) for which in ("none", "first", "all")}
+    assert {which: page.count("<video") for which, page in pages.items()} == {"none": 0, "first": 4, "all": 5}
+    named = {which: re.findall("<summary>(.*?)</summary>", page) for which, page in pages.items()}
+    first = [f"{TASK}, sac_ae, seed 1", f"{TASK}, cure_sac_ae, seed 0"]
+    assert named == {"none": [], "first": first, "all": [*first, f"{TASK}, cure_sac_ae, seed 1"]}
+    videos = re.findall("<video.*?<figcaption>(.*?):", pages["first"])
+    assert videos == ["the task policy", "the curious policy"] * 2
+
+
+def test_srl_errors_of_both_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line for each arm and policy that was measured, with that policy's numbers; the legend tells them apart."""
+    write_grid(tmp_path / "curves", seeds=1)
+    write_cell(tmp_path / "curves", TASK, "sac_ae", 0, curve(0, 50, 100))
+    write_cell(tmp_path / "curves", TASK, "cure_sac_ae", 0, curve(0, 50, 100), arguments=CURE, curious=True)
+    (experiment,) = read_results(tmp_path)
+    drawn: list[Any] = []
+    legends: list[list[str]] = []
+    draw, legend = plots.srl_error_curves, plots.Figure.legend
+    monkeypatch.setattr(plots, "srl_error_curves", lambda *args: (drawn.append(args[1]), draw(*args)))
+    monkeypatch.setattr(
+        plots.Figure,
+        "legend",
+        lambda self, handles, labels, **how: (legends.append(list(labels)), legend(self, handles, labels, **how)),
+    )
+    colors = plots.arm_colors(experiment.methods, "sac_ae")
+    figures = {figure.name: figure for figure in report.curve_figures(experiment, colors)}
+    assert list(figures) == ["learning_curves", "srl_loss", "srl_error"]
+    means = {key: values.mean() for key, (_, values) in drawn[0][TASK].items()}
+    # What `write_cell` writes for each policy
+    task = {(arm, "task"): pytest.approx(1e-3) for arm in ("sac_ae", "cure_sac_ae")}
+    assert means == {**task, ("cure_sac_ae", "curious"): pytest.approx(2e-3)}
+    assert legends[-1] == ["sac_ae", "cure_sac_ae", "task policy", "curious policy"]
+    assert legends[0] == ["sac_ae", "cure_sac_ae"], "returns are the task policy's alone"
+    assert "deterministic" in figures["learning_curves"].caption and "deterministic" in figures["srl_error"].caption
+
+
+def test_line_styles_tell_policies_apart(tmp_path: Path) -> None:
+    """The same numbers take less ink, and the same colour, as those of the curious policy: a dashed line."""
+    line = np.linspace(0, 100, 5), np.full((1, 5), 0.5)
+    ink = {}
+    for actor in ("task", "curious"):
+        plots.srl_error_curves(tmp_path / "lines.png", {TASK: {("arm", actor): line}}, {"arm": "#d62728"}, "error")
+        pixels = np.asarray(Image.open(tmp_path / "lines.png").convert("RGB")).astype(int)
+        ink[actor] = (np.abs(pixels - (0xD6, 0x27, 0x28)).max(axis=2) < 60).sum()
+    assert 0.3 * ink["task"] < ink["curious"] < 0.9 * ink["task"]
 
 
 def test_errors_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -284,7 +331,7 @@ def test_nothing_is_broken_in_a_browser(chromium: str, results: Path, tmp_path: 
     sizes, console = look(chromium, page, tmp_path)
     assert console == []
     assert len(sizes["images"]) == page.count("<img ") > 8 and min(sizes["images"]) > 0
-    assert sizes["videos"] == [64]
+    assert sizes["videos"] == [64, 64]
 
 
 def test_the_browser_check_finds_what_is_broken(chromium: str, results: Path, tmp_path: Path) -> None:

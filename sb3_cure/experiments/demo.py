@@ -144,13 +144,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for actor in errors
     ]
     write_csv(options.out / "srl_error.csv", list(table[0]), table)
-    plots.srl_error_bars(options.out / "srl_error.png", errors, "SRL error that each policy sees")
+    plots.srl_error_bars(
+        options.out / "srl_error.png", errors, "SRL error that each policy sees\n(deterministic actions)"
+    )
     strip = reconstruct_with_probe(model, env.get_wrapper_attr("frame_stack"))
     if strip is not None:
         plots.reconstruction_grid(options.out / "reconstructions.png", strip, "What the latents know of the image")
     episode = next(run_episodes(model, eval_env, 1, "task", seed=30_000, render=True))
     fps = round(eval_env.metadata["render_fps"])
-    write_video(options.out / "policy.mp4", episode, fps, action_repeat)
+    write_video(options.out / "policy.mp4", episode, fps, action_repeat, "task policy, deterministic actions")
     model.save(options.out / "model.zip")
     summary = {
         "task": f"{DOMAIN}-{TASK}",

@@ -1,11 +1,10 @@
-"""Pictures and video of a finished cell."""
+"""Pictures and videos of a cell."""
 
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.callbacks import ReconstructionCallback
@@ -14,81 +13,110 @@ from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, trained_actors
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.grid import Cell
-from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.experiments.video import write_video
+from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
 
+#: Films and reconstructed observations are the same in all cells of a task, as far as the policies let them
 FILM_SEED = 30_000
 FRAMES = 16
 ROWS_OF_RECONSTRUCTIONS = 8
-PROBE_UPDATES = 500
+#: Reconstructed observations, and how many random agent steps lie between two of them
+RECONSTRUCTED, STEPS_APART = 8, 50
 
 
-def watch_reconstructions(cell: Cell, action_repeat: int, folder: Path) -> list[BaseCallback]:
+def watch_reconstructions(cell: Cell, action_repeat: int, folder: Path) -> list[ReconstructionCallback]:
     """
     :param cell: A cell that is about to be trained
     :param action_repeat: Environment steps per agent step
-    :param folder: Where to write ``reconstructions.png``, one row per time
+    :param folder: Where to write ``reconstructions.png``, one row per time, of the same observations in all cells of
+        the task (that have the same ``env_kwargs``)
     :return: Callbacks that draw it during training
     """
+    if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
+        return []
     every = max(cell.budget // action_repeat // ROWS_OF_RECONSTRUCTIONS, 1)
-    learns_from_images = cell.arguments["policy"] == "CnnPolicy" and cell.arguments.get("srl", "rae") is not None
-    return [ReconstructionCallback(folder, every)] if learns_from_images else []
+    return [ReconstructionCallback(folder, every, _random_observations(cell))]
+
+
+def _random_observations(cell: Cell) -> np.ndarray:
+    """Of episodes with random actions, [n, *shape]."""
+    env = gym.make(cell.task, **cell.env_kwargs)
+    env.action_space.seed(FILM_SEED)
+    observation, _ = env.reset(seed=FILM_SEED)
+    chosen = []
+    for step in range(1, RECONSTRUCTED * STEPS_APART + 1):
+        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            observation, _ = env.reset()
+        if step % STEPS_APART == 0:
+            chosen.append(observation)
+    env.close()
+    return np.stack(chosen)
 
 
 def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
-    """Write ``policy.mp4``, ``reconstructions.png``, ``uncomfortable.png`` and ``curiosity_map.png``.
+    """Write ``<actor>_policy.mp4``, ``reconstructions.png``, ``uncomfortable.png`` and ``curiosity_map.png``.
 
-    Each is left out where there is nothing to show: no frames to film, no images or head to reconstruct with, no SRL
-    error, no true state, or no policy that was trained.
+    Each is left out where there is nothing to show: no policy that was trained or no frames to film, no images or head
+    to reconstruct with, no SRL error, no true state. Videos have deterministic actions; the map is that of the visits
+    of ``measure_visits``, with sampled ones.
 
     :param model: The cell's model, with its replay buffer
     :param cell: The cell
     :param folder: Where to write
     """
     name = f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
-    head = getattr(model.policy, "srl", None)
-    actors = trained_actors(model) if cell.budget > 0 else []
-    probe = gym.make(cell.task, **cell.env_kwargs)
-    can_film, has_physics = "rgb_array" in probe.metadata.get("render_modes", []), probe.has_wrapper_attr("physics")
-    frame_stack = probe.get_wrapper_attr("frame_stack") if probe.has_wrapper_attr("frame_stack") else 1
-    repeat = probe.get_wrapper_attr("action_repeat") if probe.has_wrapper_attr("action_repeat") else 1
-    if actors and has_physics:
-        _draw_map(model, probe, actors, folder / "curiosity_map.png", name)
-    probe.close()
-    if actors and can_film:
+    env = gym.make(cell.task, **cell.env_kwargs)
+    can_film = "rgb_array" in env.metadata.get("render_modes", [])
+    frame_stack = env.get_wrapper_attr("frame_stack") if env.has_wrapper_attr("frame_stack") else 1
+    repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
+    if env.has_wrapper_attr("physics"):
+        visits = _measured_visits(model, cell, env, folder)
+        title = f"Where policies go with sampled actions: {name}"
+        names, units = physics_state_names(env), physics_state_units(env)
+        plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
+    env.close()
+    if cell.budget > 0 and can_film:
         env = gym.make(cell.task, **{**cell.env_kwargs, "render_mode": "rgb_array"})
-        episode = next(run_episodes(model, env, 1, actors[0], seed=FILM_SEED, render=True))
         fps = max(round(env.metadata.get("render_fps") or 30), 1)
-        write_video(folder / "policy.mp4", episode, fps, repeat, f"{actors[0]} policy: {name}")
+        for actor in trained_actors(model):
+            (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
+            title = f"{actor} policy, deterministic actions: {name}"
+            write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
         env.close()
-    if head is not None and is_image_space(model.observation_space) and model.replay_buffer.size() > 0:  # type: ignore[union-attr]
-        is_drawn = (folder / "reconstructions.png").exists()  # by `watch_reconstructions`
-        strip = None if is_drawn else reconstruct_with_probe(model, frame_stack, PROBE_UPDATES)
-        if strip is not None:
-            title = f"What the latents know of the image: {name}"
-            plots.reconstruction_grid(folder / "reconstructions.png", strip, title)
-        found = most_uncomfortable(model, FRAMES)
-        with th.no_grad():
-            latents = model.policy.encode(th.as_tensor(found.observations, device=model.device))
-            drawn = head.reconstruct(latents)
-        plots.uncomfortable_frames(
-            folder / "uncomfortable.png",
-            found,
-            frame_stack,
-            f"What the agent finds uncomfortable: {name}",
-            None if drawn is None else drawn.cpu().numpy(),
-        )
+    head = getattr(model.policy, "srl", None)
+    if head is None or not is_image_space(model.observation_space) or model.replay_buffer.size() == 0:  # type: ignore[union-attr]
+        return
+    if not (folder / "reconstructions.png").exists():  # not drawn in training
+        for callback in watch_reconstructions(cell, repeat, folder):
+            callback.init_callback(model)
+            callback.num_timesteps = model.num_timesteps
+            callback.on_period()
+    found = most_uncomfortable(model, FRAMES)
+    with th.no_grad():
+        latents = model.policy.encode(th.as_tensor(found.observations, device=model.device))
+        drawn = head.reconstruct(latents)
+    plots.uncomfortable_frames(
+        folder / "uncomfortable.png",
+        found,
+        frame_stack,
+        f"What the agent finds uncomfortable: {name}",
+        None if drawn is None else drawn.cpu().numpy(),
+    )
 
 
-def _draw_map(model: CuReSAC, env: gym.Env, actors: list[str], path: Path, name: str, n_episodes: int = 5) -> None:
+def _measured_visits(
+    model: CuReSAC, cell: Cell, env: gym.Env, folder: Path
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """States and SRL errors of ``measure_visits`` by policy: in cells of kind "visitation" they lie in a file."""
+    actors = visiting_actors(model, cell)
+    if cell.kind == "visitation":
+        with np.load(folder / "visits.npz") as kept:
+            return {actor: (kept[f"{actor}_states"], kept[f"{actor}_errors"]) for actor in actors}
     visits = {}
-    with evenly_measured(model, env, FILM_SEED - 1):
+    with evenly_measured(model, env, VISIT_SEED - 1):
         for actor in actors:
-            seen = [
-                (each.states, each.srl_errors)
-                for each in run_episodes(model, env, n_episodes, actor, seed=FILM_SEED, states=True)
-            ]
-            states, errors = zip(*seen, strict=True)
+            episodes = roll_out(model, cell, env, actor, states=True)
+            states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
             visits[actor] = np.concatenate(states), np.concatenate(errors)
-    title = f"Where policies go: {name}"
-    plots.curiosity_map(path, visits, physics_state_names(env), title, units=physics_state_units(env))
+    return visits

@@ -2,24 +2,28 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
 from sb3_cure.evaluation import Uncomfortable, binned_errors
 
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
+#: Where colours are taken by arms
+LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """Return of both policies over environment steps, with the random policy as a line.
+    """Return of both policies (deterministic actions) over environment steps, with the random policy as a line.
 
     :param path: File to write
     :param rows: Evaluations with ``environment_steps``, ``task_return`` and ``curious_return``
@@ -31,7 +35,8 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     for actor in ("task", "curious"):
         axes.plot(steps, [row[f"{actor}_return"] for row in rows], "o-", color=COLORS[actor], label=f"{actor} policy")
     axes.axhline(random_return, color=COLORS["random"], linestyle="--", label="random policy")
-    axes.set(xlabel="environment steps", ylabel="return of an episode", title=title, ylim=(0, None))
+    axes.set(xlabel="environment steps", ylabel="return of an episode (deterministic actions)")
+    axes.set(title=title, ylim=(0, None))
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=150)
@@ -214,7 +219,7 @@ def _counts_up_to(highest: float) -> list[int]:
 def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
     """Ends of an axis: the full circle for angles, else from the least to the greatest value."""
     low, high = float(values.min()), float(values.max())
-    if unit == "rad" and -np.pi <= low and high <= np.pi:
+    if unit == "rad" and max(-low, high) <= np.float32(np.pi):
         return -np.pi, np.pi
     return (low, high) if high > low else (low - 0.5, high + 0.5)
 
@@ -292,11 +297,41 @@ def learning_curves(
     :param ylabel: What the values are
     :param logarithmic: Whether the values have a logarithmic axis
     """
+    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
+    _draw_curves(path, of_task, colors, ylabel, logarithmic)
+
+
+def srl_error_curves(
+    path: Path | IO[bytes],
+    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+) -> None:
+    """SRL error that policies meet, as ``learning_curves``: arms by colour, policies by line style.
+
+    :param path: File to write
+    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    """
+    there = {actor for policies in curves.values() for _, actor in policies}
+    _draw_curves(path, curves, colors, ylabel, logarithmic=True, actors=[each for each in LINE_STYLES if each in there])
+
+
+def _draw_curves(
+    path: Path | IO[bytes],
+    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool,
+    actors: Sequence[str] = (),
+) -> None:
+    """One panel per task, lines by arm and policy; the legend names the arms and the policies asked for."""
     figure, panels = _panels(len(curves), height=2.9)
-    for axes, (task, arms) in zip(panels, curves.items(), strict=True):
-        for arm, (steps, values) in arms.items():
+    for axes, (task, lines) in zip(panels, curves.items(), strict=True):
+        for (arm, actor), (steps, values) in lines.items():
             mean = values.mean(axis=0)
-            axes.plot(steps, mean, color=colors[arm], linewidth=1.8, label=_plain(arm))
+            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor], linewidth=1.8)
             if len(values) > 1:
                 std = values.std(axis=0, ddof=1)
                 low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
@@ -306,7 +341,10 @@ def learning_curves(
         if logarithmic:
             axes.set_yscale("log")
         _tidy(axes)
-    _shared_legend(figure, panels)
+    arms = dict.fromkeys(arm for lines in curves.values() for arm, _ in lines)
+    handles = {_plain(arm): Line2D([], [], color=colors[arm], linewidth=1.8) for arm in arms}
+    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
+    _legend(figure, handles)
     figure.savefig(path, dpi=150)
 
 
@@ -471,9 +509,13 @@ def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
 def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     """What any panel shows, once, below all of them."""
     shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if shown:
-        columns = min(len(shown), int(figure.get_figwidth() // 1.8))
-        figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, frameon=False)
+    _legend(figure, shown)
+
+
+def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
+    if handles:
+        columns = min(len(handles), int(figure.get_figwidth() // 1.8))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
 def _tidy(axes: Axes) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from PIL import Image
@@ -39,13 +39,24 @@ from sb3_cure.experiments.tables import (
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
 PAIRS_UP_TO = 5
+_FILM = "deterministic actions; below the picture the return and, with an SRL head, the SRL error so far"
 #: Optional files of a cell: caption
 MEDIA = {
-    "policy.mp4": "the policy that the caption names, with its SRL error",
-    "reconstructions.png": "reconstructions over training",
-    "uncomfortable.png": "what the agent finds uncomfortable: frames of the replay buffer with the highest SRL error",
-    "curiosity_map.png": "SRL error and visits over the true state",
+    "task_policy.mp4": f"the task policy: {_FILM}",
+    "curious_policy.mp4": f"the curious policy: {_FILM}",
+    # Of cells of former versions
+    "policy.mp4": f"the task policy (the curious one, where no task policy is trained): {_FILM}",
+    "reconstructions.png": "reconstructions over training, of the same observations of random actions in all arms (in "
+    "cells of former versions: of each agent's own replay buffer)",
+    "uncomfortable.png": "what the agent finds uncomfortable: frames of the replay buffer with the highest SRL error, "
+    "met in training with sampled actions",
+    "curiosity_map.png": "visits and SRL error over the true state, by policy: sampled actions, as in training (in "
+    "cells of former versions, whose pictures do not say so: deterministic actions)",
 }
+
+
+#: Environment steps [n] and values [seeds, n]
+Curves: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -87,24 +98,41 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
     """
     :param experiment: An experiment
     :param colors: By arm
-    :return: Return, SRL loss and SRL error of the curious policy over training, where there is anything to draw
+    :return: Return, SRL loss and SRL error of the policies over training, where there is anything to draw
     """
     columns = {
-        "return_mean": ("learning_curves", "episode return", "Return of the task policy", False),
-        "srl_loss": ("srl_loss", "SRL loss", "SRL loss in training", True),
-        "curious_srl_error": ("curious_srl_error", "SRL error", "SRL error that the curious policy meets", True),
-    }
-    for column, (name, label, caption, logarithmic) in columns.items():
-        curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
-        for task in experiment.tasks:
-            for method in experiment.methods:
-                cells = list(experiment.done(task, method).values())
-                steps, values = statistics.stack_curves(cells, column)
-                if len(steps) > 1:
-                    curves.setdefault(task, {})[method] = (steps, values)
+        "return_mean": ("learning_curves", "episode return\n(deterministic actions)", False,
+                        "Return of the task policy, which acts deterministically,"),
+        "srl_loss": ("srl_loss", "SRL loss", True, "SRL loss of the batches of training"),
+    }  # fmt: skip
+    for column, (name, label, logarithmic, caption) in columns.items():
+        curves = _stacked(experiment, column)
         if curves:
-            caption = f"{caption} over environment steps: mean over seeds ± standard deviation ({', '.join(curves)})."
-            yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
+            yield _figure(name, _of(caption, curves), plots.learning_curves, curves, colors, label, logarithmic)
+    errors: dict[str, dict[tuple[str, str], Curves]] = {}
+    for actor in ("task", "curious"):
+        for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
+            errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
+    if errors:
+        caption = "SRL error, under the agent's own head, that the task policy (solid lines) and the curious policy "
+        caption = _of(f"{caption}(dashed) meet, each acting alone and deterministically,", errors)
+        label = "SRL error\n(deterministic actions)"
+        yield _figure("srl_error", caption, plots.srl_error_curves, errors, colors, label)
+
+
+def _of(what: str, curves: Mapping[str, object]) -> str:
+    return f"{what} over environment steps: mean over seeds ± standard deviation ({', '.join(curves)})."
+
+
+def _stacked(experiment: Experiment, column: str) -> dict[str, dict[str, Curves]]:
+    """By task and arm, where there are two evaluations or more with a value in the column."""
+    curves: dict[str, dict[str, Curves]] = {}
+    for task in experiment.tasks:
+        for method in experiment.methods:
+            steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
+            if len(steps) > 1:
+                curves.setdefault(task, {})[method] = steps, values
+    return curves
 
 
 def difference_figure(
@@ -392,23 +420,25 @@ def _media_html(path: Path, caption: str) -> str:
 def media_html(experiment: Experiment, which: str) -> str:
     """
     :param experiment: An experiment
-    :param which: ``"all"`` seeds, the ``"first"`` one done of each arm, or ``"none"``
+    :param which: ``"all"`` seeds, of each arm the ``"first"`` one that has some, or ``"none"``
     :return: Pictures and videos of the cells that have some
     """
     blocks = []
     for task in experiment.tasks:
         for method in experiment.methods:
-            cells = list(experiment.done(task, method).values()) if which != "none" else []
-            for cell in cells[:1] if which == "first" else cells:
-                shown = [
-                    _media_html(cell.folder / name, MEDIA[name]) for name in MEDIA if (cell.folder / name).exists()
-                ]
-                if shown:
-                    name = escape(f"{task}, {method}, seed {cell.seed}")
-                    is_open = " open" if task == experiment.tasks[0] else ""
-                    content = f'<div class="media">{"".join(shown)}</div>'
-                    blocks.append(f"<details{is_open}><summary>{name}</summary>{content}</details>\n")
-    return f"<h3>Pictures and videos</h3>\n{''.join(blocks)}" if blocks else ""
+            cells = experiment.done(task, method).values() if which != "none" else []
+            files = [[cell.folder / name for name in MEDIA if (cell.folder / name).exists()] for cell in cells]
+            shown = [(cell, paths) for cell, paths in zip(cells, files, strict=True) if paths]
+            for cell, paths in shown[:1] if which == "first" else shown:
+                name = escape(f"{task}, {method}, seed {cell.seed}")
+                is_open = " open" if task == experiment.tasks[0] else ""
+                content = "".join(_media_html(path, MEDIA[path.name]) for path in paths)
+                media = f'<div class="media">{content}</div>'
+                blocks.append(f"<details{is_open}><summary>{name}</summary>{media}</details>\n")
+    if not blocks:
+        return ""
+    seeds = "the first seed that has some" if which == "first" else "all seeds that have some"
+    return f'<h3>Pictures and videos</h3>\n<p class="note">Of each arm: {seeds}.</p>\n{"".join(blocks)}'
 
 
 def _configs_html(experiment: Experiment) -> str:
@@ -561,7 +591,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--thresholds", type=_thresholds, default=THRESHOLDS, help="returns whose steps are told (default: 250,500,750)"
     )
     parser.add_argument(
-        "--media", choices=("first", "all", "none"), default="first", help="videos and pictures of which seeds"
+        "--media",
+        choices=("first", "all", "none"),
+        default="first",
+        help="videos and pictures of which seeds (default: of each arm the first that has some)",
     )
     options = parser.parse_args(argv)
     try:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import platform
 import re
 import sys
@@ -11,7 +12,7 @@ import traceback
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from rich.console import Console
 from rich.live import Live
@@ -25,6 +26,8 @@ from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head
 from sb3_cure.values import check_folder, is_integer, is_number
 
 ENGINES = ("local", "ray")
+#: In the log of a job, between two lines about the whole
+SUMMARY_SECONDS = 300.0
 #: From what is under way or left, what can begin besides
 Ready: TypeAlias = Callable[[Iterable[Unit]], Sequence[Unit]]
 
@@ -238,12 +241,15 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
     stopped = threading.Event()
 
     def refresh(show: Callable[[Table], object]) -> None:
-        told = _finished(list_units(), results)
+        told, told_at = _finished(list_units(), results), time.monotonic()
         while not stopped.wait(1.0):
             if watches:
                 show(progress_table(list_units(), results))
-            else:  # in the log of a job
-                told = _tell_finished(list_units(), results, told)
+                continue
+            told = _tell_finished(list_units(), results, told)
+            if time.monotonic() - told_at >= SUMMARY_SECONDS:
+                told_at = time.monotonic()
+                print(_Progress(list_units(), results).line(), flush=True)
 
     with _shown(console, progress_table(list_units(), results)) as show:
         thread = threading.Thread(target=refresh, args=(show,), daemon=True)
@@ -295,32 +301,71 @@ def _shown(console: Console, table: Table) -> Iterator[Callable[[Table], object]
             console.line()  # which rich ends a table with on terminals only
 
 
+class _UnitProgress(NamedTuple):
+    unit: Unit
+    state: str
+    #: Environment steps, or updates of a common head
+    done: int
+    total: int
+    #: Of these, per second
+    rate: float
+    #: Return
+    best: float | None
+
+
+class _Progress:
+    """How far all units are, as their files tell.
+
+    :param units: The cells of a grid, and its common heads
+    :param results: Folder of all results
+    """
+
+    def __init__(self, units: Sequence[Unit], results: Path):
+        self.units = units
+        self.rows = [_unit_progress(unit, results) for unit in units]
+
+    def summary(self) -> str:
+        """What is done and under way, how fast it goes, when it will be finished."""
+        done = {row.unit.folder for row in self.rows if row.state == "done"}
+        running = sum(row.state == "running" for row in self.rows)
+        told = f"{_count(self.units, done)} done" + (f", {running} running" if running else "")
+        left = [row for row in self.rows if row.state != "done" and isinstance(row.unit, Cell)]
+        speed = sum(row.rate for row in left if row.state == "running")
+        if not speed:
+            return told
+        seconds = sum(row.total - row.done for row in left) / speed
+        return f"{told}, {speed:.1f} environment steps/s, about {_duration(seconds)} left"
+
+    def line(self) -> str:
+        """The summary, with the best return that a table would show."""
+        best = max(((row.best, str(row.unit.folder)) for row in self.rows if row.best is not None), default=None)
+        return self.summary() + ("" if best is None else f", best return {best[0]:.0f} ({best[1]})")
+
+
+def _unit_progress(unit: Unit, results: Path) -> _UnitProgress:
+    state, progress = read_progress(unit, results)
+    if isinstance(unit, CommonHead):
+        total, done = unit.updates, progress.get("updates", 0)
+    else:
+        total = unit.budget + (unit.pretrain.budget if unit.pretrain else 0)
+        done = progress.get("environment_steps", 0)
+        if unit.pretrain and progress.get("phase") == "train":
+            done += unit.pretrain.budget
+    rate = done / progress["seconds"] if progress.get("seconds") else 0.0
+    return _UnitProgress(unit, state, done, total, rate, progress.get("best_return"))
+
+
 def progress_table(units: Sequence[Unit], results: Path) -> Table:
     """
     :param units: The cells of a grid, and its common heads
     :param results: Folder of all results
     :return: What is done, how fast it goes, when it will be finished; one line where nothing is under way
     """
+    progress = _Progress(units, results)
     table = Table("task", "method", "seed", "state", "environment steps", "steps/s", "left", "best return")
-    finished, left, speed = set(), 0.0, 0.0
-    for unit in units:
-        state, progress = read_progress(unit, results)
-        if state == "done":
-            finished.add(unit.folder)
-        if isinstance(unit, CommonHead):
-            total, done, what = unit.updates, progress.get("updates", 0), " updates"
-        else:
-            what = ""
-            total = unit.budget + (unit.pretrain.budget if unit.pretrain else 0)
-            done = progress.get("environment_steps", 0)
-            if unit.pretrain and progress.get("phase") == "train":
-                done += unit.pretrain.budget
-        rate = done / progress["seconds"] if progress.get("seconds") else 0.0
-        if state != "done" and isinstance(unit, Cell):
-            left += total - done
-            speed += rate if state == "running" else 0.0
+    for unit, state, done, total, rate, best in progress.rows:
         if state in ("running", "interrupted", "failed"):
-            best = progress.get("best_return")
+            what = " updates" if isinstance(unit, CommonHead) else ""
             table.add_row(
                 *(unit.folder.parts[1], unit.method, str(unit.seed), state, f"{done:,} of {total:,}{what}"),
                 *(
@@ -329,13 +374,11 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
                     "" if best is None else f"{best:.0f}",
                 ),
             )
-    pace = f", {speed:.1f} environment steps/s, about {_duration(left / speed)} left" if speed else ""
-    summary = f"{_count(units, finished)} done{pace}"
     if not table.row_count:
         table = Table.grid()
-        table.add_row(summary)
+        table.add_row(progress.summary())
     else:
-        table.caption = summary
+        table.caption = progress.summary()
     return table
 
 
@@ -427,9 +470,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
         if options.dry_run:
-            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
-            for unit in units:
-                print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
+            _list_units([*grid.cells, *common_heads(grid, options.out, grid.cells)], options.out)
             return 0
         of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
         given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
@@ -456,6 +497,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for sentence in _failures(failed, options.out):
         print(sentence)
     return 1 if failed else 0
+
+
+def _list_units(units: Iterable[Unit], results: Path) -> None:
+    try:
+        for unit in units:
+            print(f"{unit.folder}: {read_progress(unit, results)[0]}")
+        sys.stdout.flush()
+    except BrokenPipeError:  # such as `| head`, which has read enough
+        # Else Python would write the rest when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _failures(failed: Iterable[Unit], results: Path) -> Iterator[str]:

@@ -1,5 +1,7 @@
 """Videos of a policy with its SRL error drawn in."""
 
+import functools
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +23,7 @@ def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, 
     :param episode: Episode with ``frames`` (rendered with ``render=True``); without ``srl_errors`` none are drawn
     :param fps: Pictures per second, one per agent step
     :param action_repeat: Environment steps per agent step, for the caption
-    :param title: What is seen, put before the caption
+    :param title: What is seen, put before the caption; wrapped where it is wider than the picture
     """
     # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
     with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
@@ -41,28 +43,29 @@ def annotated_frames(episode: Episode, action_repeat: int = 1, title: str = "") 
     top = float(episode.srl_errors.max()) if len(episode.srl_errors) else 0.0
     for step, frame in enumerate(episode.frames):
         caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
-        lines = [title, caption] if title else [caption]
         errors = episode.srl_errors[: step + 1]
-        yield _with_panel(frame, lines, errors, len(episode.frames), top)
+        yield _with_panel(frame, title, caption, errors, len(episode.frames), top)
 
 
-def _with_panel(frame: np.ndarray, lines: list[str], errors: np.ndarray, length: int, top: float) -> np.ndarray:
+def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray, length: int, top: float) -> np.ndarray:
     """The frame above a panel with text and, if there are errors, the newest one as a number and all as a curve."""
     factor = -(-MIN_WIDTH // frame.shape[1])
     frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
     height, width = frame.shape[:2]
     unit = width // 64  # sizes follow the picture's
-    font = ImageFont.load_default(3 * unit)
     line_height, curve_height = 4 * unit, 10 * unit if len(errors) else 0
+    # Only the title may be wrapped: it stays as it is, and all pictures have to have the same number of lines.
+    lines = [*_wrapped(title, 3 * unit, width - 2 * unit), caption]
     if len(errors):
-        lines = [*lines, f"SRL error {errors[-1]:.5f} (highest {top:.5f})"]
+        lines.append(f"SRL error {errors[-1]:.5f} (highest {top:.5f})")
     size = (width + width % 2, height + line_height * len(lines) + curve_height + 2 * unit)
     picture = Image.new("RGB", (size[0], size[1] + size[1] % 2), "white")
     picture.paste(Image.fromarray(frame))
     draw = ImageDraw.Draw(picture)
     for index, line in enumerate(lines):
         color = RED if len(errors) and line is lines[-1] else "black"
-        draw.text((unit, height + index * line_height + unit // 2), line, fill=color, font=font)
+        place = (unit, height + index * line_height + unit // 2)
+        draw.text(place, line, fill=color, font=_font(_fitting_size(line, 3 * unit, width - 2 * unit)))
     if len(errors):
         left, right, bottom = unit, width - unit, picture.height - unit
         draw.line([(left, bottom), (right, bottom)], fill=GREY)
@@ -74,3 +77,24 @@ def _with_panel(frame: np.ndarray, lines: list[str], errors: np.ndarray, length:
         x, y = points[-1]
         draw.ellipse((x - unit / 2, y - unit / 2, x + unit / 2, y + unit / 2), fill=RED)
     return np.asarray(picture)
+
+
+#: By size; loading one takes longer than drawing a line
+_font = functools.cache(ImageFont.load_default)
+
+
+@functools.cache
+def _wrapped(text: str, size: int, width: int) -> list[str]:
+    """As few lines as fit into a width; words are broken only where one alone is wider."""
+    for length in range(len(text), 1, -1):
+        lines = textwrap.wrap(text, length, break_on_hyphens=False)
+        if all(_font(size).getlength(line) <= width for line in lines):
+            return lines
+    return [text] if text else []
+
+
+def _fitting_size(line: str, size: int, width: int) -> int:
+    """The size, or as much smaller as a line with long numbers asks for."""
+    while size > 1 and _font(size).getlength(line) > width:
+        size -= 1
+    return size
