@@ -248,7 +248,7 @@ def _visitation_headlines(
     for task in experiment.tasks:
         for method in experiment.methods:
             key = (task, method, "curious")
-            rows = [
+            rows: list[tuple[Any, str]] = [
                 (row, "as many cells of the true state space")
                 for row in coverage
                 if (row.task, row.method, row.actor) == key

@@ -453,7 +453,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=_seed_choice, help="how many (5), or which (0,3,4; one alone: 3,)")
     parser.add_argument("--tasks", type=_names, help="some of the grid's tasks: cartpole-swingup,finger-spin")
     parser.add_argument("--methods", type=_names, help="some of the grid's methods")
-    parser.add_argument("--budget", type=_steps, help="environment steps of training, for example 100k")
+    parser.add_argument(
+        "--budget",
+        type=_steps,
+        help="environment steps of training, for example 100k; those of pretraining in proportion",
+    )
     parser.add_argument("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     parser.add_argument("--address", help="of a Ray cluster (auto: the one this machine is part of)")
     parser.add_argument("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")

@@ -442,7 +442,8 @@ def conditions_table(experiment: Experiment) -> Table:
         rows.setdefault(key, []).append(cell)
         commits.setdefault((cell.task, cell.seed), set()).add(conditions[3])
     shown = []
-    for (task, method, steps, pretraining, *conditions), cells in rows.items():
+    for alike, cells in rows.items():
+        task, method, steps, pretraining, *conditions = alike
         seeds = ", ".join(str(cell.seed) for cell in cells)
         times = ", ".join(_duration(cell.run.get("seconds")) for cell in cells)
         shown.append([task, method, seeds, steps, pretraining, times, *conditions])
@@ -459,7 +460,7 @@ def _letters(index: int) -> str:
 
 
 def _steps(cell: statistics.CellResult) -> str:
-    steps = cell.evaluations.get("environment_steps", ())
+    steps, _ = cell.curve("environment_steps")
     return number_text(float(steps[-1])) if len(steps) else NONE
 
 
