@@ -205,11 +205,11 @@ def test_names_are_text_only(tmp_path: Path) -> None:
     run = {"versions": {HOSTILE: HOSTILE}, "machine": HOSTILE, "commit": [HOSTILE], "seconds": "x"}
     (folder / TASK / arm / "seed0" / "run.json").write_text(json.dumps(run))
     (folder / TASK / arm / "seed0" / "reconstructions.png").write_bytes(b"no picture")
-    (folder / TASK / arm / "seed0" / "policy.mp4").write_bytes(b"no video")
+    (folder / TASK / arm / "seed0" / "task_policy.mp4").write_bytes(b"no video")
     report.write_report(folder, tmp_path / "out" / "page.html")
     page = (tmp_path / "out" / "page.html").read_text()
     assert "<img src=x" not in page and html.escape(HOSTILE) in page
-    assert "reconstructions.png cannot be shown" in page and "policy.mp4 cannot be shown" in page
+    assert "reconstructions.png cannot be shown" in page and "task_policy.mp4 cannot be shown" in page
     for path in (folder / "summary.md", folder / "table.md"):
         text = path.read_text()
         assert "<" not in text and not re.search(r"(?<!\\)\]\(b\)", text)
@@ -221,12 +221,12 @@ def test_names_are_text_only(tmp_path: Path) -> None:
 
 
 def test_which_media(tmp_path: Path) -> None:
-    """Of each arm the first seed that has some, which is named; all or none on demand; older cells' videos too."""
+    """Of each arm the first seed that has some, which is named; all or none on demand."""
     write_curves(tmp_path / "curves")
     of_task = tmp_path / "curves" / TASK
     write_media(of_task / "sac_ae" / "seed1")
     write_media(of_task / "cure_sac_ae" / "seed0")
-    write_media(of_task / "cure_sac_ae" / "seed1", videos=("policy",))
+    write_media(of_task / "cure_sac_ae" / "seed1", videos=("curious_policy",))
     (experiment,) = read_results(tmp_path)
     pages = {which: report.media_html(experiment, which) for which in ("none", "first", "all")}
     assert {which: page.count("<video") for which, page in pages.items()} == {"none": 0, "first": 4, "all": 5}

@@ -44,14 +44,11 @@ _FILM = "deterministic actions; below the picture the return and, with an SRL he
 MEDIA = {
     "task_policy.mp4": f"the task policy: {_FILM}",
     "curious_policy.mp4": f"the curious policy: {_FILM}",
-    # Of cells of former versions
-    "policy.mp4": f"the task policy (the curious one, where no task policy is trained): {_FILM}",
     "reconstructions.png": "reconstructions over training, of the same observations of random actions in all arms (in "
     "cells of former versions: of each agent's own replay buffer)",
     "uncomfortable.png": "what the agent finds uncomfortable: frames of the replay buffer with the highest SRL error, "
     "met in training with sampled actions",
-    "curiosity_map.png": "visits and SRL error over the true state, by policy: sampled actions, as in training (in "
-    "cells of former versions, whose pictures do not say so: deterministic actions)",
+    "curiosity_map.png": "visits and SRL error over the true state, by policy: sampled actions, as in training",
 }
 
 
