@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl chromium demo test test-oldest check bench notebooks clean help
+.PHONY: .venv gl screens demo test test-oldest check bench notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -63,9 +63,9 @@ gl: .venv/.installed
 		$(RUN) sb3_cure.envs.rendering
 	fi
 
-# A browser that opens the report as its readers do; without it those tests are skipped.
-chromium:
-	@if ! command -v chromium >/dev/null; then $(call apt_install,chromium); fi
+# A browser that opens the report as its readers do, and a display for windows; without them those tests are skipped.
+screens:
+	@if ! { command -v chromium && command -v Xvfb; } >/dev/null; then $(call apt_install,chromium xvfb); fi
 
 demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten minutes on two cores)
 	$(RUN) sb3_cure.experiments.demo --out demo

@@ -303,7 +303,7 @@ def chromium() -> str:
     found = shutil.which("chromium") or shutil.which("chromium-browser")
     if found is None:
         reason = "chromium is not installed (Debian: apt-get install chromium)"
-        if os.environ.get("SB3_CURE_REQUIRE_CHROMIUM") == "1":
+        if os.environ.get("SB3_CURE_REQUIRE_SCREENS") == "1":
             pytest.fail(reason)
         pytest.skip(reason)
     return found

@@ -30,8 +30,9 @@ def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if there is no display and ``MUJOCO_GL`` is not set.
 
-    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set. No rendering context is
-    made, so a process that has only called this can still be forked.
+    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set, and SDL's windows to do
+    without OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is. No rendering context is made, so a process that has only
+    called this can still be forked.
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
@@ -39,6 +40,9 @@ def load_gl() -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    # pygame, which opens windows for render_mode="human", would draw with OpenGL, too: that ends the process (EGL), or
+    # the window shows the first frame for ever (GLFW).
+    os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
     importlib.import_module("dm_control")  # outside of the try: its absence is no matter of OpenGL
     try:
         backend = importlib.import_module("dm_control._render").BACKEND
