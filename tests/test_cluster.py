@@ -21,9 +21,7 @@ def pinned_ray() -> str:
 
 
 def ray_job() -> dict:
-    volume, job = yaml.safe_load_all((CLUSTER / "kubernetes.yml").read_text())
-    assert (volume["kind"], job["kind"]) == ("PersistentVolumeClaim", "RayJob")
-    return job
+    return yaml.safe_load((CLUSTER / "kubernetes.yml").read_text())
 
 
 def test_image_and_manifest_have_the_ray_that_is_tested() -> None:
@@ -34,7 +32,7 @@ def test_image_and_manifest_have_the_ray_that_is_tested() -> None:
 
 def test_every_pod_mounts_the_claimed_volume_where_the_grid_writes() -> None:
     """A worker without the volume would write its cells where nobody finds them."""
-    volume = next(yaml.safe_load_all((CLUSTER / "kubernetes.yml").read_text()))
+    volume = yaml.safe_load((CLUSTER / "volume.yml").read_text())
     cluster = ray_job()["spec"]["rayClusterSpec"]
     out = Path(re.search(r"--out (\S+)", ray_job()["spec"]["entrypoint"])[1])
     for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
@@ -85,16 +83,17 @@ def test_slurm_script_starts_ray_on_all_nodes_and_passes_the_grid_on(tmp_path: P
     """With stand-ins for SLURM's and Ray's commands: one head, the others join it by one token; no Ray, no waiting."""
     commands = {
         "scontrol": "printf 'node1\\nnode2\\n'",
-        "srun": 'for id in 0 1; do SLURM_PROCID=$id "$@"; done; [ -z "$RAY_FAILS" ] && sleep 30',
+        "srun": 'echo "$1 $2"; shift 2; for id in 0 1; do SLURM_PROCID=$id "$@"; done; [ -z "$RAY_FAILS" ] && /bin/sleep 5',
         # `ray status` answers when all nodes have begun.
         "ray": '[ -z "$RAY_FAILS" ] || exit 1; [ "$1" = status ] && exec test -e started1; touch started$SLURM_PROCID; '
         'echo "$@ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN}"',
+        "sleep": "exec /bin/sleep 0.1",
         "sb3-cure": 'echo "$@ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN}"',
     }
     for name, script in commands.items():
         (tmp_path / name).write_text(f"#!/bin/bash\n{script}\n")
         (tmp_path / name).chmod(0o755)
-    job = {"SLURM_JOB_NODELIST": "node[1-2]", "SLURM_CPUS_PER_TASK": "16", "SLURM_JOB_ID": "7"}
+    job = {"SLURM_JOB_NODELIST": "node[1-2]", "SLURM_CPUS_ON_NODE": "16", "SLURM_JOB_ID": "7"}
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
 
     def submit(**more: str) -> subprocess.CompletedProcess:
@@ -106,8 +105,9 @@ def test_slurm_script_starts_ray_on_all_nodes_and_passes_the_grid_on(tmp_path: P
     done = submit()
     assert done.stdout == "experiment grid.yml --out /shared/my results --engine ray --address node1:6379 token 64\n"
     assert (tmp_path / "ray-7.log").read_text().splitlines() == [
+        "--cpus-per-task=16 --kill-on-bad-exit=1",
         "start --head --port=6379 --num-cpus 16 --block token 64",
         "start --address=node1:6379 --num-cpus 16 --block token 64",
     ]
-    failed = submit(RAY_FAILS="1")
+    failed = submit(RAY_FAILS="yes")
     assert (failed.returncode, failed.stdout) == (1, "Ray did not start: see ray-7.log\n")
