@@ -273,6 +273,8 @@ class CuReSAC(SAC):
         self._mixer: CuriousMixer | None = None
         # Who collects while pretraining ("curious" or "random"); None otherwise.
         self._collector: str | None = None
+        # Whether `learn` comes right after `pretrain`, and begins as without it
+        self._is_pretrained = False
         self._warmed_up = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
@@ -854,6 +856,8 @@ class CuReSAC(SAC):
             return self
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
+        if self._is_pretrained:
+            self._restart_random_streams()
         self._learn("learn", total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         return self
 
@@ -887,7 +891,8 @@ class CuReSAC(SAC):
         Trains no task networks. Keeps encoder, target encoder, head and their optimisers (and the curious agent, if
         curiosity is on), empties the replay buffer and starts counting anew: the ``learn`` that follows is vanilla
         unless curiosity is on. Of a model with a seed it also begins with the environments and random numbers that it
-        would begin with without pretraining, so that both have the same random warm-up.
+        would begin with without pretraining, so that both have the same random warm-up (but for what ``VecNormalize``
+        has seen). So pretraining with ``"random"`` begins with the same actions as that warm-up.
 
         :param total_timesteps: Agent steps
         :param collector: Who collects: ``"curious"``, a policy trained by the SRL error alone (built for the purpose
@@ -951,12 +956,14 @@ class CuReSAC(SAC):
         self.num_timesteps = self._n_updates = 0
         self._warmed_up = False
         self._last_obs = None
-        self._restart_random_streams()
+        self._is_pretrained = True
 
     def _restart_random_streams(self) -> None:
         """All of them are to be where they are when a model of this seed has been made."""
+        self._is_pretrained = False
         if self.seed is not None:
             self.set_random_seed(self.seed)
+            self._mixer = CuriousMixer(self.curiosity_prob, self.seed)
             # Draws the initial weights once more; nothing else of it is needed.
             arguments = {**self.policy_kwargs, **self._policy_blueprint()}
             self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **arguments)

@@ -56,6 +56,7 @@ def write_cell(
     done: bool = True,
     visitation: Sequence[Sequence[Any]] = (),
     states: Mapping[str, np.ndarray] | None = None,
+    state_units: Sequence[str] | None = None,
     curious: bool = False,
     **config: Any,
 ) -> Path:
@@ -71,6 +72,7 @@ def write_cell(
     :param done: Whether it is marked as finished
     :param visitation: Rows of ``visitation.csv``: actor, head, episode, min, mean, max, return
     :param states: True states by actor
+    :param state_units: Units of their coordinates
     :param curious: Whether the columns of a curious actor are filled
     :param config: Further keys of ``config.json``
     :return: Its folder
@@ -101,7 +103,8 @@ def write_cell(
         arrays = {f"{actor}_states": values for actor, values in states.items()}
         errors = {f"{actor}_errors": np.zeros(len(values)) for actor, values in states.items()}
         names = np.array([f"x{index}" for index in range(next(iter(states.values())).shape[1])])
-        np.savez(cell / "visits.npz", **arrays, **errors, state_names=names)
+        units = np.array(["m"] * len(names) if state_units is None else state_units)
+        np.savez(cell / "visits.npz", **arrays, **errors, state_names=names, state_units=units)
     if done:
         (cell / "DONE").touch()
     return cell

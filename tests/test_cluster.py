@@ -83,7 +83,8 @@ def test_slurm_script_starts_ray_on_all_nodes_and_passes_the_grid_on(tmp_path: P
     """With stand-ins for SLURM's and Ray's commands: one head, the others join it by one token; no Ray, no waiting."""
     commands = {
         "scontrol": "printf 'node1\\nnode2\\n'",
-        "srun": 'echo "$1 $2"; shift 2; for id in 0 1; do SLURM_PROCID=$id "$@"; done; [ -z "$RAY_FAILS" ] && /bin/sleep 5',
+        "srun": 'echo "$1 $2"; shift 2; for id in 0 1; do SLURM_PROCID=$id "$@"; done; '
+        '[ -z "$RAY_FAILS" ] && /bin/sleep 5',
         # `ray status` answers when all nodes have begun.
         "ray": '[ -z "$RAY_FAILS" ] || exit 1; [ "$1" = status ] && exec test -e started1; touch started$SLURM_PROCID; '
         'echo "$@ $RAY_AUTH_MODE ${#RAY_AUTH_TOKEN}"',

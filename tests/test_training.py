@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.logger import KVWriter, Logger, configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
@@ -473,6 +473,28 @@ def test_pretraining(curiosity: str | None, collector: str, update: str) -> None
     assert (0 < len(asked) < 20) == (curiosity == "separate")
     # Random warm-up again
     assert np.abs(stored_actions(model)[:10]).max() < 0.9999
+
+
+def test_only_training_begins_as_without_pretraining() -> None:
+    """Two calls of `pretrain` do not collect the same steps; the `learn` after them has a new model's warm-up."""
+    collected: list[np.ndarray] = []
+
+    class Keep(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_training_end(self) -> None:
+            buffer = self.model.replay_buffer
+            collected.append(buffer.actions[: buffer.size()].copy())
+
+    for pretrains in (2, 0):
+        model = tiny_model("CnnPolicy", PixelBox(), learning_starts=30, seed=0)
+        for _ in range(pretrains):
+            model.pretrain(30, "random", callback=Keep())
+        model.learn(30, callback=Keep())
+    first, second, pretrained, vanilla = collected
+    assert (first != second).any()
+    np.testing.assert_array_equal(pretrained, vanilla)
 
 
 def test_pretraining_with_fixed_temperature_bonus_and_burst() -> None:

@@ -70,7 +70,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     can_film = "rgb_array" in env.metadata.get("render_modes", [])
     frame_stack = env.get_wrapper_attr("frame_stack") if env.has_wrapper_attr("frame_stack") else 1
     repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
-    if env.has_wrapper_attr("physics"):
+    if env.has_wrapper_attr("physics") and visiting_actors(model, cell) != ["random"]:
         visits = _measured_visits(model, cell, env, folder)
         title = f"Where policies go with sampled actions: {name}"
         names, units = physics_state_names(env), physics_state_units(env)

@@ -191,12 +191,11 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
             for task in dict.fromkeys(row.task for row in coverage)
         }
         caption = (
-            "Occupied cells of a grid over the true physics state, by policy (sampled actions): mean over seeds, each "
-            "seed a dot; above, how many times the random policy's, with its 95 % interval."
+            "Occupied cells of a grid over two coordinates of the true physics state, mean over all pairs of them, by "
+            "policy (sampled actions): mean over seeds, each seed a dot; above, how many times the random policy's, "
+            "with its 95 % interval."
         )
-        parts.append(
-            _figure("coverage", caption, plots.coverage_bars, panels, "occupied cells of the true state space")
-        )
+        parts.append(_figure("coverage", caption, plots.coverage_bars, panels, "occupied cells of the true state"))
         parts.append(tables.coverage_table(experiment, coverage))
     for head in [head for head in statistics.HEADS if any(row.head == head for row in errors)]:
         judged = [row for row in errors if row.head == head]

@@ -329,7 +329,7 @@ class _Progress:
         done = {row.unit.folder for row in self.rows if row.state == "done"}
         running = sum(row.state == "running" for row in self.rows)
         told = f"{_count(self.units, done)} done" + (f", {running} running" if running else "")
-        left = [row for row in self.rows if row.state != "done" and isinstance(row.unit, Cell)]
+        left = [row for row in self.rows if row.state not in ("done", "failed") and isinstance(row.unit, Cell)]
         speed = sum(row.rate for row in left if row.state == "running")
         if not speed:
             return told
@@ -337,7 +337,7 @@ class _Progress:
         return f"{told}, {speed:.1f} environment steps/s, about {_duration(seconds)} left"
 
     def line(self) -> str:
-        """The summary, with the best return that a table would show."""
+        """The summary, with the best return of all cells."""
         best = max(((row.best, str(row.unit.folder)) for row in self.rows if row.best is not None), default=None)
         return self.summary() + ("" if best is None else f", best return {best[0]:.0f} ({best[1]})")
 

@@ -307,12 +307,12 @@ def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSumm
         ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_ratio_columns(experiment), ">paper"],
         rows,
         "Actions are sampled, as in training. Heads: own, the arm's own; common, one fitted to an even mix of frames "
-        "of the random, task and curious policies from other seeds; zero and mean image, yardsticks that always "
-        "predict the same. Errors are measured against the mean of the dither: "
+        "of the random, task and curious policies (each of the first arm that has it) from other seeds; zero and mean "
+        "image, yardsticks that always predict the same. Errors are measured against the mean of the dither: "
         f"an autoencoder's error is its excess over the dither floor already ({published.DITHER_FLOOR:.1e} of the "
         "training loss), and the ratios those of the excesses: over the random actor's under the same head, and over "
-        f"that of the task policy of {experiment.baseline} with the same seed (under its own head, or the same common "
-        "one); geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
+        f"that of the task policy of {experiment.baseline} with the same seed (not under own heads, which differ); "
+        "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
         f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}.",
     )
 
@@ -338,7 +338,7 @@ def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) 
     :param rows: Coverage by actor
     :return: Occupied cells and entropy
     """
-    grids = _list([f"{row.task}: {row.grid} intervals in each of {row.dimensions} dimensions" for row in rows])
+    dimensions = _list([f"{row.task}: {row.dimensions}" for row in rows])
     columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells"]
     shown = []
     for row in rows:
@@ -351,10 +351,11 @@ def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) 
         "Coverage of the true state space",
         [*columns, *_ratio_columns(experiment), ">entropy, bits"],
         shown,
-        "Positions and velocities of the simulator, of which the agents see only images; actions are sampled, as in "
-        f"training. Grid: {grids} between the random policy's 1st and 99th percentile, and cells of that size beyond. "
-        "Equally many states are counted of each actor and seed. Ratios: geometric mean over seeds, t interval of the "
-        "logarithms.",
+        f"Positions and velocities of the simulator ({dimensions}), of which the agents see only images; actions are "
+        "sampled, as in training. Cells are those of a grid over two coordinates, mean over all pairs of them: "
+        f"{statistics.GRID_INTERVALS} intervals between the random policy's 1st and 99th percentile (of angles: on the "
+        "circle), and cells of that size beyond. Equally many states are counted of each actor and seed. Ratios: "
+        "geometric mean over seeds, t interval of the logarithms.",
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 
 from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.envs import physics_state_names
+from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import Episode, even_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, write_csv
 from sb3_cure.experiments.grid import Cell
@@ -47,6 +47,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     arrays: dict[str, np.ndarray] = {}
     if has_physics:
         arrays["state_names"] = np.array(physics_state_names(env))
+        arrays["state_units"] = np.array(physics_state_units(env))
     episodes = {}
     for actor in visiting_actors(model, cell):
         episodes[actor] = roll_out(model, cell, env, actor, has_physics)
