@@ -477,6 +477,7 @@ def _actor_bars(
                 )
                 position += 1
             position += 0.7
+        axes.set_xlim(-0.7, position - 1)
         axes.set_xticks(ticks, [_plain(arm) for arm in arms], fontsize=8.5)
         if len(arms) > 2:
             axes.tick_params(axis="x", rotation=15)
