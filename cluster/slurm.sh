@@ -12,9 +12,9 @@ srun --cpus-per-task="$SLURM_CPUS_ON_NODE" --kill-on-bad-exit=1 bash -c '
     [ "$SLURM_PROCID" = 0 ] && role="--head --port=6379" || role="--address=$address"
     exec ray start $role --num-cpus "$SLURM_CPUS_ON_NODE" --block' > "ray-$SLURM_JOB_ID.log" 2>&1 &
 ray=$!
-for try in {1..60}; do
-    ray status --address "$address" > /dev/null 2>&1 && break
-    if [ "$try" = 60 ] || ! kill -0 "$ray" 2> /dev/null; then
+while true; do
+    timeout 60 ray status --address "$address" > /dev/null 2>&1 && break
+    if (( SECONDS > 240 )) || ! kill -0 "$ray" 2> /dev/null; then
         echo "Ray did not start: see ray-$SLURM_JOB_ID.log"
         exit 1
     fi
