@@ -296,7 +296,7 @@ COMMANDS: dict[str, str] = {
     "doctor --fast": "sb3-cure doctor: error: unrecognized arguments: --fast",
     "report nowhere": ("sb3-cure report: nowhere is no folder: give the one that `sb3-cure experiment` wrote."),
     "report .": (
-        "sb3-cure report: . holds no experiment (no grid.json in it, nor in a folder of it): "
+        "sb3-cure report: . holds no experiment (no grid.json in it, nor anywhere below it): "
         "give the folder that `sb3-cure experiment` wrote."
     ),
     "report . --thresholds many": (
