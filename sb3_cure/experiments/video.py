@@ -83,18 +83,23 @@ def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray,
 _font = functools.cache(ImageFont.load_default)
 
 
+def _width(line: str, size: int) -> float:
+    """Of its pixels: glyphs such as ``_`` end beyond where the next one would begin."""
+    return _font(size).getbbox(line)[2]
+
+
 @functools.cache
 def _wrapped(text: str, size: int, width: int) -> list[str]:
     """As few lines as fit into a width; words are broken only where one alone is wider."""
     for length in range(len(text), 1, -1):
         lines = textwrap.wrap(text, length, break_on_hyphens=False)
-        if all(_font(size).getlength(line) <= width for line in lines):
+        if all(_width(line, size) <= width for line in lines):
             return lines
     return [text] if text else []
 
 
 def _fitting_size(line: str, size: int, width: int) -> int:
     """The size, or as much smaller as a line with long numbers asks for."""
-    while size > 1 and _font(size).getlength(line) > width:
+    while size > 1 and _width(line, size) > width:
         size -= 1
     return size
