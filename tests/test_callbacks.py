@@ -201,7 +201,7 @@ def test_text_of_a_video_fits(title: str, reward: float, width: int) -> None:
 
     one, other = pictures("A"), pictures("B")
     top = 40 * -(-256 // width)
-    assert (one[:, top:, -one.shape[2] // 64 :] > 250).all() and (one[:, top:] < 80).any()
+    assert (one[:, top:, -(one.shape[2] // 64) :] > 250).all() and (one[:, top:] < 80).any()
     assert one.shape != other.shape or (one != other).any()
 
 
