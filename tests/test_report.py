@@ -2,9 +2,7 @@
 
 import html
 import json
-import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 from PIL import Image
+from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, write_cell, write_grid
 
 from sb3_cure.experiments import plots, report
@@ -300,13 +299,7 @@ def test_report_without_rliable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 @pytest.fixture(scope="module")
 def chromium() -> str:
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
-    if found is None:
-        reason = "chromium is not installed (Debian: apt-get install chromium)"
-        if os.environ.get("SB3_CURE_REQUIRE_SCREENS") == "1":
-            pytest.fail(reason)
-        pytest.skip(reason)
-    return found
+    return find_program("chromium", "chromium-browser", package="chromium")
 
 
 def look(chromium: str, page: str, folder: Path) -> tuple[dict[str, list[int]], list[str]]:

@@ -1,7 +1,6 @@
 """Windows of `enjoy` and `render_mode="human"`, on a real display (Xvfb)."""
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs_for_tests import find_program
 
 #: Steps an environment in a window, and notes observations, frames and what the display then shows
 PROGRAM = """
@@ -33,12 +33,16 @@ SIZE = 320
 @pytest.fixture
 def display(tmp_path: Path) -> Iterator[tuple[str, Path]]:
     """Name of a display, and the file that holds what it shows."""
-    if shutil.which("Xvfb") is None:
-        reason = "Xvfb is not installed (Debian: apt-get install xvfb)"
-        if os.environ.get("SB3_CURE_REQUIRE_SCREENS") == "1":
-            pytest.fail(reason)
-        pytest.skip(reason)
-    command = ["Xvfb", "-displayfd", "1", "-screen", "0", f"{SIZE}x{SIZE}x24", "-fbdir", str(tmp_path)]
+    command = [
+        find_program("Xvfb", package="xvfb"),
+        "-displayfd",
+        "1",
+        "-screen",
+        "0",
+        f"{SIZE}x{SIZE}x24",
+        "-fbdir",
+        str(tmp_path),
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
         assert server.stdout is not None
         yield f":{server.stdout.readline().strip()}", tmp_path / "Xvfb_screen0"

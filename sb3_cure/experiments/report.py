@@ -255,7 +255,7 @@ def _visitation_headlines(
                 if (row.task, row.method, row.actor) == key and row.head in statistics.HEADS
             ]
             seeds = plural(len(experiment.done(task, method)), "seed")
-            others = {"random policy": "ratio", f"task policy of {experiment.baseline}": "task_ratio"}
+            others = {"random policy": "ratio", f"task policy of {experiment.baseline_of(method)}": "task_ratio"}
             for other, name in others.items():
                 ratios = [(getattr(row, name), what) for row, what in rows]
                 found = [f"{ratio_text(ratio)} times {what}" for ratio, what in ratios if math.isfinite(ratio.value)]

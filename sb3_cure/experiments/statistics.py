@@ -32,8 +32,7 @@ HEADS = ("own", "common")
 HIGHEST_RETURN = 1000.0
 #: Below this part of a published mean, a return is suspected to be a bug of ours.
 SUSPECT_BELOW = 0.75
-#: Of the range of the random policy, or of the whole circle, along each of two coordinates. (With 5 to 20 of them the
-#: ratios between policies that were measured here differ by some 5 %; on a grid over all coordinates at once by 50 %.)
+#: Of the range of the random policy, or of the whole circle, along each of two coordinates
 GRID_INTERVALS = 10
 DRAWS = 100_000
 RLIABLE_REPS = 2000

@@ -137,13 +137,9 @@ def _list(values: Sequence[Any]) -> str:
 def _duration(seconds: Any) -> str:
     if not isinstance(seconds, int | float):
         return NONE
-    return (
-        f"{seconds / 3600:.1f} h"
-        if seconds >= 3600
-        else f"{seconds / 60:.0f} min"
-        if seconds >= 60
-        else f"{seconds:.0f} s"
-    )
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
 
 
 # Tables
@@ -181,7 +177,7 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
             row = [task, method, str(len(arm.seeds))]
             row += [_mean_std(values) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
             row += [number_text(statistics.interquartile_range(arm.finals)), number_text(arm.curve_iqr)]
-            rows.append(row + [_reached(arm, limit, experiment.budget) for limit in thresholds])
+            rows.append(row + [_reached(arm.reached[limit], experiment.budget) for limit in thresholds])
     return Table(
         "Learning curves",
         columns,
@@ -193,8 +189,7 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     )
 
 
-def _reached(arm: statistics.ArmSummary, limit: float, budget: int) -> str:
-    steps = arm.reached[limit]
+def _reached(steps: np.ndarray, budget: int) -> str:
     if not len(steps):
         return NONE
     count = int(np.isfinite(steps).sum())
@@ -304,21 +299,26 @@ def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSumm
         rows.append([row.task, row.method, head, row.actor, str(len(row.means)), *errors, *ratios, shown])
     return Table(
         "SRL error per step",
-        ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_ratio_columns(experiment), ">paper"],
+        ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_RATIO_COLUMNS, ">paper"],
         rows,
         "Actions are sampled, as in training. Heads: own, the arm's own; common, one fitted to an even mix of frames "
         "of the random, task and curious policies (each of the first arm that has it) from other seeds; zero and mean "
         "image, yardsticks that always predict the same. Errors are measured against the mean of the dither: "
         f"an autoencoder's error is its excess over the dither floor already ({published.DITHER_FLOOR:.1e} of the "
         "training loss), and the ratios those of the excesses: over the random actor's under the same head, and over "
-        f"that of the task policy of {experiment.baseline} with the same seed (not under own heads, which differ); "
+        f"that of the task policy of the baseline ({_baselines(experiment)}) with the same seed (not under own heads, "
+        "which differ); "
         "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
         f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}.",
     )
 
 
-def _ratio_columns(experiment: Experiment) -> list[str]:
-    return [">/ random's [95 %]", f">/ {experiment.baseline} task policy's [95 %]"]
+_RATIO_COLUMNS = (">/ random's [95 %]", ">/ baseline's task policy's [95 %]")
+
+
+def _baselines(experiment: Experiment) -> str:
+    own = [name for name in experiment.methods if experiment.baseline_of(name) != experiment.baseline]
+    return _list([experiment.baseline, *(f"of {name} {experiment.baseline_of(name)}" for name in own)])
 
 
 def ratio_text(estimate: Estimate) -> str:
@@ -349,13 +349,13 @@ def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) 
         )
     return Table(
         "Coverage of the true state space",
-        [*columns, *_ratio_columns(experiment), ">entropy, bits"],
+        [*columns, *_RATIO_COLUMNS, ">entropy, bits"],
         shown,
         f"Positions and velocities of the simulator ({dimensions}), of which the agents see only images; actions are "
         "sampled, as in training. Cells are those of a grid over two coordinates, mean over all pairs of them: "
         f"{statistics.GRID_INTERVALS} intervals between the random policy's 1st and 99th percentile (of angles: on the "
-        "circle), and cells of that size beyond. Equally many states are counted of each actor and seed. Ratios: "
-        "geometric mean over seeds, t interval of the logarithms.",
+        "circle), and cells of that size beyond. Equally many states are counted of each actor and seed. Ratios "
+        f"(baseline: {_baselines(experiment)}): geometric mean over seeds, t interval of the logarithms.",
     )
 
 
