@@ -1,4 +1,4 @@
-"""The files in `cluster/` fit the package: one who copies them gets a running grid."""
+"""The files in `zoo_configs/cluster/` fit the package: one who copies them gets a running grid."""
 
 import os
 import re
@@ -11,7 +11,7 @@ import yaml
 from sb3_cure.experiments.run import main
 
 ROOT = Path(__file__).parent.parent
-CLUSTER = ROOT / "cluster"
+CLUSTER = ROOT / "zoo_configs" / "cluster"
 
 
 def pinned_ray() -> str:

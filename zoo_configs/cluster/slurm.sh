@@ -1,7 +1,8 @@
 #!/bin/bash
 #SBATCH --nodes=4 --ntasks-per-node=1 --exclusive --gpus-per-node=1 --time=24:00:00
 # A grid on Ray on whole nodes, from this repository's environment and with a folder that all nodes share:
-#   sbatch cluster/slurm.sh zoo_configs/experiments/curves.yml --out /shared/results --cpus-per-cell 4 --gpus-per-cell 0.25
+#   sbatch zoo_configs/cluster/slurm.sh zoo_configs/experiments/curves.yml --out /shared/results \
+#       --cpus-per-cell 4 --gpus-per-cell 0.25
 # Without GPUs: sbatch --gpus-per-node=0 ..., without --gpus-per-cell. Stopped or out of time? Submit it again.
 set -u
 head=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
