@@ -41,7 +41,7 @@ ARGUMENTS = dict(
 )
 
 
-class _Silent:
+class Silent:
     """A logger that takes everything and writes nothing."""
 
     def __getattr__(self, name: str) -> Any:
@@ -69,18 +69,53 @@ class _Buffer:
         return images, batch.actions, batch.rewards, next_images, 1 - batch.dones
 
 
-def _public_agent(checkout: str, shape: tuple[int, ...]) -> Any:
+def import_public(checkout: Path, module: str) -> ModuleType:
+    """
+    :param checkout: Folder that holds the public implementation's files
+    :param module: Name of one of them, without ending
+    :return: The module
+    """
     try:
         importlib.import_module("gym")
     except ImportError:  # it is imported for a wrapper that is not used here
         gym: Any = ModuleType("gym")
         gym.Wrapper, gym.spaces = object, SimpleNamespace(Box=None)
         sys.modules["gym"] = gym
-    sys.path.insert(0, checkout)
-    return importlib.import_module("sac_ae").SacAeAgent(shape, (1,), th.device("cpu"), **ARGUMENTS)
+    if str(checkout.resolve()) not in sys.path:
+        sys.path.insert(0, str(checkout.resolve()))
+    return importlib.import_module(module)
 
 
-def measure(checkout: str, repeats: int, tuned: bool) -> Times:
+def public_agent(checkout: Path, shape: tuple[int, ...], n_actions: int, **changes: Any) -> Any:
+    """
+    :param checkout: Folder that holds the public implementation's files
+    :param shape: Of an observation, [C, H, W] with H = W
+    :param n_actions: Size of an action
+    :param changes: Other arguments than ``ARGUMENTS``
+    :return: Its agent, on the CPU
+    """
+    arguments = {**ARGUMENTS, **changes}
+    layers = arguments["num_layers"]
+    # It knows the size of what its convolutions return for images of 84x84 only.
+    import_public(checkout, "encoder").OUT_DIM[layers] = (shape[-1] - 3) // 2 + 1 - 2 * (layers - 1)
+    return import_public(checkout, "sac_ae").SacAeAgent(shape, (n_actions,), th.device("cpu"), **arguments)
+
+
+def checkout_argument(parser: argparse.ArgumentParser) -> None:
+    """
+    :param parser: Gets the argument ``checkout``, which must hold the public implementation
+    """
+
+    def folder(text: str) -> Path:
+        if not (Path(text) / "sac_ae.py").is_file():
+            reason = f"{text} holds no sac_ae.py: give the folder into which pytorch_sac_ae was cloned"
+            raise argparse.ArgumentTypeError(reason)
+        return Path(text)
+
+    parser.add_argument("checkout", type=folder, help="folder that holds the public implementation's sac_ae.py")
+
+
+def measure(checkout: Path, repeats: int, tuned: bool) -> Times:
     """
     :param checkout: Path of the public implementation's checkout
     :param repeats: Rounds
@@ -92,7 +127,8 @@ def measure(checkout: str, repeats: int, tuned: bool) -> Times:
     replay_buffer = make_model().replay_buffer
     batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)]
     buffers = {name: _Buffer(batches) for name in (PLAIN, PUBLIC)}
-    plain, public, silent = PlainSacAe(actions=1), _public_agent(checkout, batches[0].observations.shape[1:]), _Silent()
+    plain, silent = PlainSacAe(actions=1), Silent()
+    public = public_agent(checkout, batches[0].observations.shape[1:], n_actions=1)
     # Of two updates the first includes the actors.
     steps = itertools.count()
     variants = {
@@ -105,14 +141,12 @@ def measure(checkout: str, repeats: int, tuned: bool) -> Times:
 def main() -> None:
     """Measure and print times and ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkout", type=Path, help="folder that holds the public implementation's sac_ae.py")
+    checkout_argument(parser)
     parser.add_argument("--repeats", type=int, default=7, help="rounds (default: 7)")
     options = parser.parse_args()
-    if not (options.checkout / "sac_ae.py").is_file():
-        parser.error(f"{options.checkout} holds no sac_ae.py: give the folder into which pytorch_sac_ae was cloned")
     for tuned in (False, True):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-            times = process.submit(measure, str(options.checkout.resolve()), options.repeats, tuned).result()
+            times = process.submit(measure, options.checkout, options.repeats, tuned).result()
         print("With the allocator settings" if tuned else "As the C library allocates by default")
         for name, seconds in times.items():
             print(f"  {name}: {summary(seconds)}")

@@ -1,0 +1,186 @@
+"""Train the public implementation of SAC-AE beside ours: the same environment, settings, budget and evaluations.
+
+    git clone https://github.com/denisyarats/pytorch_sac_ae
+    python -m benchmarks.public_returns pytorch_sac_ae --out results
+    sb3-cure report results
+
+Our arms are those of ``zoo_configs/experiments/fast/public_sac_ae.yml``; the public one is the baseline. What is done
+is not run again. The arms of a seed share the evaluations' starts, but not initial weights and warm-up.
+"""
+
+import argparse
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+
+from benchmarks.public_sac_ae import ARGUMENTS, Silent, checkout_argument, import_public, public_agent
+from sb3_cure.allocator import tune_allocator
+from sb3_cure.experiments.cells import EVAL_SEED, alone_in, check_settings, run_cell
+from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
+from sb3_cure.experiments.grid import DONE, Cell, load_grid
+
+GRID = Path(__file__).parent.parent / "zoo_configs" / "experiments" / "fast" / "public_sac_ae.yml"
+ARM, SOURCE = "public", "https://github.com/denisyarats/pytorch_sac_ae"
+_EVAL_COLUMNS = ("environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss")
+
+
+def public_cell(cell: Cell) -> Cell:
+    """
+    :param cell: One of ours, in SAC-AE's settings
+    :return: The public implementation's with the same environment, seed and budget
+    """
+    ours = cell.arguments
+    (width, *_), filters = ours["policy_kwargs"]["net_arch"], ours["policy_kwargs"]["features_extractor_kwargs"]
+    settings = {**ARGUMENTS, "hidden_dim": width, "num_filters": filters["n_filters"], "discount": ours["gamma"]}
+    shared = {key: ours[key] for key in ("srl", "curiosity", "learning_starts", "batch_size", "buffer_size")}
+    return replace(cell, method=ARM, arguments={"implementation": SOURCE, **shared, **settings})
+
+
+class _Losses(Silent):
+    """A logger that keeps the autoencoder's losses."""
+
+    def __init__(self) -> None:
+        self.losses: list[float] = []
+
+    def log(self, key: str, value: Any, step: int) -> None:
+        """Called by the public implementation."""
+        if key == "train_ae/ae_loss":
+            self.losses.append(float(value))
+
+
+class _PublicRun:
+    """Its training loop, on an environment of ours.
+
+    :param checkout: Folder that holds the public implementation's files
+    :param cell: What to run
+    """
+
+    def __init__(self, checkout: Path, cell: Cell):
+        self.cell, self.settings = cell, cell.arguments
+        self.env, self.eval_env = (gym.make(cell.task, **cell.env_kwargs) for _ in range(2))
+        self.action_repeat = int(self.env.get_wrapper_attr("action_repeat"))
+        self.env.action_space.seed(cell.seed)
+        utils = import_public(checkout, "utils")
+        utils.set_seed_everywhere(cell.seed)
+        shape, actions = self.env.observation_space.shape, self.env.action_space
+        assert isinstance(actions, gym.spaces.Box) and shape is not None and shape[0] < shape[1]
+        assert (actions.low == -1).all() and (actions.high == 1).all()
+        self.agent = public_agent(
+            checkout,
+            shape,
+            actions.shape[0],
+            **{k: v for k, v in self.settings.items() if k in (*ARGUMENTS, "discount")},
+        )
+        self.buffer = utils.ReplayBuffer(
+            shape, actions.shape, self.settings["buffer_size"], self.settings["batch_size"], th.device("cpu")
+        )
+        self.logger = _Losses()
+        self.updates = 0
+        self.evaluations: list[Row] = []
+        self.began = time.monotonic()
+
+    def learn(self) -> list[Row]:
+        """
+        :return: Rows of ``eval.csv``
+        """
+        warmup, total = self.settings["learning_starts"], -(-self.cell.budget // self.action_repeat)
+        observation, _ = self.env.reset(seed=self.cell.seed)
+        for step in range(total):
+            self._evaluate_if_due(step)
+            if step < warmup:
+                action = self.env.action_space.sample()
+            else:
+                action = self.agent.sample_action(observation)
+                for _ in range(warmup if step == warmup else 1):
+                    # It counts steps, not updates: in the burst after the warm-up each update includes the actor.
+                    self.agent.update(self.buffer, self.logger, step)
+                    self.updates += 1
+            next_observation, reward, terminated, truncated, _ = self.env.step(action)
+            self.buffer.add(observation, action, reward, next_observation, terminated)
+            observation = next_observation
+            if terminated or truncated:
+                observation, _ = self.env.reset()
+        self._evaluate_if_due(total, finished=True)
+        return self.evaluations
+
+    def _evaluate_if_due(self, step: int, finished: bool = False) -> None:
+        steps, every = step * self.action_repeat, self.cell.eval_every
+        last = self.evaluations[-1]["environment_steps"] if self.evaluations else -1
+        if last >= 0 and not (steps > last and (finished or steps // every > last // every)):
+            return
+        returns = [self._episode(EVAL_SEED if number == 0 else None) for number in range(self.cell.eval_episodes)]
+        losses = self.logger.losses
+        row = (
+            *(steps, step, self.updates, round(time.monotonic() - self.began, 1)),
+            *(float(np.mean(returns)), float(np.std(returns)), float(np.mean(losses)) if losses else ""),
+        )
+        losses.clear()
+        self.evaluations.append(dict(zip(_EVAL_COLUMNS, row, strict=True)))
+        print(f"{self.cell.folder}: {steps} environment steps, return {np.mean(returns):.1f}", flush=True)
+
+    def _episode(self, seed: int | None) -> float:
+        observation, _ = self.eval_env.reset(seed=seed)
+        total, done = 0.0, False
+        while not done:
+            action = self.agent.select_action(observation)
+            observation, reward, terminated, truncated, _ = self.eval_env.step(action)
+            total, done = total + float(reward), terminated or truncated
+        return total
+
+
+def run_public(checkout: Path, cell: Cell, results: Path) -> None:
+    """Train and evaluate one cell, from its beginning, unless that is done.
+
+    :param checkout: Folder that holds the public implementation's files
+    :param cell: From ``public_cell``
+    :param results: Folder of all results
+    """
+    tune_allocator()
+    folder = results / cell.folder
+    check_settings(folder, cell.config())
+    folder.mkdir(parents=True, exist_ok=True)
+    with alone_in(folder):
+        if (folder / DONE).exists():
+            return
+        run = _PublicRun(checkout, cell)
+        write_json(folder / "config.json", {**cell.config(), "action_repeat": run.action_repeat})
+        write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
+        seconds = run.evaluations[-1]["seconds"]
+        conditions = {"device": "cpu", "precision": "fp32", "seconds": seconds, "attempts": 1}
+        write_json(folder / "run.json", {**describe_run(), **conditions})
+        write_text(folder / DONE, "")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run all three arms, seed by seed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    checkout_argument(parser)
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder of results (default: results)")
+    parser.add_argument("--seeds", type=int, help="how many (default: as the grid says)")
+    parser.add_argument("--budget", type=int, help="environment steps (default: as the grid says)")
+    options = parser.parse_args(arguments)
+    tune_allocator()
+    grid = load_grid(GRID, seeds=options.seeds, budget=options.budget)
+    methods = {ARM: {"implementation": SOURCE}, **grid.description["methods"]}
+    (options.out / grid.experiment).mkdir(parents=True, exist_ok=True)
+    description = {**grid.description, "methods": methods, "baseline": ARM}
+    write_json(options.out / grid.experiment / "grid.json", description)
+    for seed in dict.fromkeys(cell.seed for cell in grid.cells):
+        cells = [cell for cell in grid.cells if cell.seed == seed]
+        # In a process of its own, with its modules of common names (utils, logger).
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+            process.submit(run_public, options.checkout, public_cell(cells[0]), options.out).result()
+        for cell in cells:
+            run_cell(cell, options.out)
+
+
+if __name__ == "__main__":
+    main()
