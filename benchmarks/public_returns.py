@@ -53,7 +53,7 @@ class _Losses(Silent):
     def log(self, key: str, value: Any, step: int) -> None:
         """Called by the public implementation."""
         if key == "train_ae/ae_loss":
-            self.losses.append(float(value))
+            self.losses.append(float(value.detach()))
 
 
 class _PublicRun:

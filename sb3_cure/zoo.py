@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 from unittest import mock
 
 import gymnasium as gym
+import numpy as np
 
 try:
     import optuna
@@ -66,7 +67,7 @@ class ActingCuReSAC(CuReSAC):
     objects: ClassVar[dict[str, Any]] = {}
 
     @classmethod
-    def load(cls, *args: Any, **kwargs: Any) -> CuReSAC:  # type: ignore[override]
+    def load(cls, *args: Any, **kwargs: Any) -> "ActingCuReSAC":
         """
         :param args: Arguments of ``CuReSAC.load``
         :param kwargs: Its keyword arguments
@@ -77,11 +78,34 @@ class ActingCuReSAC(CuReSAC):
         objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects}
         kwargs.update(custom_objects=objects, buffer_size=1)
         try:
-            model = CuReSAC.load(*args, **kwargs)
+            model = super().load(*args, **kwargs)
         except ValueError as error:
             raise SettingsError(f"{_explained(error, 'add --srl {}')}.") from error
         model.replay_buffer = None
         return model
+
+    def predict(self, observation: np.ndarray | dict[str, np.ndarray], *args: Any, **kwargs: Any) -> Any:
+        """
+        :param observation: Observations of rl-zoo3's environment, which ``enjoy`` does not compare with the model's
+        :param args: Further arguments of ``CuReSAC.predict``
+        :param kwargs: Its keyword arguments
+        :return: What it returns
+        :raises SettingsError: if the observations are of another shape than those of the training
+        """
+        try:
+            return super().predict(observation, *args, **kwargs)
+        except ValueError as error:
+            if "Unexpected observation shape" not in str(error):
+                raise
+            given = (
+                {key: value.shape for key, value in observation.items()}
+                if isinstance(observation, dict)
+                else observation.shape
+            )
+            raise SettingsError(
+                f"the model was trained with the observations {self.observation_space}, but the environment has others "
+                f"({given}): correct --env-kwargs (images: the same image_size, grayscale, frame_stack)."
+            ) from error
 
 
 class ExperimentManager(exp_manager.ExperimentManager):

@@ -424,6 +424,11 @@ MODELS: dict[str, str] = {
         "uint8): make it as for that training (images: the same image_size, grayscale, "
         "frame_stack), or train anew."
     ),
+    f"{ENJOY} --exp-id 3 --env-kwargs size:40": (
+        "sb3-cure enjoy: the model was trained with the observations Box(0, 255, (6, 36, 36), uint8), but the "
+        "environment has others ((1, 6, 40, 40)): correct --env-kwargs (images: the same image_size, grayscale, "
+        "frame_stack)."
+    ),
     f"{TRAIN} -i {RUN}_3/tests-PixelBox-v0.zip --env-kwargs frame_stack:1": (
         f"sb3-cure train: '{RUN}_3/tests-PixelBox-v0.zip' was trained with the observations "
         "Box(0, 255, (6, 36, 36), uint8), but the environment has Box(0, 255, (3, 36, 36), "
