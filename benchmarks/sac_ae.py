@@ -15,15 +15,22 @@ from torch.nn import functional as F
 
 from sb3_cure.layers import init_weights
 
+FEATURES = 50
+
+
+def _last_size(size: int) -> int:
+    """Of what four convolutions, the first of stride 2, make of an even number of pixels."""
+    return (size - 2) // 2 - 6
+
 
 class _Encoder(nn.Module):
-    def __init__(self, channels: int, filters: int = 32, features: int = 50):
+    def __init__(self, channels: int, size: int, filters: int):
         super().__init__()
         self.convs = nn.ModuleList(
             [nn.Conv2d(channels, filters, 3, stride=2), *(nn.Conv2d(filters, filters, 3) for _ in range(3))]
         )
-        self.fc = nn.Linear(filters * 35 * 35, features)
-        self.ln = nn.LayerNorm(features)
+        self.fc = nn.Linear(filters * _last_size(size) ** 2, FEATURES)
+        self.ln = nn.LayerNorm(FEATURES)
 
     def forward(self, images: th.Tensor, detach: bool = False) -> th.Tensor:
         hidden = images / 255.0
@@ -34,14 +41,15 @@ class _Encoder(nn.Module):
 
 
 class _Decoder(nn.Module):
-    def __init__(self, channels: int, filters: int = 32, features: int = 50):
+    def __init__(self, channels: int, size: int, filters: int):
         super().__init__()
-        self.fc = nn.Linear(features, filters * 35 * 35)
+        self.last_size = _last_size(size)
+        self.fc = nn.Linear(FEATURES, filters * self.last_size**2)
         self.deconvs = nn.ModuleList(nn.ConvTranspose2d(filters, filters, 3) for _ in range(3))
         self.output = nn.ConvTranspose2d(filters, channels, 3, stride=2, output_padding=1)
 
     def forward(self, latents: th.Tensor) -> th.Tensor:
-        hidden = th.relu(self.fc(latents)).view(len(latents), -1, 35, 35)
+        hidden = th.relu(self.fc(latents)).view(len(latents), -1, self.last_size, self.last_size)
         for deconv in self.deconvs:
             hidden = th.relu(deconv(hidden))
         return self.output(hidden)
@@ -54,10 +62,10 @@ def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class _Actor(nn.Module):
-    def __init__(self, channels: int, actions: int, hidden: int):
+    def __init__(self, encoder: _Encoder, actions: int, hidden: int):
         super().__init__()
-        self.encoder = _Encoder(channels)
-        self.trunk = _mlp(50, hidden, 2 * actions)
+        self.encoder = encoder
+        self.trunk = _mlp(FEATURES, hidden, 2 * actions)
 
     def forward(self, images: th.Tensor, detach: bool = False) -> tuple[th.Tensor, th.Tensor]:
         mean, log_std = self.trunk(self.encoder(images, detach)).chunk(2, dim=-1)
@@ -70,11 +78,11 @@ class _Actor(nn.Module):
 
 
 class _Critic(nn.Module):
-    def __init__(self, channels: int, actions: int, hidden: int):
+    def __init__(self, encoder: _Encoder, actions: int, hidden: int):
         super().__init__()
-        self.encoder = _Encoder(channels)
-        self.q1 = _mlp(50 + actions, hidden, 1)
-        self.q2 = _mlp(50 + actions, hidden, 1)
+        self.encoder = encoder
+        self.q1 = _mlp(FEATURES + actions, hidden, 1)
+        self.q2 = _mlp(FEATURES + actions, hidden, 1)
 
     def forward(self, images: th.Tensor, actions: th.Tensor, detach: bool = False) -> tuple[th.Tensor, th.Tensor]:
         inputs = th.cat([self.encoder(images, detach), actions], dim=1)
@@ -82,20 +90,35 @@ class _Critic(nn.Module):
 
 
 class PlainSacAe:
-    """SAC-AE's update on images of 84x84.
+    """SAC-AE's update.
 
     :param channels: Channels of the observations
     :param actions: Size of the action
     :param hidden: Hidden units of actor and critics
     :param device: Where to compute
+    :param size: Height and width of the observations, an even number
+    :param filters: Channels of the convolutions
+    :param decoder_first: Whether the autoencoder's step comes first, as in the CuRe paper's Algorithm 1, or last, as in
+        the public implementation
     """
 
-    def __init__(self, channels: int = 9, actions: int = 1, hidden: int = 1024, device: th.device | str = "cpu"):
-        self.actor = init_weights(_Actor(channels, actions, hidden)).to(device)
-        self.critic = init_weights(_Critic(channels, actions, hidden)).to(device)
+    def __init__(
+        self,
+        channels: int = 9,
+        actions: int = 1,
+        hidden: int = 1024,
+        device: th.device | str = "cpu",
+        size: int = 84,
+        filters: int = 32,
+        decoder_first: bool = False,
+    ):
+        self.decoder_first = decoder_first
+        encoders = [_Encoder(channels, size, filters) for _ in range(2)]
+        self.actor = init_weights(_Actor(encoders[0], actions, hidden)).to(device)
+        self.critic = init_weights(_Critic(encoders[1], actions, hidden)).to(device)
         self.critic_target = copy.deepcopy(self.critic)
         self.actor.encoder.convs = self.critic.encoder.convs
-        self.decoder = init_weights(_Decoder(channels)).to(device)
+        self.decoder = init_weights(_Decoder(channels, size, filters)).to(device)
         self.log_alpha = th.tensor(np.log(0.1), device=device, requires_grad=True)
         self.target_entropy = -float(actions)
         adam = th.optim.Adam
@@ -105,18 +128,23 @@ class PlainSacAe:
         self.encoder_optimizer = adam(self.critic.encoder.parameters(), lr=1e-3)
         self.decoder_optimizer = adam(self.decoder.parameters(), lr=1e-3, weight_decay=1e-7)
         self.step = 0
+        #: Losses of the last update, detached
+        self.losses: dict[str, th.Tensor] = {}
 
     def update(self, batch: ReplayBufferSamples) -> None:
         """One update of everything.
 
-        :param batch: Samples of the replay buffer, observations uint8 [B, C, 84, 84]
+        :param batch: Samples of the replay buffer, observations uint8 [B, C, H, W]
         """
         images, next_images = batch.observations.float(), batch.next_observations.float()
+        if self.decoder_first:
+            self._update_decoder(images)
         self._update_critic(images, batch.actions, batch.rewards, next_images, 1 - batch.dones)
         if self.step % 2 == 0:
             self._update_actor(images)
             self._update_targets()
-        self._update_decoder(images)
+        if not self.decoder_first:
+            self._update_decoder(images)
         self.step += 1
 
     def _update_critic(
@@ -128,6 +156,7 @@ class PlainSacAe:
             target = rewards + not_done * 0.99 * next_q
         q1, q2 = self.critic(images, actions)
         loss = F.mse_loss(q1, target) + F.mse_loss(q2, target)
+        self.losses["critic"] = loss.detach()
         self.critic_optimizer.zero_grad()
         loss.backward()
         self.critic_optimizer.step()
@@ -136,6 +165,7 @@ class PlainSacAe:
         actions, log_prob = self.actor(images, detach=True)
         q = th.min(*self.critic(images, actions, detach=True))
         loss = (self.log_alpha.exp().detach() * log_prob - q).mean()
+        self.losses["actor"] = loss.detach()
         self.actor_optimizer.zero_grad()
         loss.backward()
         self.actor_optimizer.step()
@@ -152,10 +182,19 @@ class PlainSacAe:
     def _update_decoder(self, images: th.Tensor) -> None:
         latents = self.critic.encoder(images)
         target = th.floor(images / 8) / 32
-        target = target + th.rand_like(target) / 32 - 0.5
+        target = target + self.dither(target) / 32 - 0.5
         loss = F.mse_loss(target, self.decoder(latents)) + 1e-6 * (0.5 * latents.pow(2).sum(1)).mean()
+        self.losses["decoder"] = loss.detach()
         self.encoder_optimizer.zero_grad()
         self.decoder_optimizer.zero_grad()
         loss.backward()
         self.encoder_optimizer.step()
         self.decoder_optimizer.step()
+
+    @staticmethod
+    def dither(images: th.Tensor) -> th.Tensor:
+        """
+        :param images: [B, C, H, W]
+        :return: Uniform noise in [0, 1) of that shape
+        """
+        return th.rand_like(images)

@@ -99,14 +99,20 @@ class Agent:
 class EncoderPass:
     """One run of the shared encoder over a batch.
 
-    :param features: Trunk features of the observations, detached, for the actors, [B, trunk_dim]
     :param latents: Latents of the observations, with their graph, [B, features_dim]
+    :param for_actor: Computes what an actor's update reads, when it is due: trunk features of the observations,
+        [B, trunk_dim], and their latents, [B, features_dim], both detached
     :param next_features: Computes the trunk features of the next observations; called at most once
     """
 
-    def __init__(self, features: th.Tensor, latents: th.Tensor, next_features: Callable[[], th.Tensor]):
-        self.features = features
+    def __init__(
+        self,
+        latents: th.Tensor,
+        for_actor: Callable[[], tuple[th.Tensor, th.Tensor]],
+        next_features: Callable[[], th.Tensor],
+    ):
         self.latents = latents
+        self.for_actor = for_actor
         self._compute_next_features = next_features
         self._next_features: th.Tensor | None = None
 
@@ -674,11 +680,18 @@ class CuReSAC(SAC):
             latents = encoder.projection(features).float()
         self._log({"train/latent_variance": latents.detach().var(dim=0, correction=0).mean()})
 
+        def for_actor() -> tuple[th.Tensor, th.Tensor]:
+            if self.update == "joint":  # where the encoder moves when all else has moved
+                return features.detach(), latents.detach()
+            with th.no_grad(), self._autocast():
+                moved = encoder.trunk(observations)
+                return moved, encoder.projection(moved).float()
+
         def next_features() -> th.Tensor:
             with th.no_grad(), self._autocast():
                 return encoder.trunk(next_observations)
 
-        return EncoderPass(features.detach(), latents, next_features)
+        return EncoderPass(latents, for_actor, next_features)
 
     @property
     def _srl_head(self) -> SRLHead:
@@ -765,7 +778,7 @@ class CuReSAC(SAC):
         prefix = self._prefix(agent)
         self._log({f"{prefix}critic_loss": critic_loss, f"{prefix}q_value": q_values[0].mean()})  # type: ignore[dict-item]
         if self._n_updates % self.actor_update_interval == 0:
-            self._update_actor(agent, encoded.features, encoded.latents.detach())
+            self._update_actor(agent, *encoded.for_actor())
 
     def _update_actor(self, agent: Agent, features: th.Tensor, latents: th.Tensor) -> None:
         """SAC's policy improvement and temperature step; neither trains the encoder.

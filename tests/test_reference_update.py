@@ -1,0 +1,103 @@
+"""Sequential updates beside SAC-AE written plainly (``benchmarks/sac_ae.py``): same weights, batches and noise."""
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox
+from stable_baselines3.common.logger import Logger
+from torch import nn
+
+from benchmarks.sac_ae import PlainSacAe
+from sb3_cure import CuReSAC
+from sb3_cure.layers import Projection
+from sb3_cure.srl import autoencoder
+
+SIZE, FILTERS, HIDDEN, BATCH = 36, 4, 16, 8
+LAST = (SIZE - 2) // 2 - 6
+Layer = nn.Linear | nn.Conv2d | nn.ConvTranspose2d | nn.LayerNorm
+
+
+def layers(module: nn.Module) -> list[Layer]:
+    return [layer for layer in module.modules() if isinstance(layer, Layer)]
+
+
+@th.no_grad()
+def copy_layers(target: nn.Module, source: nn.Module) -> None:
+    """All weights, layer by layer."""
+    for mine, other in zip(layers(target), layers(source), strict=True):
+        mine.weight.copy_(other.weight)
+        mine.bias.copy_(other.bias)
+
+
+@th.no_grad()
+def copy_projection(target: Projection, source: nn.Module) -> None:
+    """Ours reads the convolutions' images as [H, W, C], the plain one as [C, H, W]."""
+    by_image = source.fc.weight.view(-1, FILTERS, LAST, LAST)
+    target.linear.weight.copy_(by_image.permute(0, 2, 3, 1).flatten(1))
+    target.linear.bias.copy_(source.fc.bias)
+    copy_layers(target.norm, source.ln)
+
+
+@th.no_grad()
+def copy_weights(model: CuReSAC, plain: PlainSacAe) -> None:
+    policy, decoder = model.policy, model.policy.srl.decoder
+    copy_layers(policy.encoder.trunk, plain.critic.encoder.convs)
+    copy_projection(policy.encoder.projection, plain.critic.encoder)
+    copy_projection(policy.actor.features_extractor, plain.actor.encoder)
+    policy.encoder_target.load_state_dict(policy.encoder.state_dict())
+    hidden, output = plain.actor.trunk[:-1], plain.actor.trunk[-1]
+    copy_layers(policy.actor.latent_pi, hidden)
+    n_actions = policy.actor.mu.out_features
+    for head, part in ((policy.actor.mu, slice(n_actions)), (policy.actor.log_std, slice(n_actions, None))):
+        head.weight.copy_(output.weight[part])
+        head.bias.copy_(output.bias[part])
+    for mine, other in zip(policy.critic.q_networks, (plain.critic.q1, plain.critic.q2), strict=True):
+        copy_layers(mine, other)
+    policy.critic_target.load_state_dict(policy.critic.state_dict())
+    decoder.linear.weight.copy_(plain.decoder.fc.weight.view(FILTERS, LAST, LAST, -1).permute(1, 2, 0, 3).flatten(0, 2))
+    decoder.linear.bias.copy_(plain.decoder.fc.bias.view(FILTERS, LAST, LAST).permute(1, 2, 0).flatten())
+    copy_layers(decoder.hidden, plain.decoder.deconvs)
+    copy_layers(decoder.output, plain.decoder.output)
+
+
+def test_sequential_updates_are_sac_aes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Losses and temperature of ten updates; what differs in any step shows in the losses of those after it."""
+    model = CuReSAC(
+        "CnnPolicy",
+        PixelBox(),
+        srl="rae",
+        curiosity=None,
+        update="sequential",
+        precision="fp32",
+        learning_starts=40,
+        warmup_updates=0,
+        buffer_size=100,
+        policy_kwargs=dict(net_arch=[HIDDEN, HIDDEN], features_extractor_kwargs=dict(n_filters=FILTERS)),
+        seed=0,
+    )
+    model.learn(40)  # random actions
+    assert model._n_updates == 0
+    channels, actions = model.observation_space.shape[0], model.action_space.shape[0]
+    plain = PlainSacAe(channels, actions, HIDDEN, size=SIZE, filters=FILTERS, decoder_first=True)
+    copy_weights(model, plain)
+    # The only noise that the two would draw otherwise.
+    monkeypatch.setattr(autoencoder, "_random_bytes_like", lambda images: th.full_like(images, 99))
+    monkeypatch.setattr(plain, "dither", lambda images: th.full_like(images, 99.5 / 256))
+    model.set_logger(Logger(None, []))
+    model.replay_buffer.dones[::5] = 1
+    model.replay_buffer.timeouts[:] = 0
+    for update in range(10):
+        for train in (lambda: model.train(1, BATCH), lambda: plain.update(model.replay_buffer.sample(BATCH))):
+            np.random.seed(update)
+            th.manual_seed(update)
+            train()
+        logged = model.logger.name_to_value
+        found = {
+            "critic": 2 * float(logged["train/critic_loss"]),  # SB3 halves it
+            "actor": float(logged["train/actor_loss"]),
+            "decoder": float(logged["train/srl_loss"]),
+            "temperature": float(model.log_ent_coef.detach().exp()),
+        }
+        expected = {name: float(loss) for name, loss in plain.losses.items()}
+        expected["temperature"] = float(plain.log_alpha.detach().exp())
+        assert found == pytest.approx(expected, rel=1e-3), update
