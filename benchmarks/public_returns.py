@@ -15,13 +15,12 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
 
-from benchmarks.public_sac_ae import ARGUMENTS, Silent, checkout_argument, import_public, public_agent
+from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import EVAL_SEED, alone_in, check_settings, run_cell
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
@@ -42,18 +41,6 @@ def public_cell(cell: Cell) -> Cell:
     settings = {**ARGUMENTS, "hidden_dim": width, "num_filters": filters["n_filters"], "discount": ours["gamma"]}
     shared = {key: ours[key] for key in ("srl", "curiosity", "learning_starts", "batch_size", "buffer_size")}
     return replace(cell, method=ARM, arguments={"implementation": SOURCE, **shared, **settings})
-
-
-class _Losses(Silent):
-    """A logger that keeps the autoencoder's losses."""
-
-    def __init__(self) -> None:
-        self.losses: list[float] = []
-
-    def log(self, key: str, value: Any, step: int) -> None:
-        """Called by the public implementation."""
-        if key == "train_ae/ae_loss":
-            self.losses.append(float(value.detach()))
 
 
 class _PublicRun:
@@ -82,7 +69,7 @@ class _PublicRun:
         self.buffer = utils.ReplayBuffer(
             shape, actions.shape, self.settings["buffer_size"], self.settings["batch_size"], th.device("cpu")
         )
-        self.logger = _Losses()
+        self.log, self.losses = Log(), list[float]()
         self.updates = 0
         self.evaluations: list[Row] = []
         self.began = time.monotonic()
@@ -101,7 +88,8 @@ class _PublicRun:
                 action = self.agent.sample_action(observation)
                 for _ in range(warmup if step == warmup else 1):
                     # It counts steps, not updates: in the burst after the warm-up each update includes the actor.
-                    self.agent.update(self.buffer, self.logger, step)
+                    self.agent.update(self.buffer, self.log, step)
+                    self.losses.append(self.log.losses["decoder"])
                     self.updates += 1
             next_observation, reward, terminated, truncated, _ = self.env.step(action)
             self.buffer.add(observation, action, reward, next_observation, terminated)
@@ -117,12 +105,11 @@ class _PublicRun:
         if last >= 0 and not (steps > last and (finished or steps // every > last // every)):
             return
         returns = [self._episode(EVAL_SEED if number == 0 else None) for number in range(self.cell.eval_episodes)]
-        losses = self.logger.losses
         row = (
             *(steps, step, self.updates, round(time.monotonic() - self.began, 1)),
-            *(float(np.mean(returns)), float(np.std(returns)), float(np.mean(losses)) if losses else ""),
+            *(float(np.mean(returns)), float(np.std(returns)), float(np.mean(self.losses)) if self.losses else ""),
         )
-        losses.clear()
+        self.losses.clear()
         self.evaluations.append(dict(zip(_EVAL_COLUMNS, row, strict=True)))
         print(f"{self.cell.folder}: {steps} environment steps, return {np.mean(returns):.1f}", flush=True)
 

@@ -1,10 +1,11 @@
-"""Time the plain SAC-AE update of ``benchmarks/sac_ae.py`` against that of the public implementation.
+"""Compare the plain SAC-AE update of ``benchmarks/sac_ae.py`` with that of the public implementation.
 
     git clone https://github.com/denisyarats/pytorch_sac_ae
     python -m benchmarks.public_sac_ae pytorch_sac_ae
 
-Both get the same batches in the paper's setting and take turns; with and without the allocator settings of
-``sb3_cure.allocator``, each in a process of its own, as they cannot be undone.
+First their losses, from the same weights, batches and noise; then their times. Both get the same batches in the paper's
+setting and take turns; with and without the allocator settings of ``sb3_cure.allocator``, each in a process of its own,
+as they cannot be undone.
 """
 
 import argparse
@@ -25,6 +26,8 @@ from benchmarks.harness import BATCH_SIZE, Times, interleaved, make_model, media
 from benchmarks.sac_ae import PlainSacAe
 from sb3_cure.allocator import tune_allocator
 
+#: Of a log of the public implementation and of ``PlainSacAe.losses``
+LOSSES = {"train_critic/loss": "critic", "train_actor/loss": "actor", "train_ae/ae_loss": "decoder"}
 PLAIN, PUBLIC = "benchmarks/sac_ae.py", "public implementation"
 #: The published command line's arguments, with the CuRe paper's width of 1024
 ARGUMENTS = dict(
@@ -41,8 +44,16 @@ ARGUMENTS = dict(
 )
 
 
-class Silent:
-    """A logger that takes everything and writes nothing."""
+class Log:
+    """A logger that keeps the last value of each loss."""
+
+    def __init__(self) -> None:
+        self.losses: dict[str, float] = {}
+
+    def log(self, key: str, value: Any, step: int) -> None:
+        """Called by the public implementation."""
+        if key in LOSSES:
+            self.losses[LOSSES[key]] = float(value.detach())
 
     def __getattr__(self, name: str) -> Any:
         return lambda *arguments: None
@@ -115,6 +126,33 @@ def checkout_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("checkout", type=folder, help="folder that holds the public implementation's sac_ae.py")
 
 
+def compare_losses(checkout: Path, updates: int = 10) -> float:
+    """
+    :param checkout: Folder that holds the public implementation's files
+    :param updates: How many
+    :return: The largest relative difference of a loss in these updates, which start from the same weights and have the
+        same batches and noise
+    """
+    replay_buffer = make_model().replay_buffer
+    batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(updates)]
+    plain, buffer, log = PlainSacAe(actions=1), _Buffer(batches), Log()
+    public = public_agent(checkout, batches[0].observations.shape[1:], n_actions=1)
+    with th.no_grad():
+        for name in ("actor", "critic", "critic_target", "decoder"):
+            pairs = zip(getattr(plain, name).parameters(), getattr(public, name).parameters(), strict=True)
+            for mine, theirs in pairs:
+                mine.copy_(theirs)
+    largest = 0.0
+    for update, batch in enumerate(batches):
+        th.manual_seed(update)
+        public.update(buffer, log, update)
+        th.manual_seed(update)
+        plain.update(batch)
+        differences = [abs(float(plain.losses[name]) / loss - 1) for name, loss in log.losses.items()]
+        largest = max(largest, *differences)
+    return largest
+
+
 def measure(checkout: Path, repeats: int, tuned: bool) -> Times:
     """
     :param checkout: Path of the public implementation's checkout
@@ -127,23 +165,26 @@ def measure(checkout: Path, repeats: int, tuned: bool) -> Times:
     replay_buffer = make_model().replay_buffer
     batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)]
     buffers = {name: _Buffer(batches) for name in (PLAIN, PUBLIC)}
-    plain, silent = PlainSacAe(actions=1), Silent()
+    plain, log = PlainSacAe(actions=1), Log()
     public = public_agent(checkout, batches[0].observations.shape[1:], n_actions=1)
     # Of two updates the first includes the actors.
     steps = itertools.count()
     variants = {
         PLAIN: lambda: plain.update(buffers[PLAIN].next()),
-        PUBLIC: lambda: public.update(buffers[PUBLIC], silent, next(steps)),
+        PUBLIC: lambda: public.update(buffers[PUBLIC], log, next(steps)),
     }
     return interleaved(variants, repeats, calls=2)
 
 
 def main() -> None:
-    """Measure and print times and ratios."""
+    """Measure and print the difference of losses, times and ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     checkout_argument(parser)
     parser.add_argument("--repeats", type=int, default=7, help="rounds (default: 7)")
     options = parser.parse_args()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        difference = process.submit(compare_losses, options.checkout).result()
+    print(f"Largest relative difference of a loss in ten updates: {difference:.1e}")
     for tuned in (False, True):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
             times = process.submit(measure, options.checkout, options.repeats, tuned).result()
