@@ -22,7 +22,14 @@ import torch as th
 
 from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
 from sb3_cure.allocator import tune_allocator
-from sb3_cure.experiments.cells import EVAL_SEED, alone_in, check_settings, run_cell
+from sb3_cure.experiments.cells import (
+    EVAL_SEED,
+    action_repeat_of,
+    alone_in,
+    check_settings,
+    is_evaluation_due,
+    run_cell,
+)
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import DONE, Cell, load_grid
 
@@ -53,7 +60,7 @@ class _PublicRun:
     def __init__(self, checkout: Path, cell: Cell):
         self.cell, self.settings = cell, cell.arguments
         self.env, self.eval_env = (gym.make(cell.task, **cell.env_kwargs) for _ in range(2))
-        self.action_repeat = int(self.env.get_wrapper_attr("action_repeat"))
+        self.action_repeat = action_repeat_of(self.env)
         self.env.action_space.seed(cell.seed)
         utils = import_public(checkout, "utils")
         utils.set_seed_everywhere(cell.seed)
@@ -100,9 +107,8 @@ class _PublicRun:
         return self.evaluations
 
     def _evaluate_if_due(self, step: int, finished: bool = False) -> None:
-        steps, every = step * self.action_repeat, self.cell.eval_every
-        last = self.evaluations[-1]["environment_steps"] if self.evaluations else -1
-        if last >= 0 and not (steps > last and (finished or steps // every > last // every)):
+        steps = step * self.action_repeat
+        if not is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             return
         returns = [self._episode(EVAL_SEED if number == 0 else None) for number in range(self.cell.eval_episodes)]
         row = (

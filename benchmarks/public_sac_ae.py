@@ -25,6 +25,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from benchmarks.harness import BATCH_SIZE, Times, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
 from sb3_cure.allocator import tune_allocator
+from sb3_cure.layers import conv_sizes
 
 #: Of a log of the public implementation and of ``PlainSacAe.losses``
 LOSSES = {"train_critic/loss": "critic", "train_actor/loss": "actor", "train_ae/ae_loss": "decoder"}
@@ -108,7 +109,7 @@ def public_agent(checkout: Path, shape: tuple[int, ...], n_actions: int, **chang
     arguments = {**ARGUMENTS, **changes}
     layers = arguments["num_layers"]
     # It knows the size of what its convolutions return for images of 84x84 only.
-    import_public(checkout, "encoder").OUT_DIM[layers] = (shape[-1] - 3) // 2 + 1 - 2 * (layers - 1)
+    import_public(checkout, "encoder").OUT_DIM[layers] = conv_sizes(shape[1], shape[2], layers)[-1][0]
     return import_public(checkout, "sac_ae").SacAeAgent(shape, (n_actions,), th.device("cpu"), **arguments)
 
 

@@ -13,14 +13,9 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.layers import init_weights
+from sb3_cure.layers import conv_sizes, init_weights
 
 FEATURES = 50
-
-
-def _last_size(size: int) -> int:
-    """Of what four convolutions, the first of stride 2, make of an even number of pixels."""
-    return (size - 2) // 2 - 6
 
 
 class _Encoder(nn.Module):
@@ -29,7 +24,7 @@ class _Encoder(nn.Module):
         self.convs = nn.ModuleList(
             [nn.Conv2d(channels, filters, 3, stride=2), *(nn.Conv2d(filters, filters, 3) for _ in range(3))]
         )
-        self.fc = nn.Linear(filters * _last_size(size) ** 2, FEATURES)
+        self.fc = nn.Linear(filters * conv_sizes(size, size, 4)[-1][0] ** 2, FEATURES)
         self.ln = nn.LayerNorm(FEATURES)
 
     def forward(self, images: th.Tensor, detach: bool = False) -> th.Tensor:
@@ -43,7 +38,7 @@ class _Encoder(nn.Module):
 class _Decoder(nn.Module):
     def __init__(self, channels: int, size: int, filters: int):
         super().__init__()
-        self.last_size = _last_size(size)
+        self.last_size, _ = conv_sizes(size, size, 4)[-1]
         self.fc = nn.Linear(FEATURES, filters * self.last_size**2)
         self.deconvs = nn.ModuleList(nn.ConvTranspose2d(filters, filters, 3) for _ in range(3))
         self.output = nn.ConvTranspose2d(filters, channels, 3, stride=2, output_padding=1)

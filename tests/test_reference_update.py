@@ -9,11 +9,11 @@ from torch import nn
 
 from benchmarks.sac_ae import PlainSacAe
 from sb3_cure import CuReSAC
-from sb3_cure.layers import Projection
+from sb3_cure.layers import Projection, conv_sizes
 from sb3_cure.srl import autoencoder
 
 SIZE, FILTERS, HIDDEN, BATCH = 36, 4, 16, 8
-LAST = (SIZE - 2) // 2 - 6
+LAST, _ = conv_sizes(SIZE, SIZE, 4)[-1]
 Layer = nn.Linear | nn.Conv2d | nn.ConvTranspose2d | nn.LayerNorm
 
 

@@ -7,7 +7,7 @@ import math
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -237,19 +237,10 @@ class _Record(BaseCallback):
     # -------------------------------------------------------------- evaluation
 
     def _evaluate_if_due(self, finished: bool) -> None:
-        if self.evaluates and self._is_evaluation_due(finished):
+        steps = self.num_timesteps * self.action_repeat
+        if self.evaluates and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             self.evaluate()
         self._tick()
-
-    def _is_evaluation_due(self, finished: bool) -> bool:
-        """
-        :param finished: Whether training has ended: then the last row is due, whatever its step
-        """
-        steps = self.num_timesteps * self.action_repeat
-        if not self.evaluations:
-            return True
-        last, every = self.evaluations[-1]["environment_steps"], self.cell.eval_every
-        return steps > last and (finished or steps // every > last // every)
 
     def evaluate(self) -> None:
         """Evaluate each policy over episodes that start from the same states in all cells."""
@@ -317,6 +308,20 @@ class _Record(BaseCallback):
             # Where it was interrupted: what each attempt ran on
             **({"history": self.attempts} if len(self.attempts) > 1 else {}),
         }
+
+
+def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finished: bool) -> bool:
+    """
+    :param evaluations: Rows of ``eval.csv`` so far
+    :param steps: Environment steps so far
+    :param every: Environment steps between two evaluations
+    :param finished: Whether training has ended: then the last row is due, whatever its step
+    :return: Whether to evaluate now
+    """
+    if not evaluations:
+        return True
+    last = evaluations[-1]["environment_steps"]
+    return steps > last and (finished or steps // every > last // every)
 
 
 def action_repeat_of(env: gym.Env) -> int:
