@@ -31,7 +31,7 @@ from sb3_cure.experiments.cells import (
     run_cell,
 )
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import DONE, Cell, load_grid
+from sb3_cure.experiments.grid import DONE, Cell, GridError, load_grid
 
 GRID = Path(__file__).parent.parent / "zoo_configs" / "experiments" / "fast" / "public_sac_ae.yml"
 ARM, SOURCE = "public", "https://github.com/denisyarats/pytorch_sac_ae"
@@ -168,11 +168,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     write_json(options.out / grid.experiment / "grid.json", description)
     for seed in dict.fromkeys(cell.seed for cell in grid.cells):
         cells = [cell for cell in grid.cells if cell.seed == seed]
-        # In a process of its own, with its modules of common names (utils, logger).
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-            process.submit(run_public, options.checkout, public_cell(cells[0]), options.out).result()
-        for cell in cells:
-            run_cell(cell, options.out)
+        try:
+            # In a process of its own, with its modules of common names (utils, logger).
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+                process.submit(run_public, options.checkout, public_cell(cells[0]), options.out).result()
+            for cell in cells:
+                run_cell(cell, options.out)
+        except GridError as error:
+            parser.error(str(error))
 
 
 if __name__ == "__main__":

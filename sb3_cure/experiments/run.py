@@ -5,6 +5,7 @@ import json
 import os
 import platform
 import re
+import signal
 import sys
 import threading
 import time
@@ -243,13 +244,16 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
     def refresh(show: Callable[[Table], object]) -> None:
         told, told_at = _finished(list_units(), results), time.monotonic()
         while not stopped.wait(1.0):
-            if watches:
-                show(progress_table(list_units(), results))
-                continue
-            told = _tell_finished(list_units(), results, told)
-            if time.monotonic() - told_at >= SUMMARY_SECONDS:
-                told_at = time.monotonic()
-                print(_Progress(list_units(), results).line(), flush=True)
+            try:
+                if watches:
+                    show(progress_table(list_units(), results))
+                    continue
+                told = _tell_finished(list_units(), results, told)
+                if time.monotonic() - told_at >= SUMMARY_SECONDS:
+                    told_at = time.monotonic()
+                    print(_Progress(list_units(), results).line(), flush=True)
+            except BrokenPipeError:  # nobody reads on, and the cells are to be finished all the same
+                _write_to_nobody()
 
     with _shown(console, progress_table(list_units(), results)) as show:
         thread = threading.Thread(target=refresh, args=(show,), daemon=True)
@@ -285,6 +289,11 @@ def _count(units: Sequence[Unit], done: Container[Path]) -> str:
         if folders:
             counts.append(f"{sum(folder in done for folder in folders)} of {len(folders)} {name}")
     return ", ".join(counts)
+
+
+def _write_to_nobody() -> None:
+    """After a BrokenPipeError: else whatever is written later would raise another, at the latest when Python ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
@@ -474,7 +483,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
         if options.dry_run:
-            _list_units([*grid.cells, *common_heads(grid, options.out, grid.cells)], options.out)
+            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
+            for unit in units:
+                print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
+            sys.stdout.flush()
             return 0
         of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
         given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
@@ -493,24 +505,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             gpus_per_cell=options.gpus_per_cell,
             retries=options.retries,
         )
+        for sentence in _failures(failed, options.out):
+            print(sentence)
+        sys.stdout.flush()
     except GridError as error:
         parser.error(str(error))
     except KeyboardInterrupt:
         print("Stopped; the same command goes on from the last checkpoints.")
         return 130
-    for sentence in _failures(failed, options.out):
-        print(sentence)
+    except BrokenPipeError:  # such as `--dry-run | head`, which has read enough
+        _write_to_nobody()
+        return 128 + signal.SIGPIPE
     return 1 if failed else 0
-
-
-def _list_units(units: Iterable[Unit], results: Path) -> None:
-    try:
-        for unit in units:
-            print(f"{unit.folder}: {read_progress(unit, results)[0]}")
-        sys.stdout.flush()
-    except BrokenPipeError:  # such as `| head`, which has read enough
-        # Else Python would write the rest when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _failures(failed: Iterable[Unit], results: Path) -> Iterator[str]:
