@@ -15,7 +15,7 @@ from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, write_cell, write_grid
 
 from sb3_cure.experiments import plots, report
-from sb3_cure.experiments.statistics import read_results
+from sb3_cure.experiments.results import read_results
 
 TASK = "cartpole-swingup"
 HOSTILE = '<img src=x onerror=alert(1)>|$x$ "quoted" [a](b)'

@@ -12,7 +12,14 @@ from results_for_tests import CURE, RAE, write_cell, write_grid
 from scipy import stats
 
 from sb3_cure.experiments import published, statistics
-from sb3_cure.experiments.statistics import ResultsError, read_results
+from sb3_cure.experiments.results import ResultsError, read_results
+from sb3_cure.experiments.visit_statistics import (
+    GRID_INTERVALS,
+    entropy_bits,
+    state_coverage,
+    summarise_errors,
+    visits_by_pair,
+)
 
 TASK = "cartpole-swingup"
 returns = st.floats(-1e3, 1e3, allow_nan=False)
@@ -251,7 +258,7 @@ def test_errors_and_their_ratio(tmp_path: Path) -> None:
             ("curious", "own", 0, 0.001, 0.003 * ratio, 0.05 + seed, 1), ("random", "zero", 0, 0.05, 0.05, 0.05, 1),
         ]  # fmt: skip
         write_cell(folder, TASK, "cure_sac_ae", seed, {}, visitation=rows)
-    summary = {(row.head, row.actor): row for row in statistics.summarise_errors(read_results(folder)[0])}
+    summary = {(row.head, row.actor): row for row in summarise_errors(read_results(folder)[0])}
     assert list(summary) == [("own", "random"), ("own", "curious"), ("zero", "random")]
     random, curious = summary["own", "random"], summary["own", "curious"]
     assert (random.error_min, random.error_mean, random.error_max) == pytest.approx((0.001, 0.003, 0.008))
@@ -278,11 +285,11 @@ def test_curious_policies_are_compared_with_the_baselines_task_policy_of_their_s
             states = {"random": still, actor: visited}
             write_cell(folder, TASK, method, seed, {}, visitation=rows, states=states)
     (experiment,) = read_results(folder)
-    errors = {(row.head, row.method, row.actor): row.task_ratio for row in statistics.summarise_errors(experiment)}
+    errors = {(row.head, row.method, row.actor): row.task_ratio for row in summarise_errors(experiment)}
     compared = ("common", "cure_sac_ae", "curious")  # the own heads of two agents are two yardsticks
     assert errors[compared].value == pytest.approx(np.sqrt(18))
     assert np.isnan([errors[key].value for key in errors if key != compared]).all()
-    coverage = {(row.method, row.actor): row.task_ratio for row in statistics.state_coverage(experiment)}
+    coverage = {(row.method, row.actor): row.task_ratio for row in state_coverage(experiment)}
     assert coverage["cure_sac_ae", "curious"].value == pytest.approx(3)
     assert np.isnan([coverage[key].value for key in coverage if key != ("cure_sac_ae", "curious")]).all()
 
@@ -299,7 +306,7 @@ def test_nobodys_coverage_depends_on_where_other_arms_went(tmp_path: Path) -> No
         for method in ("calm", *others):
             curious = 2 * near if method == "calm" else far
             write_cell(folder, TASK, method, 0, {}, states={"random": near, "curious": curious})
-        rows = {(row.method, row.actor): row for row in statistics.state_coverage(read_results(folder)[0])}
+        rows = {(row.method, row.actor): row for row in state_coverage(read_results(folder)[0])}
         found.append((rows["calm", "random"].occupied[0], rows["calm", "curious"].occupied[0]))
     assert found[0] == found[1] and found[0][1] > 1.3 * found[0][0]
     assert rows["wild", "curious"].occupied[0] == pytest.approx((50 + 50 + 1) / 3)
@@ -312,7 +319,7 @@ def test_coverage_counts_cells_of_equally_many_states(tmp_path: Path) -> None:
     corners = np.array([[0.0, 0.0], [1.0, 1.0]])  # a policy that stays in one point has no range: cells of size 1
     states = {"random": np.repeat(corners[:1], 100, axis=0), "curious": np.tile(corners, (200, 1))}
     write_cell(folder, TASK, "cure_sac_ae", 0, {}, states=states)
-    random, curious = statistics.state_coverage(read_results(folder)[0])
+    random, curious = state_coverage(read_results(folder)[0])
     assert (random.actor, random.occupied.tolist(), random.entropy.tolist()) == ("random", [1], [0.0])
     assert (curious.actor, curious.occupied.tolist(), curious.steps, curious.dimensions) == ("curious", [2], 100, 2)
     assert curious.entropy[0] == pytest.approx(1, abs=0.02)
@@ -325,7 +332,7 @@ def test_visits_are_counted_for_each_pair_of_coordinates(dimensions: int, n: int
     states = np.random.default_rng(seed).normal(0, 3, (n, dimensions))
     low, width = np.full(dimensions, -1.0), np.linspace(0.5, 2, dimensions)
     pairs = list(itertools.combinations(range(dimensions), 2)) or [(0, 0)]
-    found = statistics.visits_by_pair(states, low, width)
+    found = visits_by_pair(states, low, width)
     for (i, j), counts in zip(pairs, found, strict=True):
         cells = [tuple(np.floor((state[[i, j]] - low[[i, j]]) / width[[i, j]])) for state in states]
         assert sorted(counts) == sorted(Counter(cells).values())
@@ -338,18 +345,18 @@ def test_cells_of_angles_go_round_the_circle(tmp_path: Path) -> None:
     angles = np.linspace(-np.pi, np.pi, 2000)
     states = {"random": np.full((2000, 2), [3.1, 0.0]), "curious": np.stack([angles, 0 * angles], axis=1)}
     write_cell(folder, TASK, "cure_sac_ae", 0, {}, states=states, state_units=["rad", "rad/s"])
-    random, curious = statistics.state_coverage(read_results(folder)[0])
-    assert (random.occupied.tolist(), curious.occupied.tolist()) == ([1], [statistics.GRID_INTERVALS])
+    random, curious = state_coverage(read_results(folder)[0])
+    assert (random.occupied.tolist(), curious.occupied.tolist()) == ([1], [GRID_INTERVALS])
 
 
 @given(st.lists(st.integers(1, 1000), min_size=1, max_size=30))
 def test_entropy_is_at_most_that_of_even_visits(counts: list[int]) -> None:
-    assert -1e-9 <= statistics.entropy_bits(np.array(counts)) <= np.log2(len(counts)) + 1e-9
+    assert -1e-9 <= entropy_bits(np.array(counts)) <= np.log2(len(counts)) + 1e-9
 
 
 def test_comparison_with_published_returns(results: Path) -> None:
     """150 on average where SAC-AE published 311 is below 0.75 of it: suspected; arms with curiosity are not judged."""
-    baseline, cure = statistics.compare_with_published(read_results(results))
+    baseline, cure = published.compare_with_published(read_results(results))
     assert (baseline.method, baseline.steps, baseline.ours, baseline.theirs) == ("sac_ae", 100_000, 150, (311, 11))
     assert baseline.suspect and baseline.same_method and baseline.std == pytest.approx(70.71, abs=0.01)
     assert (cure.published_as, cure.same_method, cure.suspect) == ("SAC-AE", False, False)
@@ -361,7 +368,7 @@ def test_bar_of_suspicion(tmp_path: Path, final: float, suspect: bool) -> None:
     folder = tmp_path / "curves"
     write_grid(folder)
     write_cell(folder, TASK, "sac_ae", 0, curve(0, final), arguments=RAE)
-    (row,) = statistics.compare_with_published(read_results(folder))
+    (row,) = published.compare_with_published(read_results(folder))
     assert row.suspect is suspect and np.isnan(row.std)
 
 
@@ -403,7 +410,7 @@ def test_damaged_files_are_named_in_one_sentence(results: Path, name: str, conte
 def test_damaged_states_and_missing_folders(results: Path, tmp_path: Path) -> None:
     (results / TASK / "sac_ae" / "seed0" / "visits.npz").write_bytes(b"PK no zip")
     with pytest.raises(ResultsError, match=r"visits\.npz cannot be read"):
-        statistics.state_coverage(read_results(results)[0])
+        state_coverage(read_results(results)[0])
     with pytest.raises(ResultsError, match="is no folder"):
         read_results(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
@@ -431,4 +438,4 @@ def test_other_pixels_are_not_judged_by_published_numbers(tmp_path: Path) -> Non
         write_grid(folder)
         write_cell(folder, TASK, "sac_ae", 0, curve(0, 50, 100), arguments=arguments, env_kwargs=env_kwargs)
         (experiment,) = read_results(str(folder))
-        assert bool(statistics.compare_with_published([experiment])) == compared, name
+        assert bool(published.compare_with_published([experiment])) == compared, name

@@ -1,6 +1,16 @@
-"""Published numbers that results are compared with, each with its source. Anchors for sanity, not gates."""
+"""Published numbers, each with its source, and results beside them. Anchors for sanity, not gates."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
+
+import numpy as np
+
+from sb3_cure.experiments.results import Experiment
+from sb3_cure.experiments.statistics import stack_curves
+
+#: Below this part of a published mean, a return is suspected to be a bug of ours.
+SUSPECT_BELOW = 0.75
 
 
 class MeanStd(NamedTuple):
@@ -179,3 +189,71 @@ def published_method(arguments: dict) -> tuple[str | None, bool]:
     """
     base = {"rae": "SAC-AE", "curl": "CURL"}.get(str(arguments.get("srl", "rae")))
     return base, arguments.get("curiosity", "separate") is not None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An arm beside a published number at the same environment steps.
+
+    :param theirs: The published value of the method that the arm is, or builds upon; None if there is none
+    :param published_as: Name of that method
+    :param same_method: Whether the arm is that method, rather than adding curiosity to it
+    :param ours: Mean return of the seeds at that step
+    :param std: Standard deviation over seeds; nan with one
+    """
+
+    experiment: str
+    task: str
+    method: str
+    steps: int
+    seeds: int
+    ours: float
+    std: float
+    theirs: MeanStd | None
+    published_as: str
+    same_method: bool
+
+    @property
+    def suspect(self) -> bool:
+        """Whether the return is so far below the published one that a bug of ours is suspected."""
+        return self.same_method and self.theirs is not None and self.ours < SUSPECT_BELOW * self.theirs.mean
+
+
+def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison]:
+    """
+    :param experiments: Experiments; those about visitation have no returns to compare
+    :return: Every arm at every published step that its curves reach, of those that see the published pixels
+    """
+    rows = []
+    for experiment in experiments:
+        for task in experiment.tasks:
+            for method in experiment.methods:
+                cells = [cell for cell in experiment.done(task, method).values() if len(cell.curve()[0]) > 1]
+                if not cells or experiment.kind == "visitation" or cells[0].config.get("pretrain"):
+                    continue
+                base, curious = published_method(cells[0].config.get("arguments", {}))
+                if base is None or not all(cell.sees_published_pixels for cell in cells):
+                    continue
+                steps, stacked = stack_curves(cells)
+                for at, table in RETURNS[base].items():
+                    # An agent step may be worth up to 8 environment steps, in several environments at once.
+                    if len(steps) < 2 or steps[-1] < 0.99 * at:
+                        continue
+                    values = np.array([np.interp(at, steps, curve) for curve in stacked])
+                    std = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+                    theirs = table.get(task_key(task))
+                    rows.append(
+                        Comparison(
+                            experiment.name,
+                            task,
+                            method,
+                            at,
+                            len(cells),
+                            float(values.mean()),
+                            std,
+                            theirs,
+                            base,
+                            not curious,
+                        )
+                    )
+    return rows

@@ -24,7 +24,7 @@ from PIL import Image
 
 import sb3_cure
 from sb3_cure.experiments import plots, published, statistics, tables
-from sb3_cure.experiments.statistics import Experiment, ResultsError
+from sb3_cure.experiments.results import Experiment, ResultsError, read_results
 from sb3_cure.experiments.tables import (
     Table,
     difference_label,
@@ -35,6 +35,7 @@ from sb3_cure.experiments.tables import (
     plural,
     ratio_text,
 )
+from sb3_cure.experiments.visit_statistics import HEADS, Coverage, ErrorSummary, state_coverage, summarise_errors
 
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
@@ -181,7 +182,7 @@ def describe(experiment: Experiment, thresholds: Sequence[float]) -> Section:
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure | str]]:
-    coverage, errors = statistics.state_coverage(experiment), statistics.summarise_errors(experiment)
+    coverage, errors = state_coverage(experiment), summarise_errors(experiment)
     parts: list[Table | Figure | str] = []
     if coverage:
         panels = {
@@ -197,7 +198,7 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
         )
         parts.append(_figure("coverage", caption, plots.coverage_bars, panels, "occupied cells of the true state"))
         parts.append(tables.coverage_table(experiment, coverage))
-    for head in [head for head in statistics.HEADS if any(row.head == head for row in errors)]:
+    for head in [head for head in HEADS if any(row.head == head for row in errors)]:
         judged = [row for row in errors if row.head == head]
         bars = {
             task: [
@@ -220,7 +221,7 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
     return list(_visitation_headlines(experiment, coverage, errors)), parts
 
 
-def _yardsticks(experiment: Experiment, task: str, errors: Sequence[statistics.ErrorSummary]) -> dict[str, float]:
+def _yardsticks(experiment: Experiment, task: str, errors: Sequence[ErrorSummary]) -> dict[str, float]:
     lines = {}
     for head, label in (("zero", "always zero"), ("mean_image", "mean image")):
         values = [row.error_mean for row in errors if (row.task, row.head) == (task, head)]
@@ -238,7 +239,7 @@ def _times_random(ratio: statistics.Estimate) -> str:
 
 
 def _visitation_headlines(
-    experiment: Experiment, coverage: Sequence[statistics.Coverage], errors: Sequence[statistics.ErrorSummary]
+    experiment: Experiment, coverage: Sequence[Coverage], errors: Sequence[ErrorSummary]
 ) -> Iterator[str]:
     """Of each arm with a curious policy a sentence against the random policy, and one against the task policy."""
     for task in experiment.tasks:
@@ -252,7 +253,7 @@ def _visitation_headlines(
             rows += [
                 (row, f"the SRL error under the {row.head} head")
                 for row in errors
-                if (row.task, row.method, row.actor) == key and row.head in statistics.HEADS
+                if (row.task, row.method, row.actor) == key and row.head in HEADS
             ]
             seeds = plural(len(experiment.done(task, method)), "seed")
             others = {"random policy": "ratio", f"task policy of {experiment.baseline_of(method)}": "task_ratio"}
@@ -549,9 +550,9 @@ def write_report(
     :return: What was written
     :raises ResultsError: with one sentence that names the file and what is wrong
     """
-    experiments = statistics.read_results(results)
+    experiments = read_results(results)
     sections = [describe(experiment, thresholds) for experiment in experiments]
-    comparisons = statistics.compare_with_published(experiments)
+    comparisons = published.compare_with_published(experiments)
     table = tables.published_table(comparisons) if comparisons else None
     files: dict[Path, bytes] = {out: render_html(sections, table, media, results.resolve().name).encode()}
     title = markdown_text(results.resolve().name)

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from sb3_cure.experiments import published, statistics
-from sb3_cure.experiments.statistics import Estimate, Experiment
+from sb3_cure.experiments.results import FAILED, NOT_RUN, UNFINISHED, CellResult, Experiment
+from sb3_cure.experiments.statistics import Estimate
+from sb3_cure.experiments.visit_statistics import GRID_INTERVALS, Coverage, ErrorSummary
 
 NONE = "\N{EN DASH}"
 DIFFERENCES = (
@@ -76,7 +78,7 @@ def markdown_text(text: str) -> str:
 
 def _table_cell(kind: str, text: str) -> str:
     marks = {"suspected bug": "bad", "worse": "bad", "better": "good"}
-    marks |= {statistics.FAILED: "bad", statistics.NOT_RUN: "absent", statistics.UNFINISHED: "absent"}
+    marks |= {FAILED: "bad", NOT_RUN: "absent", UNFINISHED: "absent"}
     mark = next((name for word, name in marks.items() if text.startswith(word)), "")
     content = escape(text)
     return f"<td{kind}>{f'<span class={mark!r}>{content}</span>' if mark else content}</td>"
@@ -157,8 +159,8 @@ def status_table(experiment: Experiment) -> Table:
 
 def _state(experiment: Experiment, task: str, method: str) -> str:
     state = experiment.state(task, method)
-    if set(state) <= {statistics.NOT_RUN}:
-        return statistics.NOT_RUN
+    if set(state) <= {NOT_RUN}:
+        return NOT_RUN
     return "; ".join(f"{status}: {', '.join(map(str, seeds))}" for status, seeds in state.items())
 
 
@@ -282,7 +284,7 @@ def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Tab
     )
 
 
-def error_table(experiment: Experiment, summaries: Sequence[statistics.ErrorSummary]) -> Table:
+def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Table:
     """
     :param experiment: An experiment
     :param summaries: What its policies meet
@@ -332,7 +334,7 @@ def ratio_text(estimate: Estimate) -> str:
     return f"{number_text(estimate.value, 2)} {shown}"
 
 
-def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) -> Table:
+def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
     """
     :param experiment: An experiment
     :param rows: Coverage by actor
@@ -353,7 +355,7 @@ def coverage_table(experiment: Experiment, rows: Sequence[statistics.Coverage]) 
         shown,
         f"Positions and velocities of the simulator ({dimensions}), of which the agents see only images; actions are "
         "sampled, as in training. Cells are those of a grid over two coordinates, mean over all pairs of them: "
-        f"{statistics.GRID_INTERVALS} intervals between the random policy's 1st and 99th percentile (of angles: on the "
+        f"{GRID_INTERVALS} intervals between the random policy's 1st and 99th percentile (of angles: on the "
         "circle), and cells of that size beyond. Equally many states are counted of each actor and seed. Ratios "
         f"(baseline: {_baselines(experiment)}): geometric mean over seeds, t interval of the logarithms.",
     )
@@ -389,7 +391,7 @@ def _papers_arm(method: str) -> Mapping[str, published.MeanStd]:
     return published.PRETRAINING.get(method.lower().replace("-", "_"), {})
 
 
-def published_table(comparisons: Sequence[statistics.Comparison]) -> Table:
+def published_table(comparisons: Sequence[published.Comparison]) -> Table:
     """
     :param comparisons: Arms beside published numbers
     :return: Ours, theirs, difference
@@ -408,7 +410,7 @@ def published_table(comparisons: Sequence[statistics.Comparison]) -> Table:
             difference, ratio = number_text(row.ours - row.theirs.mean), f"{row.ours / row.theirs.mean:.2f}"
             judgement = "ok" if row.same_method else "adds curiosity: not judged"
         if row.suspect:
-            judgement = f"suspected bug: below {statistics.SUSPECT_BELOW} x published"
+            judgement = f"suspected bug: below {published.SUSPECT_BELOW} x published"
         run = [row.experiment, row.task, row.method, number_text(row.steps), str(row.seeds), ours]
         rows.append([*run, theirs, difference, ratio, judgement, "; ".join(others) or NONE])
     sources = "; ".join(f"{name}: {source}" for name, source in published.SOURCES.items())
@@ -418,7 +420,7 @@ def published_table(comparisons: Sequence[statistics.Comparison]) -> Table:
         [*columns, "judgement", "other methods"],
         rows,
         f"At the same environment steps. {sources}. Independent reruns land 5 to 25 % lower than published; below "
-        f"{statistics.SUSPECT_BELOW} of the published mean a bug of ours is suspected until shown otherwise.",
+        f"{published.SUSPECT_BELOW} of the published mean a bug of ours is suspected until shown otherwise.",
     )
 
 
@@ -428,7 +430,7 @@ def conditions_table(experiment: Experiment) -> Table:
     :return: Under which conditions each curve was obtained; seeds of an arm that had the same ones share a row
     """
     letters: dict[str, str] = {}
-    rows: dict[tuple[str, ...], list[statistics.CellResult]] = {}
+    rows: dict[tuple[str, ...], list[CellResult]] = {}
     commits: dict[tuple[str, int], set[str]] = {}
     for cell in experiment.cells.values():
         if not cell.done:
@@ -460,11 +462,11 @@ def _letters(index: int) -> str:
     return chr(ord("A") + index) if index < 26 else f"Z{index - 25}"
 
 
-def _steps(cell: statistics.CellResult) -> str:
+def _steps(cell: CellResult) -> str:
     steps, _ = cell.curve("environment_steps")
     return number_text(float(steps[-1])) if len(steps) else NONE
 
 
-def _pretraining(cell: statistics.CellResult) -> str:
+def _pretraining(cell: CellResult) -> str:
     phase = cell.config.get("pretrain")
     return f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE

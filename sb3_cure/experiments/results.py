@@ -1,0 +1,300 @@
+"""Reads the folders that experiments wrote, and checks what is in them."""
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_cure.experiments.files import Row, read_rows
+from sb3_cure.experiments.grid import short_name
+
+DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+
+
+class ResultsError(ValueError):
+    """Results that cannot be read; the message is one sentence that names the file."""
+
+
+@dataclass(frozen=True)
+class Visit:
+    """SRL error of one episode under one head (a row of ``visitation.csv``)."""
+
+    actor: str
+    head: str
+    episode: int
+    error_min: float
+    error_mean: float
+    error_max: float
+    total_reward: float
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """One training run as found on disk.
+
+    :param task: Short name of the task (``"cartpole-swingup"``)
+    :param method: Name of the arm
+    :param seed: Seed
+    :param folder: Where its files lie
+    :param status: ``"done"``, ``"unfinished"``, ``"failed"``, ``"not run"``, or which other budget it was run with;
+        only cells that are done have what follows, and enter statistics
+    :param config: ``config.json``
+    :param run: ``run.json``
+    :param evaluations: Columns of ``eval.csv`` (missing values are nan); empty if there is none
+    :param visitation: Rows of ``visitation.csv``
+    """
+
+    task: str
+    method: str
+    seed: int
+    folder: Path
+    status: str
+    config: dict[str, Any] = field(default_factory=dict)
+    run: dict[str, Any] = field(default_factory=dict)
+    evaluations: dict[str, np.ndarray] = field(default_factory=dict)
+    visitation: tuple[Visit, ...] = ()
+
+    @property
+    def done(self) -> bool:
+        return self.status == DONE
+
+    @property
+    def sees_published_pixels(self) -> bool:
+        """Whether its images are those of the published results: only then numbers compare."""
+        arguments = self.config.get("arguments", {})
+        crops = arguments.get("srl_kwargs", {}).get("augmentation") == "crop"
+        usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
+        return {**usual, **self.config.get("env_kwargs", {})} == usual
+
+    def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
+        """
+        :param column: A column of ``eval.csv``
+        :return: Environment steps and values where there are any, [n] each
+        """
+        steps = self.evaluations.get("environment_steps", np.zeros(0))
+        values = self.evaluations.get(column, np.full(len(steps), np.nan))
+        there = np.isfinite(values)
+        return steps[there], values[there]
+
+    def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+        """
+        :return: True physics states by actor, [n, d] each, and the units of their coordinates (``visits.npz``); both
+            empty if there are none
+        :raises ResultsError: if the file cannot be read
+        """
+        path = self.folder / "visits.npz"
+        if not self.done or not path.exists():
+            return {}, ()
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                names = [name for name in file.files if name.endswith("_states")]
+                found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
+                units = tuple(map(str, file["state_units"])) if found else ()
+        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+            raise ResultsError(f"{path} cannot be read ({error}): run the cell again.") from None
+        for actor, states in found.items():
+            if states.ndim != 2 or not np.isfinite(states).all() or states.shape[1] != len(units):
+                shape = f"{actor}_states of shape {states.shape}, and units {units}"
+                raise ResultsError(f"{path} has {shape}, but finite [n, d] and d units are needed: run the cell again.")
+        return found, units
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All cells of a grid, run or not.
+
+    :param name: Its folder below the one that was read (``"500k/curves"``), or its own name
+    :param folder: Where it lies
+    :param grid: ``grid.json``
+    :param cells: By (task, method, seed), in the grid's order; cells on disk that the grid does not name come last
+    """
+
+    name: str
+    folder: Path
+    grid: dict[str, Any]
+    cells: dict[tuple[str, str, int], CellResult]
+
+    @property
+    def kind(self) -> str:
+        return str(self.grid["kind"])
+
+    @property
+    def budget(self) -> int:
+        return int(self.grid["budget"])
+
+    @property
+    def baseline(self) -> str:
+        return str(self.grid["baseline"])
+
+    def baseline_of(self, method: str) -> str:
+        """
+        :param method: Name of an arm
+        :return: The arm with which it is compared: its own baseline if the grid gives it one
+        """
+        methods = self.grid["methods"]
+        described = methods.get(method) if isinstance(methods, dict) else None
+        return str(described.get("baseline", self.baseline)) if isinstance(described, dict) else self.baseline
+
+    @property
+    def tasks(self) -> list[str]:
+        return list(dict.fromkeys(task for task, _, _ in self.cells))
+
+    @property
+    def methods(self) -> list[str]:
+        return list(dict.fromkeys(method for _, method, _ in self.cells))
+
+    @property
+    def seeds(self) -> list[int]:
+        return sorted({seed for _, _, seed in self.cells})
+
+    def done(self, task: str, method: str) -> dict[int, CellResult]:
+        """
+        :return: The finished cells of an arm on a task, by seed
+        """
+        return {
+            seed: cell
+            for (at, arm, seed), cell in sorted(self.cells.items(), key=lambda item: item[0][2])
+            if (at, arm) == (task, method) and cell.done
+        }
+
+    @property
+    def sees_published_pixels(self) -> bool:
+        """Whether all of its finished cells do, see ``CellResult``."""
+        return all(cell.sees_published_pixels for cell in self.cells.values() if cell.done)
+
+    def state(self, task: str, method: str) -> dict[str, list[int]]:
+        """
+        :return: Seeds of an arm on a task by the status of their cells; those of the grid are "not run" at least
+        """
+        seeds: dict[str, list[int]] = {}
+        for (at, arm, seed), cell in sorted(self.cells.items(), key=lambda item: item[0][2]):
+            if (at, arm) == (task, method):
+                seeds.setdefault(cell.status, []).append(seed)
+        return seeds
+
+
+def read_results(folder: str | Path) -> list[Experiment]:
+    """Read everything that ``sb3-cure experiment`` wrote.
+
+    :param folder: A folder with experiments anywhere below it, or the folder of one
+    :return: The experiments, by name
+    :raises ResultsError: with one sentence that names the folder or file and what is wrong with it
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ResultsError(f"{folder} is no folder: give the one that `sb3-cure experiment` wrote.")
+    if (folder / "grid.json").exists():
+        return [_read_experiment(folder / "grid.json")]
+    grids = sorted(folder.rglob("grid.json"))
+    if not grids:
+        raise ResultsError(
+            f"{folder} holds no experiment (no grid.json in it, nor anywhere below it): give the folder that "
+            "`sb3-cure experiment` wrote."
+        )
+    return [_read_experiment(path, path.parent.relative_to(folder).as_posix()) for path in grids]
+
+
+def _read_experiment(path: Path, name: str | None = None) -> Experiment:
+    grid = _read_json(path)
+    for key, kind in (("experiment", str), ("kind", str), ("budget", int), ("baseline", str), ("tasks", list)):
+        if not isinstance(grid.get(key), kind) or isinstance(grid.get(key), bool):
+            raise ResultsError(f"{path} has {key} {grid.get(key)!r}, but it must be a {kind.__name__}: correct it.")
+    methods, seeds = grid.get("methods"), grid.get("seeds")
+    if not isinstance(methods, dict | list) or not methods:
+        raise ResultsError(f"{path} has methods {methods!r}, but they must be a mapping of arms: correct it.")
+    if isinstance(seeds, int):
+        seeds = list(range(seeds))
+    if not isinstance(seeds, list) or not all(isinstance(seed, int) for seed in seeds):
+        raise ResultsError(f"{path} has seeds {grid.get('seeds')!r}, but they must be a list of numbers: correct it.")
+    tasks = [short_name(str(task)) for task in grid["tasks"]]
+    for part in (*tasks, *methods):
+        if part in ("", ".", "..") or any(mark in part for mark in "/\\\0"):
+            raise ResultsError(f"{path} names {part!r}, which cannot be the name of a folder: correct it.")
+    root = path.parent
+    keys = [(task, method, seed) for task in tasks for method in methods for seed in seeds]
+    for found in sorted(root.glob("*/*/seed*")):
+        number = found.name.removeprefix("seed")
+        if found.is_dir() and number.isdecimal():
+            keys.append((found.parent.parent.name, found.parent.name, int(number)))
+    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"]) for key in keys}
+    order = {task: index for index, task in reversed(list(enumerate(task for task, _, _ in cells)))}
+    in_order = dict(sorted(cells.items(), key=lambda item: order[item[0][0]]))
+    return Experiment(name or grid["experiment"], root, grid, in_order)
+
+
+def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int) -> CellResult:
+    if not folder.is_dir():
+        return CellResult(task, method, seed, folder, NOT_RUN)
+    if not (folder / "DONE").exists():
+        return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
+    config, run = _read_json(folder / "config.json"), _read_json(folder / "run.json")
+    if (config.get("method", method), config.get("seed", seed)) != (method, seed):
+        raise ResultsError(
+            f"{folder / 'config.json'} is of method {config.get('method')!r} and seed {config.get('seed')!r}, "
+            "which its folder is not: put it back."
+        )
+    own_budget = config.get("budget", budget)
+    if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
+        return CellResult(task, method, seed, folder, f"other budget: {own_budget} steps", config, run)
+    evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
+    visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
+    return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ResultsError(f"{path} cannot be read ({error.strerror}): run the cell or the experiment again.") from None
+    except ValueError as error:
+        raise ResultsError(f"{path} is no JSON ({error}): run the cell or the experiment again.") from None
+    if not isinstance(content, dict):
+        raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: correct it.")
+    return content
+
+
+def _read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
+    try:
+        return read_rows(path, needed)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ResultsError(f"{path} cannot be read ({error}): run the cell again.") from None
+    except ValueError as error:
+        raise ResultsError(f"{path} {error}: run the cell again.") from None
+
+
+def _number(path: Path, line: int, column: str, value: Any) -> float:
+    if value == "":
+        return float("nan")
+    if isinstance(value, str):
+        raise ResultsError(f"{path} has {value!r} as {column} in line {line}, which is no number: correct it.")
+    return float(value)
+
+
+def _read_evaluations(path: Path) -> dict[str, np.ndarray]:
+    rows = _read_rows(path, ("environment_steps", "return_mean"))
+    columns = {
+        name: np.array([_number(path, line, name, row[name]) for line, row in enumerate(rows, 2)])
+        for name in (rows[0] if rows else ("environment_steps", "return_mean"))
+    }
+    steps = columns["environment_steps"]
+    if not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
+        raise ResultsError(f"{path} has environment_steps that do not grow from row to row: run the cell again.")
+    return columns
+
+
+def _read_visitation(path: Path) -> tuple[Visit, ...]:
+    names = ("error_min", "error_mean", "error_max", "return")
+    rows = _read_rows(path, ("actor", "head", "episode", *names))
+    return tuple(
+        Visit(
+            row["actor"],
+            row["head"],
+            int(_number(path, line, "episode", row["episode"] or 0)),
+            *(_number(path, line, name, row[name]) for name in names),
+        )
+        for line, row in enumerate(rows, 2)
+    )
