@@ -265,8 +265,12 @@ def walk(callback: BaseCallback) -> list[BaseCallback]:
     return [callback, *(each for child in inside if isinstance(child, BaseCallback) for each in walk(child))]
 
 
+#: Where a callback keeps what its plain attributes were before its first ``learn``
+_AT_FIRST = "_sb3_cure_at_first"
+
+
 class WatchedCallback(NamedTuple):
-    """A callback of the running ``learn``, and what its plain attributes were when that began."""
+    """A callback of the running ``learn``, and what its plain attributes were when the first one with it began."""
 
     callback: BaseCallback
     before: dict[str, Any]
@@ -278,7 +282,11 @@ def watch(callback: BaseCallback) -> list[WatchedCallback]:
     :return: All callbacks in it, to see later what has changed in them
     """
     others = [each for each in walk(callback) if not isinstance(each, ExactCheckpoint)]
-    return [WatchedCallback(each, copy.deepcopy(_plain_attributes(each))) for each in others]
+    for each in others:
+        # A callback may serve several calls, of which those that are over will be skipped.
+        if not hasattr(each, _AT_FIRST):
+            setattr(each, _AT_FIRST, copy.deepcopy(_plain_attributes(each)))
+    return [WatchedCallback(each, getattr(each, _AT_FIRST)) for each in others]
 
 
 def _plain_attributes(callback: BaseCallback) -> dict[str, Any]:
@@ -288,7 +296,7 @@ def _plain_attributes(callback: BaseCallback) -> dict[str, Any]:
 
 
 def _changed(watched: WatchedCallback) -> dict[str, Any]:
-    """A callback's counters and the like: public plain attributes that differ from those at the start of ``learn``."""
+    """A callback's counters and the like: public plain attributes that differ from those before its first ``learn``."""
     now = _plain_attributes(watched.callback)
     missing = object()
     changed = {name: value for name, value in now.items() if not _equal(watched.before.get(name, missing), value)}

@@ -422,7 +422,10 @@ class OneStart(gym.Wrapper):
         return self.env.reset(seed=3)
 
 
-def test_callbacks_go_on_counting(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("case", "kill_at"), [("rae, joint", 33), ("pretraining", 58), ("pretraining", 28)])
+def test_callbacks_go_on_counting(case: str, kill_at: int, tmp_path: Path) -> None:
+    """From the last checkpoint, also what they counted in a call that is over."""
+
     class Count(PeriodicCallback):
         def __init__(self) -> None:
             super().__init__(10)
@@ -441,10 +444,10 @@ def test_callbacks_go_on_counting(tmp_path: Path) -> None:
         return each[0].at, each[1].evaluations_timesteps, each[1].n_calls, each[1].best_mean_reward
 
     whole, killed, resumed = callbacks(), callbacks(), callbacks()
-    train(CASES["rae, joint"], tmp_path / "whole", False, *whole)
+    train(CASES[case], tmp_path / "whole", False, *whole)
     with pytest.raises(Killed):
-        train(CASES["rae, joint"], tmp_path / "killed", False, *killed, KillAt(33))
-    train(CASES["rae, joint"], tmp_path / "killed", True, *resumed)
+        train(CASES[case], tmp_path / "killed", False, *killed, KillAt(kill_at))
+    train(CASES[case], tmp_path / "killed", True, *resumed)
     assert at_end(whole) == at_end(resumed)
 
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -26,8 +27,10 @@ from envs_for_tests import PixelBox, differences, state_of
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
+import sb3_cure
 from sb3_cure import CuReSAC, files, generations
 from sb3_cure.experiments import cells, heads, media, plots, probe, run, yardsticks
+from sb3_cure.experiments import files as experiment_files
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
@@ -138,8 +141,8 @@ def test_a_method_may_have_a_baseline_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(GRIDS.rglob("*.yml")), ids=lambda path: str(path.relative_to(GRIDS)))
-def test_the_projects_grids_can_be_built(path: Path) -> None:
-    """Every arm's arguments are accepted by CuReSAC in the task's own spaces (networks made small)."""
+def test_the_projects_grids_can_be_built_and_trained(path: Path) -> None:
+    """Every arm's arguments are accepted by CuReSAC in spaces like the task's; the last one trains for 50 steps."""
     grid = load_grid(path, seeds=1)
     assert grid.experiment == ("fast_" if path.parent.name == "fast" else "") + path.stem
     kwargs = {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2}}
@@ -153,6 +156,14 @@ def test_the_projects_grids_can_be_built(path: Path) -> None:
         assert (model.policy.curious_actor is not None) == (
             cell.arguments.get("curiosity", "separate") == "separate" and cell.arguments["srl"] is not None
         )
+    few = {"policy_kwargs": kwargs, "buffer_size": 50, "learning_starts": 30, "warmup_updates": 2, "batch_size": 4}
+    model = CuReSAC(env=env, **{**cell.arguments, **few})
+    if cell.pretrain is not None:
+        model.pretrain(50, cell.pretrain.collector)
+    if cell.budget > 0:
+        model.learn(50)
+    assert model.num_timesteps == (50 if cell.budget > 0 else 0)
+    assert float(model.logger.name_to_value["train/srl_loss"]) > 0
 
 
 @pytest.mark.parametrize(
@@ -371,7 +382,8 @@ def test_a_pretrained_cell_that_was_killed_ends_like_one_that_was_not(
 
     def outcome(folder: Path) -> Any:
         episodes = (folder / "episodes.csv").read_text()
-        return state_of(CuReSAC.load(folder / "model.zip")), kept.pop(), episodes, steps_of(folder / "eval.csv")
+        evaluations = [{**row, "seconds": 0} for row in read_rows(folder / "eval.csv")]
+        return state_of(CuReSAC.load(folder / "model.zip")), kept.pop(), episodes, evaluations
 
     expected = outcome(run_cell(cell, tmp_path / "whole", minutes, pictures=False))
     assert n_steps == 30 + 20 + 30 + 20
@@ -383,6 +395,9 @@ def test_a_pretrained_cell_that_was_killed_ends_like_one_that_was_not(
         np.random.seed(99)  # whatever another process begins with
         th.manual_seed(99)
         assert differences(expected, outcome(run_cell(cell, folder, minutes, pictures=False))) == [], kill_at
+        conditions = json.loads((folder / cell.folder / "run.json").read_text())
+        assert len(conditions["history"]) == conditions["attempts"] == 2
+        assert conditions["started"] == conditions["history"][0]["started"]
 
 
 def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
@@ -887,6 +902,122 @@ def test_variants_of_an_arm_do_not_outweigh_the_others_in_common_heads(
     assert mixed == [3 * heads.COMMON_SHARE] * 2
     for actor in ("random", "task", "curious"):  # of both seeds: once for the mix, once to be judged
         assert (rolled_out.count(("first", actor)), rolled_out.count(("variant", actor))) == (4, 2)
+
+
+def test_results_name_their_commit_wherever_the_code_comes_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A checkout's, marked when changed; what pip was given; what an image says; nothing where nothing tells."""
+    package = tmp_path / "checkout" / "sb3_cure" / "__init__.py"
+    package.parent.mkdir(parents=True)
+    package.touch()
+    monkeypatch.setattr(sb3_cure, "__file__", str(package))
+    monkeypatch.delenv("SB3_CURE_COMMIT", raising=False)
+    origin = dict[str, Any]()
+    installed = SimpleNamespace(read_text=lambda name: json.dumps(origin) if name == "direct_url.json" else None)
+    monkeypatch.setattr(experiment_files, "distribution", lambda name: installed)
+    assert experiment_files.code_commit() is None
+    origin.update(url="https://example.com/repo", vcs_info={"vcs": "git", "commit_id": "0123456789abcdef"})
+    assert experiment_files.code_commit() == "0123456789ab"
+    git = ["git", "-C", str(package.parent.parent), "-c", "user.name=a", "-c", "user.email=a@example.com"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "all"]):
+        subprocess.run([*git, *command], check=True)
+    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout[:12]
+    assert experiment_files.code_commit() == commit
+    package.write_text("changed")
+    assert experiment_files.code_commit() == f"{commit}-dirty"
+    monkeypatch.setenv("SB3_CURE_COMMIT", "v1.2-3-gabc")
+    assert experiment_files.code_commit() == "v1.2-3-gabc"
+
+
+def test_cells_of_other_settings_are_refused_whatever_their_seed(tmp_path: Path) -> None:
+    """One seed per job, of which somebody changed the grid in between: else arms would mix both, unseen."""
+    overrides = {"config": "zoo.yml", "overrides": {"batch_size": 9}}
+    run.run_grid(load_grid(write_grid(tmp_path), seeds=[7]), tmp_path / "out", pictures=False)
+    changed = load_grid(write_grid(tmp_path, methods={"cure": overrides}), seeds=[8])
+    with pytest.raises(GridError, match=r"seed7 was run with other settings: arguments is .*'batch_size': 8.* there"):
+        run.run_grid(changed, tmp_path / "out", pictures=False)
+    assert not (tmp_path / "out" / changed.cells[0].folder).exists()
+
+
+def test_common_heads_see_the_other_seeds_alone(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The policies of a seed are judged by a head that has seen nothing of them, but all of the others."""
+    seen: dict[int, set[int]] = {}
+
+    def mix(head: heads.CommonHead, seed: int, results: Path) -> np.ndarray:
+        return np.full((4, 3, 24, 24), seed, dtype=np.uint8)
+
+    def fit(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
+        seen[model.seed - 1000] = set(np.unique(observations).tolist())
+        yield 1
+
+    monkeypatch.setattr(heads, "_mix", mix)
+    monkeypatch.setattr(heads, "fit_head", fit)
+    assert run.run_grid(load_grid(visits), visits.parent / "out", pictures=False) == []
+    assert seen == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}}
+
+
+def test_common_heads_are_made_of_all_finished_seeds_whoever_ran_them(visits: Path) -> None:
+    """One call per seed, none of them the file's; then nobody who knew less replaces what was made."""
+    out = visits.parent / "out"
+    for seed in (5, 6):
+        assert run.run_grid(load_grid(visits, seeds=[seed]), out, pictures=False) == []
+    grid = load_grid(visits, seeds=[7])
+    known = heads.common_heads(grid, out)
+    assert [head.seed for head in known] == [5, 6] and all(common_rows(out).values())
+    assert run.run_grid(grid, out, pictures=False) == []
+    rows = common_rows(out)
+    assert [head.seeds for head in heads.common_heads(grid, out)] == [[5, 6, 7]] * 3 and rows.keys() == {
+        "seed5", "seed6", "seed7"
+    }  # fmt: skip
+    for head in known:
+        heads.run_head(head, out)
+    assert common_rows(out) == rows
+
+
+def test_common_heads_in_other_hands_come_last(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process that makes one, perhaps of fewer cells, is waited for; meanwhile the others are made."""
+    out, order = visits.parent / "out", list[int]()
+    assert run.run_grid(load_grid(visits, seeds=[0]), out, pictures=False) == []
+    folder = out / "tiny" / "PixelBox" / "common_heads" / "for_seed0"
+    folder.mkdir(parents=True)
+    fit, others_are_made = heads.fit_head, threading.Event()
+
+    def note(model: CuReSAC, *arguments: Any) -> Iterator[int]:
+        order.append(model.seed - 1000)
+        yield from fit(model, *arguments)
+        if len(order) == 2:
+            others_are_made.set()
+
+    def hold() -> None:
+        with cells.alone_in(folder):
+            assert others_are_made.wait(100)
+
+    monkeypatch.setattr(heads, "fit_head", note)
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert run.run_grid(load_grid(visits), out, pictures=False) == []
+    holder.join()
+    assert order == [1, 2, 0] and all(common_rows(out).values())
+
+
+def test_without_models_no_common_heads_are_made_of_the_others_alone(
+    visits: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Repositories keep no ``model.zip``: their rows stand, but further seeds would be judged by another measure."""
+    out = visits.parent / "out"
+    assert run.run_grid(load_grid(visits, seeds=[0, 1, 2]), out, pictures=False) == []
+    for path in out.rglob("model.zip"):
+        path.unlink()
+    rows = common_rows(out)
+    capsys.readouterr()
+    assert run.run_grid(load_grid(visits), out, pictures=False) == []
+    assert "No common heads" not in capsys.readouterr().out, "they are there"
+    assert run.run_grid(load_grid(visits, seeds=5), out, pictures=False) == []
+    lacking = out / "tiny" / "PixelBox" / "cure" / "seed0"
+    expected = f"No common heads for {TASK}: they would be made of all finished cells, but {lacking} has no model.zip:"
+    assert expected in capsys.readouterr().out
+    assert common_rows(out) == {**rows, "seed3": [], "seed4": []}
 
 
 def test_common_heads_of_other_settings_are_refused(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,7 +121,7 @@ def test_each_file_trains(path: str, tmp_path: Path) -> None:
     assert model.num_timesteps == 50
     # The burst, then an update per agent step.
     assert model._n_updates == burst + 20
-    assert model.logger.name_to_value["train/srl_loss"] is not None
+    assert float(model.logger.name_to_value["train/srl_loss"]) > 0
     evaluation = manager.create_envs(1, eval_env=True, no_log=True)
     assert evaluation.observation_space == model.observation_space
     assert evaluation.get_attr("renderer") == ["fast" if "fast/" in path else "dmc"]

@@ -2,10 +2,11 @@
 
 import csv
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +47,30 @@ def _processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def _commit() -> str | None:
-    """Of the checkout that the package lies in, marked where it has changes; None for an installed package."""
+def code_commit() -> str | None:
+    """
+    :return: Commit of what runs: as ``SB3_CURE_COMMIT`` says (an image without a checkout sets it), else of the
+        checkout that the package lies in, marked where it has changes, else of the repository that pip installed it
+        from; None where nothing tells
+    """
+    if os.environ.get("SB3_CURE_COMMIT"):
+        return os.environ["SB3_CURE_COMMIT"]
     root = Path(sb3_cure.__file__).parent.parent
-    if not (root / ".git").exists():
-        return None
-    command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
+        try:
+            return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        except (OSError, subprocess.CalledProcessError):
+            return None
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
+        origin = json.loads(distribution("sb3-cure").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:
         return None
+    return origin.get("vcs_info", {}).get("commit_id", "")[:12] or None
 
 
 # Of what runs: later the checkout may have moved on.
-_COMMIT = _commit()
+_COMMIT = code_commit()
 
 
 def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:

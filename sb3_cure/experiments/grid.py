@@ -5,7 +5,7 @@ import math
 import pkgutil
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,17 @@ class Grid:
     cells: tuple[Cell, ...]
     complete: tuple[Cell, ...]
     description: dict[str, Any]
+
+    def with_seeds_in(self, results: Path) -> list[Cell]:
+        """
+        :param results: Folder of all results
+        :return: All that the file makes of it, and of the further seeds that other calls have run there
+        """
+        folders = [found for cell in self.complete for found in (results / cell.folder.parent).glob("seed*")]
+        numbers = [folder.name.removeprefix("seed") for folder in folders]
+        seeds = {cell.seed for cell in self.complete} | {int(number) for number in numbers if number.isdecimal()}
+        arms = [cell for cell in self.complete if cell.seed == self.complete[0].seed]
+        return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
 
 
 def short_name(task: str) -> str:

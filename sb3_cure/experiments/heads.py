@@ -83,11 +83,17 @@ class CommonHead:
     def is_done(self, results: Path) -> bool:
         """
         :param results: Folder of all results
-        :return: Whether it has been made of these very cells: further seeds or arms, or a cell that was run again, ask
-            for another
+        :return: Whether it has been made of these very cells (and perhaps of others, by a process that knew more):
+            further seeds or arms, or a cell that was run again, ask for another
         """
         path = results / self.folder / RECORD
-        return path.exists() and json.loads(path.read_text())["cells"] == self.finished
+        if not path.exists():
+            return False
+        made_of = json.loads(path.read_text())["cells"]
+        if made_of == self.finished:
+            return True
+        of_more = self.finished.items() <= made_of.items()
+        return of_more and all(_finished_at(results / folder) == finished for folder, finished in made_of.items())
 
 
 Unit: TypeAlias = Cell | CommonHead
@@ -99,43 +105,66 @@ def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list
     :param grid: A grid
     :param results: Folder of all results
     :param coming: Cells that are to be regarded as finished
-    :return: One per task and seed of which all arms are finished, with their ``model.zip``; none for tasks with fewer
-        than two such seeds, and for grids of another kind than ``"visitation"``
+    :return: One per task and seed of which all arms are finished; none for tasks with fewer than two such seeds, for
+        those whose heads are not made and cannot be (see ``without_model``), and for grids of another kind than
+        ``"visitation"``
     """
     heads = []
-    for task in dict.fromkeys(cell.task for cell in grid.cells if cell.kind == "visitation"):
-        of_task = [cell for cell in grid.complete if cell.task == task]
-        finished = {cell.folder: _finished_at(results / cell.folder) for cell in of_task}
-        missing = {cell.seed for cell in of_task if finished[cell.folder] is None and cell not in coming}
-        cells = tuple(cell for cell in of_task if cell.seed not in missing)
-        of = {str(cell.folder): finished[cell.folder] for cell in cells}
-        seeds = sorted({cell.seed for cell in cells})
-        if len(seeds) > 1:
-            heads += [CommonHead(task, seed, cells, of, COMMON_UPDATES, COMMON_SHARE) for seed in seeds]
+    for cells in _cells_by_task(grid, results):
+        finished = {cell.folder: _finished_at(results / cell.folder) for cell in cells}
+        missing = {cell.seed for cell in cells if finished[cell.folder] is None and cell not in coming}
+        complete = tuple(cell for cell in cells if cell.seed not in missing)
+        of = {str(cell.folder): finished[cell.folder] for cell in complete}
+        seeds = sorted({cell.seed for cell in complete})
+        of_task = [CommonHead(cells[0].task, seed, complete, of, COMMON_UPDATES, COMMON_SHARE) for seed in seeds]
+        can_be_made = not any(_lacks_model(cell, results) for cell in complete)
+        if len(seeds) > 1 and (can_be_made or all(head.is_done(results) for head in of_task)):
+            heads += of_task
     return heads
 
 
+def without_model(grid: Grid, results: Path) -> dict[str, Cell]:
+    """
+    :param grid: A grid
+    :param results: Folder of all results
+    :return: By task, the first finished cell without ``model.zip``, such as those of a repository that does not keep
+        them. Heads made of the others alone would judge these by another measure
+    """
+    lacking = [cell for cells in _cells_by_task(grid, results) for cell in cells if _lacks_model(cell, results)]
+    return {cell.task: cell for cell in reversed(lacking)}
+
+
+def _cells_by_task(grid: Grid, results: Path) -> Iterator[list[Cell]]:
+    for task in dict.fromkeys(cell.task for cell in grid.cells if cell.kind == "visitation"):
+        yield [cell for cell in grid.with_seeds_in(results) if cell.task == task]
+
+
 def _finished_at(folder: Path) -> str | None:
-    """When the cell was finished whose policies can still be rolled out; None if there is none."""
-    if not all((folder / name).exists() for name in (DONE, "model.zip", "run.json")):
+    """When the cell was finished; None if it is not."""
+    if not all((folder / name).exists() for name in (DONE, "run.json")):
         return None
     return str(json.loads((folder / "run.json").read_text())["finished"])
+
+
+def _lacks_model(cell: Cell, results: Path) -> bool:
+    folder = results / cell.folder
+    return _finished_at(folder) is not None and not (folder / "model.zip").exists()
 
 
 def run_head(head: CommonHead, results: Path) -> None:
     """Fit a common head and add its rows to the ``visitation.csv`` of the cells that it judges, unless that is done.
 
-    Policies are rolled out anew from each cell's ``model.zip``: the same episodes as before.
+    Policies are rolled out anew from each cell's ``model.zip``: the same episodes as before. Where another process is
+    making it, that is waited for: it may know of fewer cells.
 
     :param head: Which, of finished cells
     :param results: Folder of all results
     :raises GridError: if its folder holds one with other settings, or a model cannot be loaded safely
-    :raises CellIsRunning: if another process is making it
     """
     folder = results / head.folder
     check_settings(folder, head.config())
     folder.mkdir(parents=True, exist_ok=True)
-    with alone_in(folder):
+    with alone_in(folder, wait=True):
         if head.is_done(results):
             return
         (folder / ERROR).unlink(missing_ok=True)

@@ -255,14 +255,20 @@ def _visitation_headlines(
                 for row in errors
                 if (row.task, row.method, row.actor) == key and row.head in HEADS
             ]
-            seeds = plural(len(experiment.done(task, method)), "seed")
             others = {"random policy": "ratio", f"task policy of {experiment.baseline_of(method)}": "task_ratio"}
             for other, name in others.items():
-                ratios = [(getattr(row, name), what) for row, what in rows]
-                found = [f"{ratio_text(ratio)} times {what}" for ratio, what in ratios if math.isfinite(ratio.value)]
-                if found:
+                ratios = [(getattr(row, name), what) for row, what in rows if math.isfinite(getattr(row, name).value)]
+                if ratios:
+                    # Measures may rest on different seeds, such as those whose common heads are made.
+                    counts = [plural(ratio.n, "seed") for ratio, _ in ratios]
+                    alike = len(set(counts)) == 1
+                    found = [
+                        f"{ratio_text(ratio)} times {what}{'' if alike else f' ({count})'}"
+                        for (ratio, what), count in zip(ratios, counts, strict=True)
+                    ]
+                    seeds = f", {counts[0]}" if alike else ""
                     compared = f"compared to the {other}, the curious one meets {', '.join(found)}"
-                    yield f"{method} on {task}, {seeds}: {compared}."
+                    yield f"{method} on {task}{seeds}: {compared}."
 
 
 def _curves(
@@ -281,7 +287,8 @@ def _curves(
     several = {row.method for row in differences if row.task is None}
     for row in differences:
         if row.task is None or row.method not in several:
-            where = f"{plural(row.t.n, 'paired seed')} on {of_tasks(row)}"
+            alike = "" if row.same_starts == row.pairs else f", {row.same_starts} with the same start,"
+            where = f"{plural(row.pairs, 'pair')} of seeds{alike} on {of_tasks(row)}"
             shown = f" {interval_text(row.t, 1)}" if row.t.low is not None else ""
             headlines.append(
                 f"{row.method} minus {row.other}: area under the curve {number_text(row.t.value, 1)}"
@@ -508,7 +515,7 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
 <p>{plural(len(sections), "experiment")}, sb3_cure {escape(sb3_cure.__version__)}, written {now}</p></div></header>
 <main>
 <nav aria-label="Experiments"><ul>{links}</ul></nav>
-{"".join(body)}<footer>Intervals are 95 %. Seeds are paired between the arms of an experiment.</footer>
+{"".join(body)}<footer>Intervals are 95 %. The arms of an experiment are compared seed by seed.</footer>
 </main>
 </body>
 </html>

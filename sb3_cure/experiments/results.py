@@ -161,6 +161,15 @@ class Experiment:
             if (at, arm) == (task, method) and cell.done
         }
 
+    def has_unlike_heads(self, task: str) -> bool:
+        """Whether common heads of a task were not all made of the same cells: some are out of date.
+
+        :raises ResultsError: if a head's file cannot be read
+        """
+        paths = sorted((self.folder / task / "common_heads").glob("*/common_head.json"))
+        made_of = [_read_json(path).get("cells") for path in paths]
+        return any(cells != made_of[0] for cells in made_of)
+
     @property
     def sees_published_pixels(self) -> bool:
         """Whether all of its finished cells do, see ``CellResult``."""

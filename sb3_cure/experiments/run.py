@@ -23,7 +23,7 @@ from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
 from sb3_cure.experiments.files import write_json, write_text
 from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid
-from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head
+from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head, without_model
 from sb3_cure.values import check_folder, is_integer, is_number
 
 ENGINES = ("local", "ray")
@@ -63,8 +63,8 @@ def run_grid(
     """
     results = Path(results).resolve()
     _check_run(engine, checkpoint_minutes, cpus_per_cell, gpus_per_cell, retries)
-    # Finished cells too, as they are to be compared with those that are run now.
-    every: list[Unit] = [*grid.complete, *common_heads(grid, results, grid.complete)]
+    # Finished cells too, also of other seeds, as they are to be compared with those that are run now.
+    every: list[Unit] = [*grid.with_seeds_in(results), *common_heads(grid, results, grid.complete)]
     for unit in every:
         check_settings(results / unit.folder, unit.config())
     left = [cell for cell in grid.cells if not cell.is_done(results)]
@@ -84,9 +84,15 @@ def run_grid(
         else:
             failed = _run_here(left, ready, settings)
     if grid.kind == "visitation":
-        with_heads = {head.task for head in common_heads(grid, results)}
+        with_heads, lacking = {head.task for head in common_heads(grid, results)}, without_model(grid, results)
         for task in dict.fromkeys(cell.task for cell in grid.cells if cell.task not in with_heads):
-            print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
+            reason = "they need two seeds of which all methods are finished."
+            if task in lacking:
+                reason = (
+                    f"they would be made of all finished cells, but {results / lacking[task].folder} has no model.zip: "
+                    "put it there, or remove that folder to have the cell run again, or choose another --out."
+                )
+            print(f"No common heads for {task}: {reason}")
     return failed
 
 
@@ -105,6 +111,8 @@ def _heads_when_ready(grid: Grid, results: Path) -> Ready:
 def _run_here(cells: Sequence[Cell], ready: Ready, settings: tuple[Path, float, bool]) -> list[Unit]:
     left, failed = [*cells, *ready(cells)], []
     while left:
+        # Common heads that other processes are making come last, as they are waited for.
+        left.sort(key=lambda unit: isinstance(unit, CommonHead) and is_held(settings[0] / unit.folder))
         unit = left.pop(0)
         if not _run_and_tell(unit, *settings):
             failed.append(unit)

@@ -16,9 +16,10 @@ from sb3_cure.experiments.visit_statistics import GRID_INTERVALS, Coverage, Erro
 
 NONE = "\N{EN DASH}"
 DIFFERENCES = (
-    "Arm minus baseline, seed by seed: the arms of a seed share initial weights, warm-up data and evaluation starts "
-    "(same start: in how many pairs both earn the same before training; not so after pretraining, or with other "
-    "networks). The t interval, which gives the verdict, draws each task's mean from Student's t around the mean of "
+    "Arm minus baseline, seed by seed: the arms of a seed share evaluation starts, and where nothing but the method "
+    "differs initial weights and warm-up data, too (same start: in how many pairs both earn the same before training; "
+    "not so after pretraining, with other networks, or with another implementation). The t interval, which gives the "
+    "verdict, draws each task's mean from Student's t around the mean of "
     "its pairs and weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap resamples "
     "seeds within tasks; with two to five of them it is too narrow (it covers the truth in about 50 to 85 % of "
     "cases), and is here for comparison. Above: in how many pairs the arm is above. Verdicts are not corrected for "
@@ -292,6 +293,8 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
     """
     rows = []
     compares = experiment.sees_published_pixels
+    unlike = [task for task in experiment.tasks if experiment.has_unlike_heads(task)]
+    again = f" Not all common heads of {_list(unlike)} were made of the same cells: run the grid again."
     for row in summaries:
         theirs = published.SRL_ERROR.get(published.task_key(row.task), {}).get(row.actor) if compares else None
         shown = NONE if theirs is None or row.head != "own" else " / ".join(f"{value:.4f}" for value in theirs)
@@ -311,7 +314,8 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
         f"that of the task policy of the baseline ({_baselines(experiment)}) with the same seed (not under own heads, "
         "which differ); "
         "geometric mean over seeds, t interval of the logarithms. Paper: min / mean / max of the last table of "
-        f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}.",
+        f"{published.PAPER}{'' if compares else ' (not given: these cells see other pixels)'}."
+        + (again if unlike else ""),
     )
 
 
