@@ -344,18 +344,21 @@ def resume(
     if env is None:
         raise CheckpointError("resume got no environment: give those of the training, made as they were then.")
     generations = Generations(path)
-    errors: list[ArchiveError] = []
+    refused: list[tuple[Generation, ArchiveError]] = []
     for generation, lost in _usable(generations):
         try:
             with sentences(str(generation.folder), "resume on a machine with more"):
-                return _restore(model_class, generation, lost, env, custom_objects, kwargs)
+                model = _restore(model_class, generation, lost, env, custom_objects, kwargs)
         except CheckpointError:
             raise
         except ArchiveError as error:
-            # What is amiss with the settings that were given is amiss with all of them: the newest tells best.
-            errors.append(error)
-            warnings.warn(f"{generation.folder.name} cannot be resumed from: {error}", stacklevel=3)
-    raise errors[0]
+            refused.append((generation, error))
+            continue
+        for newer, reason in refused:
+            warnings.warn(f"{newer.folder.name} cannot be resumed from: {reason}", stacklevel=3)
+        return model
+    # What is amiss with the settings that were given is amiss with all of them: the newest tells best.
+    raise refused[0][1]
 
 
 def _restore(

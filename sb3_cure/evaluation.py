@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.buffers import transitions, unmarked
+from sb3_cure.checks import check_srl_error
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
@@ -49,6 +50,7 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
     :param batch: Transitions, observations as stored (images in 0-255)
     :param chunk: How many at a time
     :return: Error per sample, [n]
+    :raises ValueError: if the head's error is not one number per sample
     """
     policy = model.policy
     policy.set_training_mode(False)
@@ -56,7 +58,9 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
     with th.no_grad():
         for start in range(0, len(batch.observations), chunk):
             part = ReplayBufferSamples(*[field[start : start + chunk] for field in batch if field is not None])
-            errors.append(policy.srl.error(part, policy.encode(part.observations)).cpu().numpy())  # type: ignore[union-attr]
+            error = policy.srl.error(part, policy.encode(part.observations))  # type: ignore[union-attr]
+            check_srl_error(error, len(part.observations), look=False)
+            errors.append(error.cpu().numpy())
     return np.concatenate(errors)
 
 

@@ -208,8 +208,12 @@ class CuRePolicy(SACPolicy):
         self.encoder = make_encoder(self.features_extractor_class, space, **kwargs)
         self.encoder_target = copy.deepcopy(self.encoder).requires_grad_(False)
         self.srl = None
+        head_seed = int(th.randint(2**62, ()))
         if srl_class is not None:
-            self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
+            # By random numbers of its own, so that under every head the other networks of a seed begin alike.
+            with th.random.fork_rng(devices=()):
+                th.default_generator.manual_seed(head_seed)
+                self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
             self.srl.bind_target_encoder(self.encoder_target)
             parameters = list(self.srl.parameters())
             # A head without parameters (say, one that scores latents) has nothing to optimise.

@@ -96,7 +96,7 @@ def write_cell(
         for step, value in curve.items()
     ]
     write_csv(cell / "eval.csv", EVAL_COLUMNS, rows)
-    if visitation:
+    if visitation or states is not None:
         columns = ("actor", "head", "episode", "error_min", "error_mean", "error_max", "return")
         write_csv(cell / "visitation.csv", columns, visitation)
     if states is not None:

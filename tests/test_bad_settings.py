@@ -325,7 +325,8 @@ COMMANDS: dict[str, str] = {
         "sb3-cure experiment: error: argument --seeds: 'x' names no seeds: write how many (5), or which (0,3,4)"
     ),
     "experiment grid.yml --seeds 0": (
-        "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or a list of seeds."
+        "sb3-cure experiment: error: --seeds is 0, but it must be how many (1 or more) or "
+        "which, each from 0 to 2**32 - 1: change it."
     ),
     "experiment grid.yml --retries 1": "sb3-cure experiment: error: --retries is of Ray: add --engine ray.",
     "experiment grid.yml --engine ray --cpus-per-cell -1": (
@@ -507,17 +508,18 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no seeds": (
         {"seeds": 0},
-        "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or a list of seeds.",
+        "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or "
+        "which, each from 0 to 2**32 - 1: change it.",
     ),
     "a negative seed": (
         {"seeds": [1, -2]},
         "sb3-cure experiment: error: seeds in grid.yml is [1, -2], but it must be how many "
-        "(1 or more) or a list of seeds.",
+        "(1 or more) or which, each from 0 to 2**32 - 1: change it.",
     ),
     "a seed that is too large": (
         {"seeds": [2**32]},
         "sb3-cure experiment: error: seeds in grid.yml is [4294967296], but it must be how "
-        "many (1 or more) or a list of seeds.",
+        "many (1 or more) or which, each from 0 to 2**32 - 1: change it.",
     ),
     "no list of tasks": (
         {"tasks": "all"},

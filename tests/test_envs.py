@@ -374,6 +374,7 @@ def test_pixel_environment_from_an_id():
         ({"image_size": 84.0}, ["image_size=84.0", "integer", "84"]),
         ({"frame_stack": 0}, ["frame_stack=0", "at least 1", "3"]),
         ({"frame_stack": True}, ["frame_stack=True", "integer"]),
+        ({"image_size": 8}, ["frame_stack=3 images of shape (3, 8, 8) have 9 channels", "image_size", "fewer frames"]),
         ({"action_repeat": 0}, ["action_repeat=0", "at least 1", "4"]),
         ({"action_repeat": 2.5}, ["action_repeat=2.5", "integer"]),
         ({"camera_id": 2}, ["camera_id=2", "0 to 1", "-1"]),

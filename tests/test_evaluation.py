@@ -21,6 +21,7 @@ from sb3_cure.evaluation import even_negatives, evenly_measured, most_uncomforta
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.probe import reconstruct_with_probe
 from sb3_cure.metrics import reconstruction_strip
+from sb3_cure.srl import RAE
 
 
 class Rows(KVWriter):
@@ -92,6 +93,18 @@ def test_unknown_actor_is_one_sentence() -> None:
     model = tiny_model("CnnPolicy", PixelBox())
     with pytest.raises(ValueError, match=r"actor is 'best', but it must be one of 'task', 'curious', 'random'"):
         list(run_episodes(model, PixelBox(), 1, "best"))
+
+
+def test_a_heads_error_must_be_one_number_per_sample() -> None:
+    """Said before the first update, too, as grids evaluate then."""
+
+    class Mean(RAE):
+        def error(self, batch: ReplayBufferSamples, latents: th.Tensor) -> th.Tensor:
+            return super().error(batch, latents).mean()
+
+    model = tiny_model("CnnPolicy", PixelBox(), srl=Mean)
+    with pytest.raises(ValueError, match=r"returned an error of shape \(\) for 20 samples, but SRLOutput.error is one"):
+        list(run_episodes(model, PixelBox(), 1, "task"))
 
 
 def test_negatives_are_taken_evenly_from_what_each_policy_sees() -> None:

@@ -237,10 +237,27 @@ def test_wrong_command_lines_are_one_sentence(tmp_path: Path, capsys: pytest.Cap
         "--retries 1": "--retries is of Ray: add --engine ray",
         "--address auto": "--address is of Ray: add --engine ray",
     }.items():
-        with pytest.raises(SystemExit):
-            run.main([path, *out, *wrong.split()])
+        try:
+            status = run.main([path, *out, *wrong.split()])
+        except SystemExit as stop:  # argparse's
+            status = stop.code
+        assert status == 2
         assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_refuses_what_a_run_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Settings that cannot work, and cells of other settings, which are not done for this grid."""
+    out = ["--out", str(tmp_path / "out"), "--dry-run"]
+    path = write_grid(tmp_path, methods={"cure": {"config": "zoo.yml", "overrides": {"curiosity_prob": 1.4}}})
+    assert run.main([str(path), *out]) == 2
+    assert "cannot work: curiosity_prob is 1.4" in capsys.readouterr().err
+    run_cell(load_grid(write_grid(tmp_path)).cells[0], tmp_path / "out", pictures=False)
+    assert run.main([str(path), *out]) == 0
+    assert run.main([str(path), *out, "--budget", "800"]) == 2
+    assert "seed0 was run with other settings: budget is 400 there and 800 now" in capsys.readouterr().err
+    assert run.main([str(path), *out, "--checkpoint-minutes", "-1"]) == 2
+    assert "--checkpoint-minutes is -1.0, but it must be" in capsys.readouterr().err
 
 
 # ----------------------------------------------------------------------- cells
@@ -928,6 +945,13 @@ def test_results_name_their_commit_wherever_the_code_comes_from(
     assert experiment_files.code_commit() == f"{commit}-dirty"
     monkeypatch.setenv("SB3_CURE_COMMIT", "v1.2-3-gabc")
     assert experiment_files.code_commit() == "v1.2-3-gabc"
+
+
+def test_a_cluster_that_is_too_small_leaves_no_trace(tmp_path: Path) -> None:
+    """Refused before anything is written, as all that cannot work."""
+    with pytest.raises(GridError, match="--cpus-per-cell is 999, but no machine of this Ray cluster has more than"):
+        run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="ray", cpus_per_cell=999)
+    assert not (tmp_path / "out").exists()
 
 
 def test_cells_of_other_settings_are_refused_whatever_their_seed(tmp_path: Path) -> None:

@@ -312,8 +312,10 @@ def test_errors_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert report.main([str(tmp_path)]) == 1
     first, second = capsys.readouterr().err.splitlines()
     assert "nowhere is no folder" in first and "eval.csv has no column 'environment_steps'" in second
-    with pytest.raises(SystemExit):
-        report.main([str(tmp_path), "--thresholds", "many"])
+    for wrong in ("many", "nan,300"):
+        with pytest.raises(SystemExit):
+            report.main([str(tmp_path), "--thresholds", wrong])
+        assert f"{wrong!r} is no list of returns such as 250,500,750" in capsys.readouterr().err
 
 
 def test_report_without_rliable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

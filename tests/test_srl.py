@@ -601,6 +601,28 @@ def test_the_head_does_not_own_the_encoder(srl: str) -> None:
     assert policy.srl.target_encoder is policy.encoder_target
 
 
+def test_a_seeds_networks_begin_alike_under_every_head() -> None:
+    """So that arms with different heads are paired: whatever a head draws, the others' weights are the seed's."""
+
+    class Greedy(RAE):
+        """Draws many random numbers."""
+
+        def __init__(self, *arguments: Any, **settings: Any):
+            super().__init__(*arguments, **settings)
+            th.rand(1000)
+
+    env, settings = PixelBox(size=36), dict(curiosity="separate", seed=3)
+    heads: list[Any] = ["rae", "curl", Greedy]
+    weights = [tiny_model("CnnPolicy", env, srl=head, **settings).policy.state_dict() for head in heads]
+    others = {name for name in weights[0] if not name.startswith("srl.")}
+    assert {name.split(".")[0] for name in others} >= {"encoder", "actor", "critic", "curious_actor", "curious_critic"}
+    for policy in weights[1:]:
+        assert all(th.equal(weights[0][name], policy[name]) for name in others)
+    another = tiny_model("CnnPolicy", env, srl="rae", **{**settings, "seed": 4}).policy.state_dict()
+    drawn = [name for name in weights[0] if name.startswith("srl.decoder") and name.endswith("weight")]
+    assert drawn and not any(th.equal(weights[0][name], another[name]) for name in drawn), "heads have a seed, too"
+
+
 def test_vector_rae_trains_in_the_agent() -> None:
     """``MlpPolicy`` trains the vector autoencoder like any head."""
     model = tiny_model("MlpPolicy", VectorBox())

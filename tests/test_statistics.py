@@ -395,6 +395,12 @@ def test_the_papers_tables() -> None:
         ("eval.csv", "environment_steps,return_mean\n0,1,2\n", r"eval\.csv has a row that is shorter or longer"),
         ("eval.csv", "environment_steps,return_mean\n8,1\n8,2\n", r"eval\.csv has environment_steps that do not grow"),
         ("eval.csv", b"\xff\xfe\x00", r"eval\.csv cannot be read"),
+        ("eval.csv", "", r"eval\.csv has no column 'environment_steps'"),
+        ("eval.csv", "environment_steps,return_mean\n", r"evaluations of no environment steps, .* trained for 100000"),
+        ("eval.csv", "environment_steps,return_mean\n0,1\n90000,2\n", r"of from 0 to 90000 environment steps"),
+        ("eval.csv", "environment_steps,return_mean\n9,1\n100000,2\n", r"of from 9 to 100000 environment steps"),
+        ("eval.csv", "environment_steps,return_mean\n0,1\n50000,\n100000,2\n", r"no return_mean in line 3"),
+        ("eval.csv", "environment_steps,return_mean\n0,1\n50000,nan\n100000,2\n", r"no return_mean in line 3"),
         ("run.json", "", r"run\.json is no JSON"),
         ("config.json", '{"method": "other", "seed": 0}', r"config\.json is of method 'other'"),
     ],
@@ -405,6 +411,34 @@ def test_damaged_files_are_named_in_one_sentence(results: Path, name: str, conte
     with pytest.raises(ResultsError, match=sentence) as caught:
         read_results(results)
     assert "\n" not in str(caught.value)
+
+
+def test_no_row_of_a_finished_curve_may_be_lost(tmp_path: Path) -> None:
+    """Else what lies between is made up; but evaluations are no denser than rollouts, and fall after them."""
+    settings = {"budget": 1000, "eval_every": 100}
+    long = {**settings, "n_envs": 8, "arguments": {**RAE, "train_freq": 5}}  # 8 * 8 * 5 = 320 steps per rollout
+    for curve, config in (({0: 1, 104: 1, 200: 2, **dict.fromkeys(range(300, 1001, 100), 3)}, settings),
+                          ({0: 1, 320: 2, 640: 3, 960: 4, 1280: 5}, long)):  # fmt: skip
+        write_grid(tmp_path, budget=1000)
+        path = write_cell(tmp_path, TASK, "sac_ae", 0, curve, **config)
+        assert len(read_results(tmp_path)[0].done(TASK, "sac_ae")[0].curve()[0]) == len(curve)
+        lost, *_ = [step for step in curve if step > 0]
+        write_cell(
+            tmp_path, TASK, "sac_ae", 0, {step: value for step, value in curve.items() if step != lost}, **config
+        )
+        with pytest.raises(ResultsError, match=r"eval\.csv has no evaluation between 0 and \d+ environment steps: "):
+            read_results(tmp_path)
+    (path / "eval.csv").unlink()
+    with pytest.raises(ResultsError, match=r"seed0 is marked as DONE, but has no eval\.csv: remove the cell's folder"):
+        read_results(tmp_path)
+
+
+def test_experiments_without_their_grid_are_not_passed_over(results: Path) -> None:
+    """One beside others would be missing in the report, and nobody would see it."""
+    write_grid(results.parent / "another")
+    (results / "grid.json").unlink()
+    with pytest.raises(ResultsError, match=r"curves holds finished cells, but no grid\.json: run the grid again"):
+        read_results(results.parent)
 
 
 def test_damaged_states_and_missing_folders(results: Path, tmp_path: Path) -> None:

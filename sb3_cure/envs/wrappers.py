@@ -134,7 +134,7 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
 
     :param env: An environment whose observations are arrays, such as channels-first images
     :param frame_stack: Number of observations in a stack
-    :raises ValueError: If ``frame_stack`` is not an integer of at least 1
+    :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows
     """
 
     def __init__(self, env: gym.Env, frame_stack: int = 3) -> None:
@@ -147,6 +147,11 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
                 f"Observations of {box} cannot be stacked: expected a Box; wrap in PixelObservation first."
             )
         low, high = (np.concatenate([bound] * self.frame_stack) for bound in (box.low, box.high))
+        if low.ndim == 3 and len(low) > min(low.shape[1:]):
+            raise ValueError(
+                f"frame_stack={self.frame_stack} images of shape {box.shape} have {len(low)} channels in all, but SB3 "
+                "takes the smallest dimension for the channels: choose larger images (image_size) or fewer frames."
+            )
         self.observation_space = spaces.Box(low, high, dtype=box.dtype.type)
         self._frames: deque[np.ndarray] = deque(maxlen=self.frame_stack)
 

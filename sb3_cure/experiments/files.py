@@ -82,9 +82,9 @@ def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     """
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        rows = list(reader)
+        rows, names = list(reader), reader.fieldnames or ()
     for name in needed:
-        if name not in (reader.fieldnames or ()):
+        if name not in names:
             raise ValueError(f"has no column {name!r}")
     if any(None in row or None in row.values() for row in rows):
         raise ValueError("has a row that is shorter or longer than its header")

@@ -176,8 +176,8 @@ def load_grid(
     _check_keys(evaluation, {"every", "episodes"}, set(), f"evaluation in {path}")
     every = _whole_number("evaluation.every", evaluation.get("every", 10_000), path, least=1)
     episodes = _whole_number("evaluation.episodes", evaluation.get("episodes", 10), path, least=1)
-    all_seeds = _seeds(content.get("seeds", 1), path)
-    chosen_seeds = all_seeds if seeds is None else _seeds(seeds, path)
+    all_seeds = _seeds(content.get("seeds", 1), f"seeds in {path}")
+    chosen_seeds = all_seeds if seeds is None else _seeds(seeds, "--seeds")
     all_tasks = _tasks(content["tasks"], path)
     chosen_tasks = _choose(tasks, all_tasks, "task", path)
     arms = _mapping("methods", content["methods"], path)
@@ -379,11 +379,13 @@ def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
     return int(value)
 
 
-def _seeds(value: Any, path: Path) -> list[int]:
+def _seeds(value: Any, name: str) -> list[int]:
     numbers = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
     valid = isinstance(numbers, Sequence) and not isinstance(numbers, str) and len(numbers) > 0
     if not valid or not all(is_integer(number, 0) and number < 2**32 for number in numbers):
-        raise GridError(f"seeds in {path} is {value!r}, but it must be how many (1 or more) or a list of seeds.")
+        raise GridError(
+            f"{name} is {value!r}, but it must be how many (1 or more) or which, each from 0 to 2**32 - 1: change it."
+        )
     return list(dict.fromkeys(numbers))
 
 

@@ -615,9 +615,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _thresholds(text: str) -> list[float]:
     try:
-        return [float(number) for number in text.split(",")]
+        returns = [float(number) for number in text.split(",")]
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of returns such as 250,500,750") from None
+        returns = [math.nan]
+    if not all(map(math.isfinite, returns)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of returns such as 250,500,750")
+    return returns
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from sb3_cure.experiments.files import Row, read_rows
 from sb3_cure.experiments.grid import short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+_AGAIN = "remove the cell's folder and run the grid again"
 
 
 class ResultsError(ValueError):
@@ -95,11 +96,11 @@ class CellResult:
                 found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
                 units = tuple(map(str, file["state_units"])) if found else ()
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ResultsError(f"{path} cannot be read ({error}): run the cell again.") from None
+            raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
         for actor, states in found.items():
             if states.ndim != 2 or not np.isfinite(states).all() or states.shape[1] != len(units):
                 shape = f"{actor}_states of shape {states.shape}, and units {units}"
-                raise ResultsError(f"{path} has {shape}, but finite [n, d] and d units are needed: run the cell again.")
+                raise ResultsError(f"{path} has {shape}, but finite [n, d] and d units are needed: {_AGAIN}.")
         return found, units
 
 
@@ -199,6 +200,9 @@ def read_results(folder: str | Path) -> list[Experiment]:
     if (folder / "grid.json").exists():
         return [_read_experiment(folder / "grid.json")]
     grids = sorted(folder.rglob("grid.json"))
+    lost = {path.parents[3] for path in folder.rglob("*/*/seed*/DONE")} - {path.parent for path in grids}
+    if lost:
+        raise ResultsError(f"{min(lost)} holds finished cells, but no grid.json: run the grid again, which writes it.")
     if not grids:
         raise ResultsError(
             f"{folder} holds no experiment (no grid.json in it, nor anywhere below it): give the folder that "
@@ -229,13 +233,15 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
         number = found.name.removeprefix("seed")
         if found.is_dir() and number.isdecimal():
             keys.append((found.parent.parent.name, found.parent.name, int(number)))
-    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"]) for key in keys}
+    cells = {
+        key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"], grid["kind"]) for key in keys
+    }
     order = {task: index for index, task in reversed(list(enumerate(task for task, _, _ in cells)))}
     in_order = dict(sorted(cells.items(), key=lambda item: order[item[0][0]]))
     return Experiment(name or grid["experiment"], root, grid, in_order)
 
 
-def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int) -> CellResult:
+def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kind: str) -> CellResult:
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
@@ -249,18 +255,45 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int) -> 
     own_budget = config.get("budget", budget)
     if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
         return CellResult(task, method, seed, folder, f"other budget: {own_budget} steps", config, run)
+    needed = "visitation.csv" if kind == "visitation" else "eval.csv" if own_budget > 0 else "config.json"
+    if not (folder / needed).exists():
+        raise ResultsError(f"{folder} is marked as DONE, but has no {needed}: {_AGAIN}.")
     evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
+    if needed == "eval.csv":
+        _check_whole(folder / needed, evaluations, config)
     visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
+
+
+def _check_whole(path: Path, evaluations: dict[str, np.ndarray], config: dict[str, Any]) -> None:
+    """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return or none has."""
+    steps, returns = evaluations["environment_steps"], evaluations["return_mean"]
+    # Evaluations are due at multiples of `eval_every`, and are made before the next rollout.
+    every, train_freq = config.get("eval_every", np.inf), config.get("arguments", {}).get("train_freq", 1)
+    rollout = (
+        config.get("action_repeat", 1) * config.get("n_envs", 1) * train_freq if isinstance(train_freq, int) else np.inf
+    )
+    gaps = np.flatnonzero(np.diff(steps // every) > max(1, np.ceil(rollout / every)))
+    known = np.isfinite(returns)
+    if not len(steps) or steps[0] > 0 or steps[-1] < config.get("budget", 0):
+        found = f"from {steps[0]:.0f} to {steps[-1]:.0f}" if len(steps) else "no"
+        reason = f"has evaluations of {found} environment steps, but the cell was trained for {config['budget']}"
+    elif len(gaps):
+        reason = f"has no evaluation between {steps[gaps[0]]:.0f} and {steps[gaps[0] + 1]:.0f} environment steps"
+    elif known.any() and not known.all():
+        reason = f"has no return_mean in line {np.flatnonzero(~known)[0] + 2}"
+    else:
+        return
+    raise ResultsError(f"{path} {reason}: {_AGAIN}.")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ResultsError(f"{path} cannot be read ({error.strerror}): run the cell or the experiment again.") from None
+        raise ResultsError(f"{path} cannot be read ({error.strerror}): {_AGAIN}.") from None
     except ValueError as error:
-        raise ResultsError(f"{path} is no JSON ({error}): run the cell or the experiment again.") from None
+        raise ResultsError(f"{path} is no JSON ({error}): {_AGAIN}.") from None
     if not isinstance(content, dict):
         raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: correct it.")
     return content
@@ -270,9 +303,9 @@ def _read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
     try:
         return read_rows(path, needed)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ResultsError(f"{path} cannot be read ({error}): run the cell again.") from None
+        raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
     except ValueError as error:
-        raise ResultsError(f"{path} {error}: run the cell again.") from None
+        raise ResultsError(f"{path} {error}: {_AGAIN}.") from None
 
 
 def _number(path: Path, line: int, column: str, value: Any) -> float:
@@ -291,7 +324,7 @@ def _read_evaluations(path: Path) -> dict[str, np.ndarray]:
     }
     steps = columns["environment_steps"]
     if not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
-        raise ResultsError(f"{path} has environment_steps that do not grow from row to row: run the cell again.")
+        raise ResultsError(f"{path} has environment_steps that do not grow from row to row: {_AGAIN}.")
     return columns
 
 

@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -63,26 +63,24 @@ def run_grid(
     """
     results = Path(results).resolve()
     _check_run(engine, checkpoint_minutes, cpus_per_cell, gpus_per_cell, retries)
-    # Finished cells too, also of other seeds, as they are to be compared with those that are run now.
-    every: list[Unit] = [*grid.with_seeds_in(results), *common_heads(grid, results, grid.complete)]
-    for unit in every:
-        check_settings(results / unit.folder, unit.config())
+    check_grid(grid, results)
     left = [cell for cell in grid.cells if not cell.is_done(results)]
-    check_arms(left)
-    try:
-        check_folder("--out", results)
-        _keep_grid(grid, results / grid.experiment)
-    except OSError as error:
-        raise GridError(f"--out is {results}, which cannot be written to ({error.strerror}): give another.") from error
-    except ValueError as error:
-        raise error if isinstance(error, GridError) else GridError(str(error)) from error
     ready, settings = _heads_when_ready(grid, results), (results, checkpoint_minutes, pictures)
-    with _live_progress(lambda: [*grid.cells, *common_heads(grid, results, left)], results):
-        if engine == "ray":
-            resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-            failed = _run_with_ray(left, ready, settings, address, resources)
-        else:
-            failed = _run_here(left, ready, settings)
+    resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
+    with _ray(address, resources) if engine == "ray" else nullcontext() as ray:
+        try:
+            check_folder("--out", results)
+            _keep_grid(grid, results / grid.experiment)
+        except OSError as error:
+            reason = f"which cannot be written to ({error.strerror})"
+            raise GridError(f"--out is {results}, {reason}: give another.") from error
+        except ValueError as error:
+            raise error if isinstance(error, GridError) else GridError(str(error)) from error
+        with _live_progress(lambda: [*grid.cells, *common_heads(grid, results, left)], results):
+            if ray is None:
+                failed = _run_here(left, ready, settings)
+            else:
+                failed = _run_with_ray(ray, left, ready, settings, resources)
     if grid.kind == "visitation":
         with_heads, lacking = {head.task for head in common_heads(grid, results)}, without_model(grid, results)
         for task in dict.fromkeys(cell.task for cell in grid.cells if cell.task not in with_heads):
@@ -94,6 +92,19 @@ def run_grid(
                 )
             print(f"No common heads for {task}: {reason}")
     return failed
+
+
+def check_grid(grid: Grid, results: Path) -> None:
+    """
+    :param grid: A grid
+    :param results: Folder of all results, whether it exists or not
+    :raises GridError: with one sentence, if an arm cannot work, or the folder holds cells of other settings: also of
+        other seeds, as they are to be compared with those that are run now
+    """
+    every: list[Unit] = [*grid.with_seeds_in(results), *common_heads(grid, results, grid.complete)]
+    for unit in every:
+        check_settings(results / unit.folder, unit.config())
+    check_arms(cell for cell in grid.cells if not cell.is_done(results))
 
 
 def _heads_when_ready(grid: Grid, results: Path) -> Ready:
@@ -153,13 +164,9 @@ def _keep_error(unit: Unit, results: Path, text: str) -> None:
     write_text(path, text)
 
 
-def _run_with_ray(
-    cells: Sequence[Cell],
-    ready: Ready,
-    settings: tuple[Path, float, bool],
-    address: str | None,
-    resources: dict[str, Any],
-) -> list[Unit]:
+@contextmanager
+def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[Any]:
+    """Ray, connected to a cluster that has what a cell needs."""
     try:
         import ray
     except ImportError:
@@ -178,29 +185,39 @@ def _run_with_ray(
         raise GridError(f"--address is {address!r}, but {sentence}") from None
     try:
         _check_resources(ray.nodes(), resources)
-        # A process for each: what one leaves behind does not burden the next.
-        run = ray.remote(max_calls=1, **resources)(_run_and_tell)
-        pending: dict[Any, Unit] = {run.remote(unit, *settings): unit for unit in (*cells, *ready(cells))}
-        failed = []
-        while pending:
-            for reference in ray.wait(list(pending), timeout=5)[0]:
-                unit = pending.pop(reference)
-                try:
-                    succeeded = ray.get(reference)
-                except ray.exceptions.RayError as error:
-                    # The worker has died more often than `retries`: nobody else could have told.
-                    _keep_error(unit, settings[0], f"{error}\n")
-                    succeeded = False
-                if succeeded and not (settings[0] / unit.folder).exists():
-                    sentence = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
-                    _keep_error(unit, settings[0], f"{sentence}\n")
-                    succeeded = False
-                if not succeeded:
-                    failed.append(unit)
-                pending.update({run.remote(head, *settings): head for head in ready(pending.values())})
-        return failed
+        yield ray
     finally:
         ray.shutdown()
+
+
+def _run_with_ray(
+    ray: Any,
+    cells: Sequence[Cell],
+    ready: Ready,
+    settings: tuple[Path, float, bool],
+    resources: dict[str, Any],
+) -> list[Unit]:
+    # A process for each: what one leaves behind does not burden the next.
+    run = ray.remote(max_calls=1, **resources)(_run_and_tell)
+    pending: dict[Any, Unit] = {run.remote(unit, *settings): unit for unit in (*cells, *ready(cells))}
+    failed = []
+    while pending:
+        for reference in ray.wait(list(pending), timeout=5)[0]:
+            unit = pending.pop(reference)
+            try:
+                succeeded = ray.get(reference)
+            except ray.exceptions.RayError as error:
+                # The worker has died more often than `retries`: nobody else could have told.
+                _keep_error(unit, settings[0], f"{error}\n")
+                succeeded = False
+            if succeeded and not (settings[0] / unit.folder).exists():
+                sentence = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
+                _keep_error(unit, settings[0], f"{sentence}\n")
+                succeeded = False
+            if not succeeded:
+                failed.append(unit)
+            pending.update({run.remote(head, *settings): head for head in ready(pending.values())})
+    return failed
 
 
 def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
@@ -459,7 +476,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """``sb3-cure experiment``.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0 if nothing failed, else 1
+    :return: 0 if nothing failed, 1 if something did, 2 for what cannot be run as it was written
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure experiment",
@@ -491,6 +508,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
         if options.dry_run:
+            _check_run(
+                options.engine,
+                options.checkpoint_minutes,
+                options.cpus_per_cell,
+                options.gpus_per_cell,
+                options.retries,
+            )
+            check_grid(grid, options.out)
             units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
             for unit in units:
                 print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
@@ -517,7 +542,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(sentence)
         sys.stdout.flush()
     except GridError as error:
-        parser.error(str(error))
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("Stopped; the same command goes on from the last checkpoints.")
         return 130
