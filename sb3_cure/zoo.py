@@ -1,12 +1,13 @@
 """rl-zoo3's programs with CuReSAC among its algorithms: ``python -m sb3_cure.zoo train --env ... --conf-file ...``.
 
 ``train``, ``enjoy``, ``record`` and ``optimize`` are rl-zoo3's own, with all of its flags (``--help`` shows them). What
-differs: the algorithm is ``cure_sac`` and the folder ``logs`` unless given, ``optimize`` means ``train -optimize``, and
-what this module's classes say.
+differs: the algorithm is ``cure_sac`` and the folder ``logs`` unless given, ``--env`` must be given, ``optimize`` means
+``train -optimize``, and what this module's classes say.
 """
 
 import argparse
 import importlib
+import importlib.util
 import re
 import runpy
 import shutil
@@ -14,7 +15,8 @@ import sys
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,6 +24,7 @@ from unittest import mock
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 try:
     import optuna
@@ -29,7 +32,7 @@ try:
     from optuna.storages.journal import JournalFileBackend
     from rl_zoo3 import ALGOS, exp_manager
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-    from rl_zoo3.utils import get_class_by_name
+    from rl_zoo3.utils import StoreDict, get_class_by_name
 except ModuleNotFoundError as missing:
     raise ModuleNotFoundError(
         f'sb3_cure.zoo needs {missing.name}, which is not installed: pip install "sb3-cure[zoo]"', name=missing.name
@@ -39,7 +42,7 @@ from sb3_cure.allocator import tune_allocator
 from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
-from sb3_cure.values import arguments_of, check_keywords, is_integer, is_number
+from sb3_cure.values import arguments_of, check_folder, check_keywords, is_integer, is_number
 
 ALGO = "cure_sac"
 PROGRAMS = ("train", "enjoy", "record", "optimize")
@@ -54,10 +57,20 @@ _OF_INPUT = (
     ZeroDivisionError, gym.error.Error, GLUnavailableError,
 )  # fmt: skip
 _PACKAGES = ("sb3_cure", "rl_zoo3", "gymnasium", "importlib", "os", "pathlib")
+_OF_RUN = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
 
 
 class SettingsError(ValueError):
     """A command line or a settings file that cannot work; the message is for its author."""
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """What the package's own checks find wrong is for the author of the settings."""
+    try:
+        yield
+    except (ValueError, TypeError) as error:
+        raise SettingsError(str(error)) from error
 
 
 class ActingCuReSAC(CuReSAC):
@@ -178,10 +191,17 @@ class ExperimentManager(exp_manager.ExperimentManager):
             raise
 
     def _open_storage(self, storage: str) -> None:
+        journal = Path(storage) if storage.endswith(".log") else None
+        if journal is not None and not journal.exists():  # rl-zoo3 makes it, and its folder
+            with _refusing():
+                check_folder("the folder of --storage", journal.parent)
+            return
         try:
-            if not storage.endswith(".log"):
+            if journal is None:
                 _create_tables(storage)
-        except Exception as error:  # of the database's driver, whichever that is
+            else:
+                optuna.storages.JournalStorage(JournalFileBackend(storage))
+        except Exception as error:  # of Optuna or of the database's driver, whichever that is
             raise SettingsError(
                 f"--storage is {storage!r}, which cannot be opened ({_one_line(error)}): give a database such as "
                 "sqlite:///study.db."
@@ -258,10 +278,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
     def _check_values(self, hyperparams: dict[str, Any]) -> None:
         known = arguments_of(ALGOS[ALGO])
         for name, value in hyperparams.items():
-            try:
+            with _refusing():
                 check_keywords(self._source(name), {name: value}, known and known | _ZOO_KEYS, CuReSAC.__name__)
-            except (ValueError, TypeError) as error:
-                raise SettingsError(str(error)) from error
         if not is_number(hyperparams.get("n_timesteps"), low=1):
             raise SettingsError(
                 f"n_timesteps in {self._source('n_timesteps')} is {hyperparams.get('n_timesteps')!r}, but it must be a "
@@ -304,6 +322,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
 
 def _head(where: str, name: Any) -> Any:
     """The class of a user's own head."""
+    if not str(name).rpartition(".")[0]:
+        raise SettingsError(
+            f"{where} is {name!r}, but it must be a head of your own as module.Class: write that, or leave {where} out "
+            "for 'rae' and 'curl', which models are saved with."
+        )
     try:
         return get_class_by_name(name)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:  # ValueError: no module
@@ -333,7 +356,39 @@ def _explained(error: Exception, add_head: str = "add srl: {} to the settings") 
         return f"what is named cannot be imported ({_one_line(error)}): correct the name, or install it"
     if isinstance(error, OSError):
         return f"{error.filename} cannot be used ({error.strerror}): name another folder or file"
+    if unknown := re.search(r"unexpected keyword argument '(\w+)' was raised from .* for (\S+) with", str(error)):
+        return _not_of_environment(*unknown.groups())
+    if missing := re.match(r"No (?:model|checkpoint) found for .+, path: (.+)", str(error)):
+        return _not_of_run(Path(missing[1]))
     return _one_line(error)
+
+
+def _not_of_environment(name: str, task: str) -> str:
+    """What to do about one of its ``env_kwargs``, with the name that it is close to, if that can be told."""
+    entry = gym.spec(task).entry_point
+    creator = load_env_creator(entry) if isinstance(entry, str) else entry
+    whose = getattr(creator, "__name__", task)
+    try:
+        check_keywords("env_kwargs", {name: None}, arguments_of(creator), whose)
+    except TypeError as error:
+        return _one_line(error)
+    return f"env_kwargs has {name!r}, but {whose} has no such argument: correct or remove it"
+
+
+def _not_of_run(missing: Path) -> str:
+    """What to do about a model that is not there, with those that are."""
+    if missing.suffix != ".zip":
+        missing /= "rl_model_*_steps.zip"
+    run = missing.parent
+    steps = sorted(int(file.stem.split("_")[-2]) for file in run.glob("rl_model_*_steps.zip"))
+    shown = map(str, steps if len(steps) < 10 else [*steps[:4], "...", *steps[-4:]])
+    models = {
+        "the last model (without --load flags)": (run / f"{run.name.rpartition('_')[0]}.zip").is_file(),
+        "the best one (--load-best)": (run / "best_model.zip").is_file(),
+        f"checkpoints at {', '.join(shown)} (--load-checkpoint)": bool(steps),
+    }
+    there = " and ".join(model for model, exists in models.items() if exists)
+    return f"there is no {missing}{f', but its run has {there}: choose one of these, or' if there else ':'} {_OF_RUN}"
 
 
 def _is_about_input(error: BaseException) -> bool:
@@ -436,18 +491,91 @@ RunLoader.add_constructor(
 )
 
 
+def _load_run(load: Callable[..., Any], stream: Any, Loader: Any) -> Any:
+    """For ``yaml.load``, where rl-zoo3 reads what it saved with a run."""
+    if Loader is not RunLoader:
+        return load(stream, Loader)
+    try:
+        settings = load(stream, Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        wrong = f"is no YAML ({_one_line(error)})"
+    else:
+        if isinstance(settings, dict):
+            return settings
+        wrong = f"holds {settings!r}"
+    raise SettingsError(
+        f"{stream.name} {wrong}, but it must hold the settings of a run: restore it, or choose another with --exp-id."
+    )
+
+
+def _reading_runs() -> Any:
+    """rl-zoo3 would run what a run's folder names, which may come from anyone."""
+    return mock.patch.multiple(yaml, UnsafeLoader=RunLoader, load=partial(_load_run, yaml.load))
+
+
 def enjoy() -> None:
     """rl-zoo3's ``enjoy``, on ``sys.argv``."""
-    # rl-zoo3 would run what a run's folder names, which may come from anyone.
-    with mock.patch.object(yaml, "UnsafeLoader", RunLoader):
+    with _reading_runs():
         importlib.import_module("rl_zoo3.enjoy").enjoy()
 
 
 def record() -> None:
     """rl-zoo3's ``record_video``, on ``sys.argv``."""
     # It is a script, without a function to call.
-    with mock.patch.object(yaml, "UnsafeLoader", RunLoader):
+    with _reading_runs():
         runpy.run_module("rl_zoo3.record_video", run_name="__main__")
+
+
+_parse_args, _store = argparse.ArgumentParser.parse_args, StoreDict.__call__
+
+
+def _parse_flags(
+    parser: argparse.ArgumentParser, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+) -> argparse.Namespace:
+    """For ``ArgumentParser.parse_args``: what rl-zoo3 finds wrong never, late, or without naming the flag."""
+    if parser.get_default("algo") is None:  # of another program
+        return _parse_args(parser, args, namespace)
+    # Its own --env is CartPole-v1.
+    with mock.patch.object(StoreDict, "__call__", _store_each):
+        given = _parse_args(parser, args, argparse.Namespace(env=None))
+    flags = vars(given)
+    if given.env is None:
+        raise SettingsError("--env is missing: add the id of an environment, such as --env dmc_pixels/finger-spin-v0.")
+    if given.n_timesteps < 1 and given.n_timesteps != parser.get_default("n_timesteps"):
+        raise SettingsError(
+            f"-n/--n-timesteps is {given.n_timesteps}, but it must be a number of agent steps of at least 1: give one, "
+            "or leave it out."
+        )
+    if (agent := flags.get("trained_agent")) and not (agent.endswith(".zip") and Path(agent).is_file()):
+        raise SettingsError(
+            f"-i/--trained-agent is {agent!r}, but it must be a .zip file that is there: give the path of a saved "
+            "model, or leave it out."
+        )
+    if flags.get("track") and importlib.util.find_spec("wandb") is None:
+        raise SettingsError("--track needs wandb, which is not installed: pip install wandb, or leave --track out.")
+    for name in ("output_folder", "optimization_log_path", "reward_log"):
+        if flags.get(name):
+            with _refusing():
+                check_folder(f"--{name.replace('_', '-')}", flags[name])
+    return given
+
+
+def _store_each(
+    action: StoreDict, parser: Any, namespace: argparse.Namespace, values: Sequence[str], option: str | None = None
+) -> None:
+    """For ``StoreDict``, which evaluates ``name:value``: which of them is wrong."""
+    settings: dict[str, Any] = {}
+    for text in values:
+        try:
+            _store(action, parser, namespace, [text], option)
+        except Exception as error:  # of any Python
+            reason = error.msg if isinstance(error, SyntaxError) else _one_line(error)
+            raise SettingsError(
+                f"{option} has {text!r}, but it takes name:value, with a value of Python ({reason}): write for example "
+                "batch_size:128; text needs quotes of its own, as in \"srl:'curl'\"."
+            ) from error
+        settings |= getattr(namespace, action.dest)
+    setattr(namespace, action.dest, settings)
 
 
 def run(program: str, arguments: Sequence[str]) -> None:
@@ -479,7 +607,8 @@ def run(program: str, arguments: Sequence[str]) -> None:
     own_arguments = sys.argv
     sys.argv = [f"sb3-cure {program}", *defaults, *arguments]
     try:
-        programs[program]()
+        with mock.patch.object(argparse.ArgumentParser, "parse_args", _parse_flags):
+            programs[program]()
     except gym.error.DependencyNotInstalled as error:
         asked = program != "enjoy" or "--no-render" in sys.argv
         window = "leave render_mode='human' out" if asked else "add --no-render"
@@ -498,13 +627,16 @@ def _fix(error: BaseException, acts: bool) -> str | None:
     if not _is_about_input(error):
         return None
     if any(frame.f_code.co_name == "create_test_env" for frame in frames):  # of `enjoy` and `record`
+        if isinstance(error, TypeError) and "environment creator" in str(error):
+            return " in --env-kwargs"
         return ": correct --env-kwargs" if isinstance(error, ValueError | TypeError) else ""
     packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame in frames]
     if "stable_baselines3" in packages or packages[-1] == "sb3_cure":
         return None
     if isinstance(error, AssertionError | ValueError):
-        run = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
-        return f": {run if acts else 'correct the command line'}"
+        if acts:
+            return "" if ", path: " in str(error) else f": {_OF_RUN}"  # which `_explained` has said
+        return ": correct the command line"
     return "" if isinstance(error, NameError | SyntaxError | ImportError) else None
 
 

@@ -139,9 +139,8 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     ),
     "an argument that the environment does not take": (
         {"env_kwargs": {"imagesize": 36}},
-        "sb3-cure train: VectorBox.__init__() got an unexpected keyword argument 'imagesize' "
-        "was raised from the environment creator for tests/PixelBox-v0 with kwargs "
-        "({'imagesize': 36}) (settings: settings.yml).",
+        "sb3-cure train: env_kwargs has 'imagesize', but PixelBox has no such argument: correct or remove it "
+        "(settings: settings.yml).",
     ),
     "a misspelt argument of the policy": (
         {"policy_kwargs": {"net_ach": [8]}},
@@ -211,28 +210,61 @@ COMMANDS: dict[str, str] = {
         "sb3-cure train: the settings file no.yml is no file: give one with --conf-file, "
         "such as zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
     ),
+    **{
+        command: (
+            f"sb3-cure {command.split()[0]}: --env is missing: add the id of an environment, such as --env "
+            "dmc_pixels/finger-spin-v0."
+        )
+        for command in ("train --conf-file settings.yml", "optimize --conf-file settings.yml", "enjoy", "record")
+    },
     "train --env tests/PixelBo-v0 --conf-file settings.yml": (
         "sb3-cure train: tests/PixelBo-v0 not found in gym registry, you maybe meant "
         "tests/PixelBox-v0: correct the command line."
     ),
     f"{TRAIN} -params srl:vae": (
-        "sb3-cure train: a text that is to be evaluated is no Python (name 'vae' is not "
-        "defined): correct it; text in it needs quotes of its own, such as -params "
-        "\"srl:'curl'\"."
+        "sb3-cure train: -params has 'srl:vae', but it takes name:value, with a value of Python (name 'vae' is not "
+        "defined): write for example batch_size:128; text needs quotes of its own, as in \"srl:'curl'\"."
     ),
-    f"{TRAIN} -params srl": (
-        "sb3-cure train: a text that is to be evaluated is no Python (invalid syntax "
-        "(<string>, line 0)): correct it; text in it needs quotes of its own, such as "
-        "-params \"srl:'curl'\"."
+    f"{TRAIN} -params batch_size:8 curiosity_prob=0.2": (
+        "sb3-cure train: -params has 'curiosity_prob=0.2', but it takes name:value, with a value of Python (invalid "
+        "syntax): write for example batch_size:128; text needs quotes of its own, as in \"srl:'curl'\"."
+    ),
+    f"enjoy --env {TASK} --env-kwargs size:1/0": (
+        "sb3-cure enjoy: --env-kwargs has 'size:1/0', but it takes name:value, with a value of Python (division by "
+        "zero): write for example batch_size:128; text needs quotes of its own, as in \"srl:'curl'\"."
     ),
     f"{TRAIN} --device gpu": (
         "sb3-cure train: device is 'gpu', which PyTorch cannot use here: use 'auto', 'cpu', "
         "or 'cuda' on a machine with a GPU (settings: settings.yml, but device from --device)."
     ),
     f"{TRAIN} --seed one": "sb3-cure train: error: argument --seed: invalid int value: 'one'",
-    f"{TRAIN} -i no.zip": (
-        "sb3-cure train: The trained_agent must be a valid path to a .zip file: correct the command line."
+    **{
+        f"{TRAIN} -i {path}": (
+            f"sb3-cure train: -i/--trained-agent is '{path}', but it must be a .zip file that is there: give the path "
+            "of a saved model, or leave it out."
+        )
+        for path in ("no.zip", "settings.yml")
+    },
+    **{
+        f"{command} -n {number}": (
+            f"sb3-cure {command.split()[0]}: -n/--n-timesteps is {number}, but it must be a number of agent steps of "
+            "at least 1: give one, or leave it out."
+        )
+        for command, number in ((TRAIN, 0), (TRAIN, -7), (f"optimize --env {TASK}", 0), (f"enjoy --env {TASK}", 0))
+    },
+    f"{TRAIN} --track": (
+        "sb3-cure train: --track needs wandb, which is not installed: pip install wandb, or leave --track out."
     ),
+    **{
+        f"{command} settings.yml/new": (
+            f"sb3-cure {command.split()[0]}: {command.split()[-1]} is 'settings.yml/new', but {{folder}}/settings.yml "
+            "is a file: name a folder, or remove the file."
+        )
+        for command in (
+            f"enjoy --env {TASK} --reward-log",
+            f"optimize --env {TASK} --conf-file settings.yml --optimization-log-path",
+        )
+    },
     f"{TRAIN} -f settings.yml": (
         "sb3-cure train: settings.yml/cure_sac cannot be used (Not a directory): name "
         "another folder or file (settings: settings.yml)."
@@ -273,13 +305,24 @@ COMMANDS: dict[str, str] = {
         "sb3-cure train: n_envs in -params is 0, but it must be a whole number of at least 1: change n_envs."
     ),
     f"{TRAIN} --env-kwargs imagesize:36": (
-        "sb3-cure train: VectorBox.__init__() got an unexpected keyword argument 'imagesize' "
-        "was raised from the environment creator for tests/PixelBox-v0 with kwargs "
-        "({'imagesize': 36}) (settings: settings.yml, but env_kwargs from --env-kwargs)."
+        "sb3-cure train: env_kwargs has 'imagesize', but PixelBox has no such argument: correct or remove it "
+        "(settings: settings.yml, but env_kwargs from --env-kwargs)."
+    ),
+    "train --env dmc_pixels/finger-spin-v0 --conf-file settings.yml --env-kwargs image_sise:36": (
+        "sb3-cure train: env_kwargs has 'image_sise', but make_dmc_env has no such argument: write 'image_size' "
+        "(settings: settings.yml, but env_kwargs from --env-kwargs)."
     ),
     f"optimize --env {TASK} --conf-file settings.yml --storage nosql:///no --study-name mine": (
         "sb3-cure optimize: --storage is 'nosql:///no', which cannot be opened (Can't load "
         "plugin: sqlalchemy.dialects:nosql): give a database such as sqlite:///study.db."
+    ),
+    f"optimize --env {TASK} --conf-file settings.yml --storage settings.yml/new/study.log --study-name mine": (
+        "sb3-cure optimize: the folder of --storage is 'settings.yml/new', but {folder}/settings.yml is a file: name a "
+        "folder, or remove the file."
+    ),
+    f"optimize --env {TASK} --conf-file settings.yml --storage no-study.log --study-name mine": (
+        "sb3-cure optimize: --storage is 'no-study.log', which cannot be opened (Expecting value: line 1 column 1 "
+        "(char 0)): give a database such as sqlite:///study.db."
     ),
     f"enjoy --env {TASK} --no-render": (
         "sb3-cure enjoy: The logs/cure_sac folder was not found: give the run's --env, with "
@@ -349,7 +392,10 @@ COMMANDS: dict[str, str] = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_command_lines(command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_command_lines(
+    command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
     Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
     Path("grid.yml").write_text(yaml.safe_dump(GRID))
     Path("no-study.log").write_text(yaml.safe_dump(SETTINGS))
@@ -357,6 +403,14 @@ def test_command_lines(command: str, capsys: pytest.CaptureFixture[str], tmp_pat
     for name in ("mine", "yours"):
         optuna.create_study(study_name=name, storage=storage).ask()
     assert refusal(command, capsys) == COMMANDS[command].replace("{folder}", str(tmp_path))
+
+
+def test_the_length_of_the_file_can_be_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its -1, and only that, is rl-zoo3's word for it."""
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    assert cli.main([*TRAIN.split(), "-n", "-1", "--save-freq", "20"]) == 0
+    assert "Overwriting n_timesteps" not in capsys.readouterr().out
+    assert Path(f"{RUN}_1/rl_model_20_steps.zip").is_file()
 
 
 class Drawn(PixelBox):
@@ -376,7 +430,9 @@ class Drawn(PixelBox):
 Denoising = type("Denoising", (RAE,), {"__module__": "my_heads"})
 RUN = "logs/cure_sac/tests-PixelBox-v0"
 ENJOY = f"enjoy --env {TASK} --no-render"
-#: command line -> the whole sentence; the run 1 is of that head, 2 was damaged, 3 is whole, 4 of DMC
+OF_RUN = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id."
+#: command line -> the whole sentence; the run 1 is of that head, 2 was damaged, 3 is whole and has checkpoints, 4 is of
+#: DMC and has many of these; the settings of 5 to 7 were damaged
 MODELS: dict[str, str] = {
     f"{ENJOY} --exp-id 1": (
         f"sb3-cure enjoy: '{RUN}_1/tests-PixelBox-v0.zip' was saved with the head "
@@ -397,9 +453,49 @@ MODELS: dict[str, str] = {
         "directory or an installed one."
     ),
     f"record --env {TASK} --srl Denoising": (
-        "sb3-cure record: --srl is 'Denoising', which cannot be imported (Empty module "
-        "name): name a class as module.Class, in a module of the working directory or an "
-        "installed one."
+        "sb3-cure record: --srl is 'Denoising', but it must be a head of your own as module.Class: write that, or "
+        "leave --srl out for 'rae' and 'curl', which models are saved with."
+    ),
+    f"{ENJOY} --exp-id 3 --srl rae": (
+        "sb3-cure enjoy: --srl is 'rae', but it must be a head of your own as module.Class: write that, or leave --srl "
+        "out for 'rae' and 'curl', which models are saved with."
+    ),
+    f"record --env {TASK} --exp-id 3 -o settings.yml/new": (
+        "sb3-cure record: --output-folder is 'settings.yml/new', but {folder}/settings.yml is a file: name a folder, "
+        "or remove the file."
+    ),
+    f"{ENJOY} --exp-id 1 --load-best": (
+        f"sb3-cure enjoy: there is no {RUN}_1/best_model.zip, but its run has the last model (without --load flags): "
+        f"choose one of these, or {OF_RUN}"
+    ),
+    f"record --env {TASK} --exp-id 3 --load-checkpoint 151": (
+        f"sb3-cure record: there is no {RUN}_3/rl_model_151_steps.zip, but its run has the last model (without --load "
+        "flags) and the best one (--load-best) and checkpoints at 50, 100 (--load-checkpoint): choose one of these, or "
+        f"{OF_RUN}"
+    ),
+    "enjoy --env dmc_pixels/finger-spin-v0 --no-render --exp-id 4 --load-best": (
+        "sb3-cure enjoy: there is no logs/cure_sac/dmc_pixels-finger-spin-v0_4/best_model.zip, but its run has "
+        "the last model (without --load flags) and checkpoints at 1, 2, 3, 4, ..., 8, 9, 10, 11 (--load-checkpoint): "
+        f"choose one of these, or {OF_RUN}"
+    ),
+    f"{ENJOY} --exp-id 5 --load-last-checkpoint": (
+        f"sb3-cure enjoy: there is no {RUN}_5/rl_model_*_steps.zip, but its run has the last model (without --load "
+        f"flags): choose one of these, or {OF_RUN}"
+    ),
+    f"{ENJOY} --exp-id 8": f"sb3-cure enjoy: there is no {RUN}_8/tests-PixelBox-v0.zip: {OF_RUN}",
+    f"{ENJOY} --exp-id 5": (
+        f"sb3-cure enjoy: {RUN}_5/tests-PixelBox-v0/config.yml is no YAML (while parsing a flow node expected the node "
+        f"content, but found '<stream end>' in \"{RUN}_5/tests-PixelBox-v0/config.yml\", line 1, column 2), but it "
+        "must hold the settings of a run: restore it, or choose another with --exp-id."
+    ),
+    f"record --env {TASK} --exp-id 6": (
+        f"sb3-cure record: {RUN}_6/tests-PixelBox-v0/config.yml is no YAML ('utf-8' codec can't decode byte 0xff in "
+        "position 0: invalid start byte), but it must hold the settings of a run: restore it, or choose another with "
+        "--exp-id."
+    ),
+    f"{ENJOY} --exp-id 7": (
+        f"sb3-cure enjoy: {RUN}_7/tests-PixelBox-v0/config.yml holds None, but it must hold the settings of a run: "
+        "restore it, or choose another with --exp-id."
     ),
     f"{ENJOY} --srl sb3_cure.srl.Denoising": (
         "sb3-cure enjoy: --srl is 'sb3_cure.srl.Denoising', which cannot be imported (module "
@@ -438,9 +534,8 @@ MODELS: dict[str, str] = {
         "--env-kwargs)."
     ),
     f"record --env {TASK} --exp-id 3 --env-kwargs imagesize:36": (
-        "sb3-cure record: VectorBox.__init__() got an unexpected keyword argument "
-        "'imagesize' was raised from the environment creator for tests/PixelBox-v0 with "
-        "kwargs ({'imagesize': 36, 'render_mode': 'rgb_array'}): correct --env-kwargs."
+        "sb3-cure record: env_kwargs has 'imagesize', but Drawn has no such argument: correct or remove it in "
+        "--env-kwargs."
     ),
     "enjoy --env dmc_pixels/finger-spin-v0 --no-render --exp-id 4 --env-kwargs image_size:-1": (
         "sb3-cure enjoy: image_size=-1 is not an integer of at least 1; use image_size=84, "
@@ -463,7 +558,9 @@ MODELS: dict[str, str] = {
 
 @pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
 @pytest.mark.parametrize("command", MODELS)
-def test_models(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_models(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Those that are loaded, and the windows that show them."""
     Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
     for number, head in enumerate((Denoising, RAE, RAE), 1):
@@ -472,12 +569,21 @@ def test_models(command: str, capsys: pytest.CaptureFixture[str], monkeypatch: p
     other = Path("logs/cure_sac/dmc_pixels-finger-spin-v0_4/dmc_pixels-finger-spin-v0.zip")
     other.parent.mkdir()
     other.touch()
+    for name in ("best_model", "rl_model_100_steps", "rl_model_50_steps"):
+        Path(f"{RUN}_3/{name}.zip").touch()
+    for steps in range(1, 12):
+        (other.parent / f"rl_model_{steps}_steps.zip").touch()
+    for number, text in enumerate((b"{", b"\xff", b""), 5):
+        Path(f"{RUN}_{number}/tests-PixelBox-v0").mkdir(parents=True)
+        Path(f"{RUN}_{number}/tests-PixelBox-v0.zip").touch()
+        Path(f"{RUN}_{number}/tests-PixelBox-v0/config.yml").write_bytes(text)
+    Path(f"{RUN}_8").mkdir()
     damaged = Path(f"{RUN}_2/tests-PixelBox-v0.zip")
     damaged.write_bytes(damaged.read_bytes()[:3000])
     gym.registry[TASK] = EnvSpec(TASK, Drawn)
     monkeypatch.setitem(sys.modules, "pygame", None)  # as if it were not installed
     monkeypatch.setenv("DISPLAY", ":0")
-    assert refusal(command, capsys) == MODELS[command]
+    assert refusal(command, capsys) == MODELS[command].replace("{folder}", str(tmp_path))
 
 
 def arm(**method: Any) -> dict[str, Any]:
