@@ -1,7 +1,7 @@
 """rl-zoo3's programs with CuReSAC among its algorithms: ``python -m sb3_cure.zoo train --env ... --conf-file ...``.
 
 ``train``, ``enjoy``, ``record`` and ``optimize`` are rl-zoo3's own, with all of its flags (``--help`` shows them). What
-differs: the algorithm is ``cure_sac`` and the folder ``logs`` unless given, ``--env`` must be given, ``optimize`` means
+differs: the algorithm is ``cure_sac``, which needs ``--env``, and the folder ``logs`` unless given, ``optimize`` means
 ``train -optimize``, and what this module's classes say.
 """
 
@@ -535,12 +535,15 @@ def _parse_flags(
     """For ``ArgumentParser.parse_args``: what rl-zoo3 finds wrong never, late, or without naming the flag."""
     if parser.get_default("algo") is None:  # of another program
         return _parse_args(parser, args, namespace)
-    # Its own --env is CartPole-v1.
+    # Its own --env is CartPole-v1, which suits its own algorithms.
     with mock.patch.object(StoreDict, "__call__", _store_each):
         given = _parse_args(parser, args, argparse.Namespace(env=None))
     flags = vars(given)
     if given.env is None:
-        raise SettingsError("--env is missing: add the id of an environment, such as --env dmc_pixels/finger-spin-v0.")
+        if given.algo == ALGO:
+            example = "dmc_pixels/finger-spin-v0"
+            raise SettingsError(f"--env is missing: add the id of an environment, such as --env {example}.")
+        given.env = parser.get_default("env")
     if given.n_timesteps < 1 and given.n_timesteps != parser.get_default("n_timesteps"):
         raise SettingsError(
             f"-n/--n-timesteps is {given.n_timesteps}, but it must be a number of agent steps of at least 1: give one, "

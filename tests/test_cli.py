@@ -106,6 +106,12 @@ for command, package in ("report", "matplotlib"), ("train", "rl_zoo3"):
     ]
 
 
+def test_rl_zoos_own_algorithms_keep_their_environment(folder: Path) -> None:
+    """--env may be left out with them, as in rl-zoo3: CartPole-v1."""
+    assert cli.main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
+    assert (folder / "logs" / "dqn" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
+
+
 def test_a_users_missing_module_is_no_missing_extra(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A head that cannot be imported is named, and nothing is to be installed."""
     command = ["train", "--env", TASK, "--conf-file", "tiny.yml", "-params", "srl:'no_such_heads.Mine'"]
