@@ -107,9 +107,14 @@ def test_a_good_run_is_warned_of_nothing(srl: str, curiosity: str) -> None:
 
 @pytest.mark.parametrize("srl, min_updates", [("rae", 200), ("curl", 580)])
 def test_real_pixels_are_warned_of_nothing(srl: str, min_updates: int) -> None:
-    """Some hundred updates on DeepMind Control, judged when the latents have unfolded, which takes CURL longer."""
+    """Some hundred updates on DeepMind Control, judged when the latents have unfolded, which takes CURL longer.
+
+    With four filters, as in the other tests, some seeds need longer still.
+    """
     env = make_dmc_env("cartpole", "swingup", image_size=40, renderer="fast", seed=0)
-    warned, logged = watch(tiny_model("CnnPolicy", env, srl=srl), min_updates + 110, min_updates=min_updates)
+    networks = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 16, "n_layers": 3}}
+    model = tiny_model("CnnPolicy", env, srl=srl, policy_kwargs=networks)
+    warned, logged = watch(model, min_updates + 110, min_updates=min_updates)
     assert warned == [], logged
     assert {"dead_units", "collapsed_latents", "curious_reward"} <= set(logged)
     env.close()
@@ -222,12 +227,12 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
     "curious": (
         lambda: box(PixelBox(), curiosity_beta=1e-3, normalize_curiosity=False),
         "curious_reward",
-        r"the curious reward varies by .*e-06 while the entropy term is .*: use normalize_curiosity=True",
+        r"the curious reward varies by \d.*e-0[67] while the entropy term is .*: use normalize_curiosity=True",
     ),
     "bonus": (
         lambda: box(PixelBox(), curiosity="bonus", curiosity_beta=1e-3, normalize_curiosity=False),
         "curious_reward",
-        r"the curious reward varies by .*e-06",
+        r"the curious reward varies by \d.*e-0[67]",
     ),
 }
 
