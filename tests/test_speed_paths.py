@@ -124,35 +124,29 @@ def test_overlap_needs_worker_processes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("srl", ["rae", "curl"])
 def test_bfloat16_gradients_point_where_those_of_float32_do(srl: str) -> None:
-    """One state, one batch, one stream of random numbers: a cosine of 0.99 for every part of the agent, on average.
+    """One state, one batch, one stream of random numbers: cosine of at least 0.99 for every part of the agent.
 
-    Where the samples' gradients nearly cancel, as those of an actor sometimes do, the direction of what is left is less
-    exact than that: four agents are looked at, and each of them has 0.95.
+    A batch of the paper's size: in one of a few samples an actor's gradients may nearly cancel.
     """
-    cosines: dict[str, list[float]] = {}
-    for seed in range(4):
-        arguments: dict[str, Any] = dict(
-            srl=srl,
-            update="joint",
-            seed=seed,
-            batch_size=64,
-            policy_kwargs=dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=16, n_layers=3)),
-        )
-        trained = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(60)
-        state = copy.deepcopy(trained.get_parameters())
-        found = {}
-        for precision in ("fp32", "bf16"):
-            model = tiny_model("CnnPolicy", PixelBox(), precision=precision, **arguments)
-            model.set_logger(trained.logger)
-            model.set_parameters(state)
-            model.replay_buffer = trained.replay_buffer
-            found[precision] = gradients_of_an_update(model, seed=5)
-        assert found["fp32"].keys() == found["bf16"].keys() and len(found["fp32"]) == 6
-        for name, expected in found["fp32"].items():
-            cosine = float(th.cosine_similarity(expected, found["bf16"][name], dim=0))
-            cosines.setdefault(name, []).append(cosine)
-    for name, each in cosines.items():
-        assert min(each) >= 0.95 and sum(each) / len(each) >= 0.99, (name, each)
+    arguments: dict[str, Any] = dict(
+        srl=srl,
+        update="joint",
+        batch_size=128,
+        policy_kwargs=dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=16, n_layers=3)),
+    )
+    trained = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(60)
+    state = copy.deepcopy(trained.get_parameters())
+    found = {}
+    for precision in ("fp32", "bf16"):
+        model = tiny_model("CnnPolicy", PixelBox(), precision=precision, **arguments)
+        model.set_logger(trained.logger)
+        model.set_parameters(state)
+        model.replay_buffer = trained.replay_buffer
+        found[precision] = gradients_of_an_update(model, seed=5)
+    assert found["fp32"].keys() == found["bf16"].keys() and len(found["fp32"]) == 6
+    for name, expected in found["fp32"].items():
+        cosine = float(th.cosine_similarity(expected, found["bf16"][name], dim=0))
+        assert cosine >= 0.99, (name, cosine)
 
 
 @pytest.mark.parametrize("srl", ["rae", "curl"])

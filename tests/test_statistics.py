@@ -387,7 +387,7 @@ def test_the_papers_tables() -> None:
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("grid.json", "{", r"grid\.json is no JSON"),
+        ("grid.json", "{", r"grid\.json is no JSON .*: remove it and run the grid again, which writes it\."),
         ("grid.json", "[]", r"grid\.json holds a list"),
         ("grid.json", '{"experiment": "x"}', r"grid\.json has kind None"),
         ("eval.csv", "environment_steps\n1\n", r"eval\.csv has no column 'return_mean'"),
@@ -401,7 +401,7 @@ def test_the_papers_tables() -> None:
         ("eval.csv", "environment_steps,return_mean\n9,1\n100000,2\n", r"of from 9 to 100000 environment steps"),
         ("eval.csv", "environment_steps,return_mean\n0,1\n50000,\n100000,2\n", r"no return_mean in line 3"),
         ("eval.csv", "environment_steps,return_mean\n0,1\n50000,nan\n100000,2\n", r"no return_mean in line 3"),
-        ("run.json", "", r"run\.json is no JSON"),
+        ("run.json", "", r"run\.json is no JSON .*: remove the cell's folder and run the grid again\."),
         ("config.json", '{"method": "other", "seed": 0}', r"config\.json is of method 'other'"),
     ],
 )

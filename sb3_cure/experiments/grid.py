@@ -128,10 +128,9 @@ class Grid:
         :param results: Folder of all results
         :return: All that the file makes of it, and of the further seeds that other calls have run there
         """
-        folders = [found for cell in self.complete for found in (results / cell.folder.parent).glob("seed*")]
-        numbers = [folder.name.removeprefix("seed") for folder in folders]
-        seeds = {cell.seed for cell in self.complete} | {int(number) for number in numbers if number.isdecimal()}
         arms = [cell for cell in self.complete if cell.seed == self.complete[0].seed]
+        run = (seed_of(folder) for arm in arms for folder in (results / arm.folder.parent).glob("seed*"))
+        seeds = {cell.seed for cell in self.complete} | {seed for seed in run if seed is not None}
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
 
 
@@ -141,6 +140,15 @@ def short_name(task: str) -> str:
     :return: The id without namespace and version: a folder's name
     """
     return re.sub(r"-v\d+$", "", task.split("/")[-1])
+
+
+def seed_of(folder: Path) -> int | None:
+    """
+    :param folder: In that of an arm
+    :return: The seed whose cell it holds; None if it is no cell's
+    """
+    number = folder.name.removeprefix("seed")
+    return int(number) if folder.is_dir() and number.isdecimal() else None
 
 
 def load_grid(

@@ -117,7 +117,7 @@ def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list
         of = {str(cell.folder): finished[cell.folder] for cell in complete}
         seeds = sorted({cell.seed for cell in complete})
         of_task = [CommonHead(cells[0].task, seed, complete, of, COMMON_UPDATES, COMMON_SHARE) for seed in seeds]
-        can_be_made = not any(_lacks_model(cell, results) for cell in complete)
+        can_be_made = not any(finished[cell.folder] and _lacks_model(cell, results) for cell in complete)
         if len(seeds) > 1 and (can_be_made or all(head.is_done(results) for head in of_task)):
             heads += of_task
     return heads
@@ -130,13 +130,16 @@ def without_model(grid: Grid, results: Path) -> dict[str, Cell]:
     :return: By task, the first finished cell without ``model.zip``, such as those of a repository that does not keep
         them. Heads made of the others alone would judge these by another measure
     """
-    lacking = [cell for cells in _cells_by_task(grid, results) for cell in cells if _lacks_model(cell, results)]
+    cells = [cell for of_task in _cells_by_task(grid, results) for cell in of_task]
+    lacking = [cell for cell in cells if _finished_at(results / cell.folder) and _lacks_model(cell, results)]
     return {cell.task: cell for cell in reversed(lacking)}
 
 
 def _cells_by_task(grid: Grid, results: Path) -> Iterator[list[Cell]]:
-    for task in dict.fromkeys(cell.task for cell in grid.cells if cell.kind == "visitation"):
-        yield [cell for cell in grid.with_seeds_in(results) if cell.task == task]
+    if grid.kind == "visitation":
+        every = grid.with_seeds_in(results)
+        for task in dict.fromkeys(cell.task for cell in grid.cells):
+            yield [cell for cell in every if cell.task == task]
 
 
 def _finished_at(folder: Path) -> str | None:
@@ -147,8 +150,7 @@ def _finished_at(folder: Path) -> str | None:
 
 
 def _lacks_model(cell: Cell, results: Path) -> bool:
-    folder = results / cell.folder
-    return _finished_at(folder) is not None and not (folder / "model.zip").exists()
+    return not (results / cell.folder / "model.zip").exists()
 
 
 def run_head(head: CommonHead, results: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_cure.experiments.files import Row, read_rows
-from sb3_cure.experiments.grid import short_name
+from sb3_cure.experiments.grid import seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
 _AGAIN = "remove the cell's folder and run the grid again"
@@ -168,7 +168,7 @@ class Experiment:
         :raises ResultsError: if a head's file cannot be read
         """
         paths = sorted((self.folder / task / "common_heads").glob("*/common_head.json"))
-        made_of = [_read_json(path).get("cells") for path in paths]
+        made_of = [_read_json(path, f"remove {path.parent} and run the grid again").get("cells") for path in paths]
         return any(cells != made_of[0] for cells in made_of)
 
     @property
@@ -212,7 +212,7 @@ def read_results(folder: str | Path) -> list[Experiment]:
 
 
 def _read_experiment(path: Path, name: str | None = None) -> Experiment:
-    grid = _read_json(path)
+    grid = _read_json(path, "remove it and run the grid again, which writes it")
     for key, kind in (("experiment", str), ("kind", str), ("budget", int), ("baseline", str), ("tasks", list)):
         if not isinstance(grid.get(key), kind) or isinstance(grid.get(key), bool):
             raise ResultsError(f"{path} has {key} {grid.get(key)!r}, but it must be a {kind.__name__}: correct it.")
@@ -230,9 +230,8 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     root = path.parent
     keys = [(task, method, seed) for task in tasks for method in methods for seed in seeds]
     for found in sorted(root.glob("*/*/seed*")):
-        number = found.name.removeprefix("seed")
-        if found.is_dir() and number.isdecimal():
-            keys.append((found.parent.parent.name, found.parent.name, int(number)))
+        if (seed := seed_of(found)) is not None:
+            keys.append((found.parent.parent.name, found.parent.name, seed))
     cells = {
         key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"], grid["kind"]) for key in keys
     }
@@ -260,12 +259,12 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
         raise ResultsError(f"{folder} is marked as DONE, but has no {needed}: {_AGAIN}.")
     evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
     if needed == "eval.csv":
-        _check_whole(folder / needed, evaluations, config)
+        _check_whole(folder / needed, evaluations, own_budget, config)
     visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
 
 
-def _check_whole(path: Path, evaluations: dict[str, np.ndarray], config: dict[str, Any]) -> None:
+def _check_whole(path: Path, evaluations: dict[str, np.ndarray], budget: int, config: dict[str, Any]) -> None:
     """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return or none has."""
     steps, returns = evaluations["environment_steps"], evaluations["return_mean"]
     # Evaluations are due at multiples of `eval_every`, and are made before the next rollout.
@@ -275,9 +274,9 @@ def _check_whole(path: Path, evaluations: dict[str, np.ndarray], config: dict[st
     )
     gaps = np.flatnonzero(np.diff(steps // every) > max(1, np.ceil(rollout / every)))
     known = np.isfinite(returns)
-    if not len(steps) or steps[0] > 0 or steps[-1] < config.get("budget", 0):
+    if not len(steps) or steps[0] > 0 or steps[-1] < budget:
         found = f"from {steps[0]:.0f} to {steps[-1]:.0f}" if len(steps) else "no"
-        reason = f"has evaluations of {found} environment steps, but the cell was trained for {config['budget']}"
+        reason = f"has evaluations of {found} environment steps, but the cell was trained for {budget}"
     elif len(gaps):
         reason = f"has no evaluation between {steps[gaps[0]]:.0f} and {steps[gaps[0] + 1]:.0f} environment steps"
     elif known.any() and not known.all():
@@ -287,13 +286,13 @@ def _check_whole(path: Path, evaluations: dict[str, np.ndarray], config: dict[st
     raise ResultsError(f"{path} {reason}: {_AGAIN}.")
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ResultsError(f"{path} cannot be read ({error.strerror}): {_AGAIN}.") from None
+        raise ResultsError(f"{path} cannot be read ({error.strerror}): {fix}.") from None
     except ValueError as error:
-        raise ResultsError(f"{path} is no JSON ({error}): {_AGAIN}.") from None
+        raise ResultsError(f"{path} is no JSON ({error}): {fix}.") from None
     if not isinstance(content, dict):
         raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: correct it.")
     return content

@@ -131,10 +131,12 @@ def _run_here(cells: Sequence[Cell], ready: Ready, settings: tuple[Path, float, 
     return failed
 
 
-def _check_run(engine: str, checkpoint_minutes: float, cpus: float, gpus: float, retries: int) -> None:
+def _check_run(
+    engine: str, checkpoint_minutes: float, cpus_per_cell: float, gpus_per_cell: float, retries: int
+) -> None:
     if engine not in ENGINES:
         raise GridError(f"engine is {engine!r}, but it must be one of {', '.join(ENGINES)}: choose one.")
-    numbers = {"checkpoint-minutes": checkpoint_minutes, "cpus-per-cell": cpus, "gpus-per-cell": gpus}
+    numbers = {"checkpoint-minutes": checkpoint_minutes, "cpus-per-cell": cpus_per_cell, "gpus-per-cell": gpus_per_cell}
     for name, value in numbers.items():
         if not is_number(value, low=0):
             raise GridError(f"--{name} is {value!r}, but it must be a number of at least 0: change it.")
@@ -507,37 +509,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         grid = load_grid(
             options.grid, seeds=options.seeds, tasks=options.tasks, methods=options.methods, budget=options.budget
         )
-        if options.dry_run:
-            _check_run(
-                options.engine,
-                options.checkpoint_minutes,
-                options.cpus_per_cell,
-                options.gpus_per_cell,
-                options.retries,
-            )
-            check_grid(grid, options.out)
-            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
-            for unit in units:
-                print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
-            sys.stdout.flush()
-            return 0
         of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
         given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
         if options.engine == "local" and given:
             raise GridError(f"--{given[0].replace('_', '-')} is of Ray: add --engine ray.")
         if options.out.exists() and not options.out.is_dir():
             raise GridError(f"--out is {options.out}, which is a file: give a folder.")
-        failed = run_grid(
-            grid,
-            options.out,
-            engine=options.engine,
-            checkpoint_minutes=options.checkpoint_minutes,
-            pictures=not options.no_pictures,
-            address=options.address,
-            cpus_per_cell=options.cpus_per_cell,
-            gpus_per_cell=options.gpus_per_cell,
-            retries=options.retries,
-        )
+        checked = ("engine", "checkpoint_minutes", "cpus_per_cell", "gpus_per_cell", "retries")
+        how = {name: getattr(options, name) for name in checked}
+        if options.dry_run:
+            _check_run(**how)
+            check_grid(grid, options.out)
+            units: list[Unit] = [*grid.cells, *common_heads(grid, options.out, grid.cells)]
+            for unit in units:
+                print(f"{unit.folder}: {read_progress(unit, options.out)[0]}")
+            sys.stdout.flush()
+            return 0
+        failed = run_grid(grid, options.out, pictures=not options.no_pictures, address=options.address, **how)
         for sentence in _failures(failed, options.out):
             print(sentence)
         sys.stdout.flush()

@@ -19,11 +19,10 @@ DIFFERENCES = (
     "Arm minus baseline, seed by seed: the arms of a seed share evaluation starts, and where nothing but the method "
     "differs initial weights and warm-up data, too (same start: in how many pairs both earn the same before training; "
     "not so after pretraining, with other networks, or with another implementation). The t interval, which gives the "
-    "verdict, draws each task's mean from Student's t around the mean of "
-    "its pairs and weighs tasks evenly; with one task it is the paired t interval. The percentile bootstrap resamples "
-    "seeds within tasks; with two to five of them it is too narrow (it covers the truth in about 50 to 85 % of "
-    "cases), and is here for comparison. Above: in how many pairs the arm is above. Verdicts are not corrected for "
-    "the number of arms and tasks."
+    "verdict, draws each task's mean from Student's t around the mean of its pairs and weighs tasks evenly; with one "
+    "task it is the paired t interval. The percentile bootstrap resamples seeds within tasks; with two to five of "
+    "them it is too narrow (it covers the truth in about 50 to 85 % of cases), and is here for comparison. Above: in "
+    "how many pairs the arm is above. Verdicts are not corrected for the number of arms and tasks."
 )
 
 
