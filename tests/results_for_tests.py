@@ -99,12 +99,13 @@ def write_cell(
     if visitation or states is not None:
         columns = ("actor", "head", "episode", "error_min", "error_mean", "error_max", "return")
         write_csv(cell / "visitation.csv", columns, visitation)
-    if states is not None:
-        arrays = {f"{actor}_states": values for actor, values in states.items()}
-        errors = {f"{actor}_errors": np.zeros(len(values)) for actor, values in states.items()}
-        names = np.array([f"x{index}" for index in range(next(iter(states.values())).shape[1])])
-        units = np.array(["m"] * len(names) if state_units is None else state_units)
-        np.savez(cell / "visits.npz", **arrays, **errors, state_names=names, state_units=units)
+        arrays = {}
+        for actor, values in (states or {}).items():
+            units = ["m"] * values.shape[1] if state_units is None else state_units
+            arrays[f"{actor}_states"], arrays[f"{actor}_errors"] = values, np.zeros(len(values))
+            arrays["state_names"] = np.array([f"x{index}" for index in range(values.shape[1])])
+            arrays["state_units"] = np.array(units)
+        np.savez(cell / "visits.npz", **arrays)
     if done:
         (cell / "DONE").touch()
     return cell

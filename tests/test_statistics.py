@@ -452,6 +452,20 @@ def test_damaged_states_and_missing_folders(results: Path, tmp_path: Path) -> No
         read_results(tmp_path / "empty")
 
 
+def test_states_of_a_cell_are_not_lost_without_a_word(tmp_path: Path) -> None:
+    """Its seed would be missing in the coverage; and states of two tasks would be counted as of one."""
+    write_grid(tmp_path, kind="visitation")
+    walk = np.random.default_rng(0).normal(size=(50, 2))
+    path = write_cell(tmp_path, TASK, "sac_ae", 0, {0: 1}, states={"random": walk})
+    write_cell(tmp_path, TASK, "sac_ae", 1, {0: 1}, states={"random": walk}, state_units=("rad", "rad/s"))
+    sentence = r"seed0 has states with the units m, m, but \S+seed1 has rad, rad/s: they are of two tasks; put"
+    with pytest.raises(ResultsError, match=sentence):
+        state_coverage(read_results(tmp_path)[0])
+    (path / "visits.npz").unlink()
+    with pytest.raises(ResultsError, match=r"seed0 is marked as DONE, but has no visits\.npz: remove the cell"):
+        read_results(tmp_path)
+
+
 def test_names_in_the_grid_cannot_leave_the_folder(results: Path) -> None:
     write_grid(results, methods={"../../secret": {}, "sac_ae": {}})
     with pytest.raises(ResultsError, match="cannot be the name of a folder"):

@@ -254,12 +254,16 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
     own_budget = config.get("budget", budget)
     if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
         return CellResult(task, method, seed, folder, f"other budget: {own_budget} steps", config, run)
-    needed = "visitation.csv" if kind == "visitation" else "eval.csv" if own_budget > 0 else "config.json"
-    if not (folder / needed).exists():
-        raise ResultsError(f"{folder} is marked as DONE, but has no {needed}: {_AGAIN}.")
+    if kind == "visitation":
+        needed = ["visitation.csv", "visits.npz"]
+    else:
+        needed = ["eval.csv"] if own_budget > 0 else []
+    for name in needed:
+        if not (folder / name).exists():
+            raise ResultsError(f"{folder} is marked as DONE, but has no {name}: {_AGAIN}.")
     evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
-    if needed == "eval.csv":
-        _check_whole(folder / needed, evaluations, own_budget, config)
+    if "eval.csv" in needed:
+        _check_whole(folder / "eval.csv", evaluations, own_budget, config)
     visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -169,7 +170,7 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
 
     :param experiment: An experiment
     :return: One row per task, arm and actor
-    :raises ResultsError: if a file cannot be read, or its states have another dimension than others of the task
+    :raises ResultsError: if a file cannot be read, or cells of a task have states of different coordinates
     """
     rows = []
     for task in experiment.tasks:
@@ -207,18 +208,21 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
 def _visits(experiment: Experiment, task: str) -> tuple[dict[tuple[str, int, str], np.ndarray], tuple[str, ...]]:
     """True states by arm, seed and actor, and the units of their coordinates."""
     visits: dict[tuple[str, int, str], np.ndarray] = {}
-    kinds: set[tuple[int, tuple[str, ...]]] = set()
+    kinds: dict[tuple[str, ...], Path] = {}
     for method in experiment.methods:
         for seed, cell in experiment.done(task, method).items():
             states, units = cell.states()
-            found = {(method, seed, actor): visited for actor, visited in states.items() if len(visited)}
+            found = {(method, seed, actor): visited for actor, visited in states.items() if visited.size}
             visits.update(found)
-            kinds.update((visited.shape[1], units) for visited in found.values())
-    if len(kinds) > 1 or (0, ()) in kinds:
+            if found:
+                kinds.setdefault(units, cell.folder)
+    if len(kinds) > 1:
+        (units, one), (others, other) = list(kinds.items())[:2]
         raise ResultsError(
-            f"the visits.npz files of {experiment.folder / task} have states of different dimension: run again."
+            f"{one} has states with the units {', '.join(units)}, but {other} has {', '.join(others)}: they are of two "
+            "tasks; put the one that does not belong there back."
         )
-    return visits, kinds.pop()[1] if kinds else ()
+    return visits, next(iter(kinds), ())
 
 
 def _yardstick(
