@@ -1,5 +1,5 @@
-"""Callbacks for ``learn``: evaluation, videos, pictures and warnings. All but the SRL errors in them serve any SB3
-algorithm (warnings: any off-policy one)."""
+"""Callbacks for ``learn``: evaluation, videos, pictures and warnings. All serve any SB3 algorithm (warnings: any
+off-policy one), but for the SRL errors in them, and for reconstructions, which need an encoder of ``CuReSAC``."""
 
 import contextlib
 import importlib

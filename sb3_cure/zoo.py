@@ -556,6 +556,10 @@ def _parse_flags(
         )
     if flags.get("track") and importlib.util.find_spec("wandb") is None:
         raise SettingsError("--track needs wandb, which is not installed: pip install wandb, or leave --track out.")
+    if flags.get("sampler") == "auto" and importlib.util.find_spec("optunahub") is None:
+        raise SettingsError(
+            "--sampler auto needs optunahub, which is not installed: pip install optunahub, or choose --sampler tpe."
+        )
     for name in ("output_folder", "optimization_log_path", "reward_log"):
         if flags.get(name):
             with _refusing():

@@ -252,6 +252,10 @@ COMMANDS: dict[str, str] = {
         )
         for command, number in ((TRAIN, 0), (TRAIN, -7), (f"optimize --env {TASK}", 0), (f"enjoy --env {TASK}", 0))
     },
+    f"optimize --env {TASK} --sampler auto": (
+        "sb3-cure optimize: --sampler auto needs optunahub, which is not installed: pip install optunahub, or choose "
+        "--sampler tpe."
+    ),
     f"{TRAIN} --track": (
         "sb3-cure train: --track needs wandb, which is not installed: pip install wandb, or leave --track out."
     ),

@@ -5,6 +5,7 @@
 #       --cpus-per-cell 4 --gpus-per-cell 0.25
 # Without GPUs: sbatch --gpus-per-node=0 ..., without --gpus-per-cell. Stopped or out of time? Submit it again.
 set -u
+export MUJOCO_GL=${MUJOCO_GL:-egl}  # sbatch passes on a DISPLAY (of ssh -X, say) that no node can open
 head=$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)
 export address="${head:?SLURM does not name its nodes}:6379"
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN=$(openssl rand -hex 32)  # else anyone on the network could run code in it
