@@ -954,6 +954,25 @@ def test_a_cluster_that_is_too_small_leaves_no_trace(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_gpus_of_a_cluster_are_given_to_cells_or_hidden(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray keeps no account of what nobody asks for: a cell per core would compute on the first card."""
+    with monkeypatch.context() as with_gpus:
+        with_gpus.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 2}')
+        sentence = (
+            r"--gpus-per-cell is not given, but a machine of this Ray cluster has 2: give the share of one per cell"
+        )
+        with pytest.raises(GridError, match=sentence):
+            run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="ray")
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    seen: list[str] = []
+    monkeypatch.setattr(run, "_run_and_tell", lambda *_: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]))
+    cell = load_grid(write_grid(tmp_path)).cells[0]
+    for has_gpu in (True, False):
+        run._run_on_worker(cell, tmp_path, 10, False, has_gpu)
+    assert seen == ["0", ""]
+
+
 def test_cells_of_other_settings_are_refused_whatever_their_seed(tmp_path: Path) -> None:
     """One seed per job, of which somebody changed the grid in between: else arms would mix both, unseen."""
     overrides = {"config": "zoo.yml", "overrides": {"batch_size": 9}}

@@ -42,7 +42,7 @@ def run_grid(
     pictures: bool = True,
     address: str | None = None,
     cpus_per_cell: float = 1,
-    gpus_per_cell: float = 0,
+    gpus_per_cell: float | None = None,
     retries: int = 3,
 ) -> list[Unit]:
     """Run the cells that are not done; started again after any interruption, it goes on.
@@ -56,7 +56,8 @@ def run_grid(
     :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
-    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card
+    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
+        only where no machine has a GPU: Ray would start a cell per core, all on the first card
     :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, for what cannot be run
@@ -132,11 +133,13 @@ def _run_here(cells: Sequence[Cell], ready: Ready, settings: tuple[Path, float, 
 
 
 def _check_run(
-    engine: str, checkpoint_minutes: float, cpus_per_cell: float, gpus_per_cell: float, retries: int
+    engine: str, checkpoint_minutes: float, cpus_per_cell: float, gpus_per_cell: float | None, retries: int
 ) -> None:
     if engine not in ENGINES:
         raise GridError(f"engine is {engine!r}, but it must be one of {', '.join(ENGINES)}: choose one.")
-    numbers = {"checkpoint-minutes": checkpoint_minutes, "cpus-per-cell": cpus_per_cell, "gpus-per-cell": gpus_per_cell}
+    numbers = {"checkpoint-minutes": checkpoint_minutes, "cpus-per-cell": cpus_per_cell}
+    if gpus_per_cell is not None:
+        numbers["gpus-per-cell"] = gpus_per_cell
     for name, value in numbers.items():
         if not is_number(value, low=0):
             raise GridError(f"--{name} is {value!r}, but it must be a number of at least 0: change it.")
@@ -158,6 +161,13 @@ def _run_and_tell(unit: Unit, results: Path, checkpoint_minutes: float, pictures
         _keep_error(unit, results, traceback.format_exc())
         return False
     return True
+
+
+def _run_on_worker(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool, has_gpu: bool) -> bool:
+    """The same in a process of Ray's, which leaves all GPUs to see for whoever has asked for none."""
+    if not has_gpu:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+    return _run_and_tell(unit, results, checkpoint_minutes, pictures)
 
 
 def _keep_error(unit: Unit, results: Path, text: str) -> None:
@@ -200,8 +210,9 @@ def _run_with_ray(
     resources: dict[str, Any],
 ) -> list[Unit]:
     # A process for each: what one leaves behind does not burden the next.
-    run = ray.remote(max_calls=1, **resources)(_run_and_tell)
-    pending: dict[Any, Unit] = {run.remote(unit, *settings): unit for unit in (*cells, *ready(cells))}
+    run = ray.remote(max_calls=1, **{**resources, "num_gpus": resources["num_gpus"] or 0})(_run_on_worker)
+    on_worker = (*settings, bool(resources["num_gpus"]))
+    pending: dict[Any, Unit] = {run.remote(unit, *on_worker): unit for unit in (*cells, *ready(cells))}
     failed = []
     while pending:
         for reference in ray.wait(list(pending), timeout=5)[0]:
@@ -218,16 +229,21 @@ def _run_with_ray(
                 succeeded = False
             if not succeeded:
                 failed.append(unit)
-            pending.update({run.remote(head, *settings): head for head in ready(pending.values())})
+            pending.update({run.remote(head, *on_worker): head for head in ready(pending.values())})
     return failed
 
 
 def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
-    """A cell that fits on no machine would wait for ever."""
+    """A cell that fits on no machine would wait for ever, and Ray keeps no account of GPUs that nobody asks for."""
     wanted = {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"]}
     for kind, amount in wanted.items():
         largest = max((node["Resources"].get(kind, 0) for node in nodes if node["Alive"]), default=0)
-        if amount > largest:
+        if amount is None and largest > 0:
+            raise GridError(
+                f"--gpus-per-cell is not given, but a machine of this Ray cluster has {largest:g}: give the share of "
+                "one per cell (0.25: four cells on a card), or 0 to compute on the CPU."
+            )
+        if amount is not None and amount > largest:
             raise GridError(
                 f"--{kind.lower()}s-per-cell is {amount:g}, but no machine of this Ray cluster has more than "
                 f"{largest:g}: ask for less."
@@ -497,7 +513,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     parser.add_argument("--address", help="of a Ray cluster (auto: the one this machine is part of)")
     parser.add_argument("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
-    parser.add_argument("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell, such as 0.25")
+    parser.add_argument(
+        "--gpus-per-cell", type=float, help="Ray: share of a GPU per cell, such as 0.25; 0: compute on the CPU"
+    )
     parser.add_argument("--retries", type=int, default=3, help="Ray: new starts of a cell whose worker died")
     parser.add_argument("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     parser.add_argument("--no-pictures", action="store_true", help="neither draw nor film")

@@ -441,9 +441,8 @@ def conditions_table(experiment: Experiment) -> Table:
         versions = cell.run.get("versions")
         packages = ", ".join(f"{name} {number}" for name, number in versions.items()) if versions else ""
         letter = letters.setdefault(packages, _letters(len(letters))) if packages else NONE
-        conditions = [
-            str(cell.run.get(key) or NONE) for key in ("device", "precision", "machine", "commit", "attempts")
-        ]
+        conditions = [str(cell.run.get(key) or NONE) for key in ("device", "precision", "machine")]
+        conditions += [_commits(cell.run), str(cell.run.get("attempts") or NONE)]
         key = (cell.task, cell.method, _steps(cell), _pretraining(cell), *conditions[:3], letter, *conditions[3:])
         rows.setdefault(key, []).append(cell)
         commits.setdefault((cell.task, cell.seed), set()).add(conditions[3])
@@ -459,6 +458,12 @@ def conditions_table(experiment: Experiment) -> Table:
         note += f" Arms of one seed that were run at different commits: {', '.join(mixed)}."
     columns = ["task", "arm", "seeds", ">environment steps", ">pretraining steps", ">wall-clock", "device", "precision"]
     return Table("Run conditions", [*columns, "machine", "versions", "commit", ">attempts"], shown, note)
+
+
+def _commits(run: Mapping[str, Any]) -> str:
+    """Of all attempts at a cell, and of what measured it in the end."""
+    attempts = [each.get("commit") or "unknown" for each in run.get("history", ())]
+    return _list([*attempts, run.get("commit")])
 
 
 def _letters(index: int) -> str:
