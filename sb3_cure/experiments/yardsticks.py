@@ -5,7 +5,7 @@
 On random episodes of the paper's six tasks, in its pixels: the error of predicting zero (the middle grey) and the mean
 image, of autoencoders that are untrained, and of the same ones while they are trained on other random episodes. Writes
 ``errors.csv`` and ``table.md``, which also says after how many updates an autoencoder errs less than the paper reports
-for its curious policy.
+for its curious policy, and what predicting zero errs in an older MuJoCo's pictures (benchmarks/zero_decoder.py).
 """
 
 import argparse
@@ -67,16 +67,17 @@ def measure_task(
     return rows
 
 
-def table(rows: Sequence[Row]) -> list[str]:
+def table(rows: Sequence[Row], elsewhere: Sequence[Row] = ()) -> list[str]:
     """
     :param rows: Rows of ``errors.csv``
+    :param elsewhere: Rows of ``zero_decoder.csv``: zero's error in the pictures of other versions of MuJoCo
     :return: Lines of a Markdown table: means over seeds beside the paper's
     """
-    lines = [
-        "| task | paper: random | paper: cure | zero | mean image | untrained autoencoder | "
-        "updates until the error is below the paper's cure | error at the end (updates) |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    versions = list(dict.fromkeys(str(row["mujoco"]) for row in elsewhere))
+    columns = ["task", "paper: random", "paper: cure", *(f"zero, MuJoCo {version}" for version in versions), "zero"]
+    columns += ["mean image", "untrained autoencoder", "updates until the error is below the paper's cure"]
+    columns += ["error at the end (updates)"]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for task in dict.fromkeys(row["task"] for row in rows):
         own = [row for row in rows if row["task"] == task]
         constant = {name: _mean(own, name, 0) for name in ("zero", "mean_image", "autoencoder")}
@@ -85,7 +86,11 @@ def table(rows: Sequence[Row]) -> list[str]:
         below = [number for number in measured if _mean(own, "autoencoder", number) < published["curious"].mean]
         crossing = str(below[0]) if below else f"more than {measured[-1]}"
         last = f"{_mean(own, 'autoencoder', measured[-1]):.4f} ({measured[-1]})"
-        shown = (published["random"].mean, published["curious"].mean, *constant.values())
+        older = [
+            float(np.mean([each["error_mean"] for each in elsewhere if (str(each["mujoco"]), each["task"]) == key]))
+            for key in ((version, task) for version in versions)
+        ]
+        shown = (published["random"].mean, published["curious"].mean, *older, *constant.values())
         lines.append(f"| {task} | " + " | ".join([*(f"{value:.4f}" for value in shown), crossing, last]) + " |")
     return lines
 
@@ -113,7 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows += measure_task(f"dmc_pixels/{task}-v0", (0, 1), UPDATES, 120)
             write_csv(path, COLUMNS, rows)
             write_json(options.out / "run.json", describe_run())
-    lines = table(rows)
+    elsewhere = options.out / "zero_decoder.csv"
+    lines = table(rows, read_rows(elsewhere) if elsewhere.exists() else ())
     write_text(options.out / "table.md", "\n".join(lines) + "\n")
     print("\n".join(lines))
     return 0

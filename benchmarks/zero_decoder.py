@@ -1,0 +1,86 @@
+"""What a decoder errs that always draws the middle grey, in the pictures of whichever MuJoCo is installed.
+
+    python -m venv older
+    older/bin/pip install --only-binary mujoco,labmaze,dm-tree,lxml dm-control==1.0.9 mujoco==2.3.2 'numpy<2'
+    MUJOCO_GL=egl older/bin/python benchmarks/zero_decoder.py --out results/yardsticks
+
+MuJoCo 3.12 changed how floors are drawn, so that numbers published before belong to other pictures of the same tasks.
+This file needs dm-control and NumPy alone and runs where MuJoCo is older than sb3_cure takes. It adds its rows to
+``zero_decoder.csv``; ``python -m sb3_cure.experiments.yardsticks`` then shows them.
+"""
+
+import argparse
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from dm_control import suite
+
+#: Domain, task and action repeat
+TASKS = (
+    ("cartpole", "swingup", 8),
+    ("finger", "spin", 2),
+    ("finger", "turn_easy", 2),
+    ("ball_in_cup", "catch", 4),
+    ("reacher", "easy", 4),
+    ("reacher", "hard", 4),
+)
+COLUMNS = ("mujoco", "task", "seed", "error_mean")
+
+
+def zero_error(domain: str, task: str, action_repeat: int, seed: int, steps: int = 120) -> float:
+    """
+    :param domain: Of the DeepMind Control suite
+    :param task: Of the domain
+    :param action_repeat: For how long each random action is held
+    :param seed: Of the episode and its actions
+    :param steps: Pictures, evenly spread over the episode
+    :return: Mean square of what the autoencoder is to draw: the picture in 5 bits, in [-0.5, 0.5]
+    """
+    env = suite.load(domain, task, task_kwargs={"random": seed})
+    env.reset()
+    bounds, rng = env.action_spec(), np.random.default_rng(seed)
+    shown = set(np.linspace(0, 1000 // action_repeat - 1, steps).astype(int))
+    errors = []
+    for step in range(1000 // action_repeat):
+        if step in shown:
+            picture = env.physics.render(84, 84, camera_id=0)
+            errors.append(np.mean(((picture // 8 + 0.5) / 32 - 0.5) ** 2))
+        action = rng.uniform(bounds.minimum, bounds.maximum)
+        for _ in range(action_repeat):
+            env.step(action)
+    return float(np.mean(errors))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure all tasks, replacing what this version of MuJoCo gave before.
+
+    :param arguments: Command line, ``sys.argv`` by default
+    :return: 0
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("yardsticks"), help="folder (default: yardsticks)")
+    parser.add_argument("--seeds", type=int, default=3, help="episodes of each task (default: 3)")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "zero_decoder.csv"
+    rows: list[dict[str, object]] = []
+    if path.exists():
+        with path.open(newline="") as file:
+            rows = [dict(row) for row in csv.DictReader(file) if row["mujoco"] != mujoco.__version__]
+    for domain, task, action_repeat in TASKS:
+        for seed in range(options.seeds):
+            error = zero_error(domain, task, action_repeat, seed)
+            rows.append(dict(zip(COLUMNS, (mujoco.__version__, f"{domain}-{task}", seed, error), strict=True)))
+            print(f"MuJoCo {mujoco.__version__}, {domain}-{task}, seed {seed}: {error:.4f}", flush=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
