@@ -423,7 +423,8 @@ def published_table(comparisons: Sequence[published.Comparison]) -> Table:
         [*columns, "judgement", "other methods"],
         rows,
         f"At the same environment steps. {sources}. Independent reruns land 5 to 25 % lower than published; below "
-        f"{published.SUSPECT_BELOW} of the published mean a bug of ours is suspected until shown otherwise.",
+        f"{published.SUSPECT_BELOW} of the published mean a bug of ours is suspected until shown otherwise. Published "
+        "returns are from pictures of MuJoCo before 3.12, which drew floors in another way.",
     )
 
 
