@@ -11,7 +11,9 @@ This file needs dm-control and NumPy alone and runs where MuJoCo is older than s
 
 import argparse
 import csv
+import platform
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import mujoco
@@ -27,7 +29,7 @@ TASKS = (
     ("reacher", "easy", 4),
     ("reacher", "hard", 4),
 )
-COLUMNS = ("mujoco", "task", "seed", "error_mean")
+COLUMNS = ("mujoco", "dm_control", "machine", "task", "seed", "error_mean")
 
 
 def zero_error(domain: str, task: str, action_repeat: int, seed: int, steps: int = 120) -> float:
@@ -66,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / "zero_decoder.csv"
+    here = (mujoco.__version__, version("dm_control"), f"{platform.system()} {platform.machine()}")
     rows: list[dict[str, object]] = []
     if path.exists():
         with path.open(newline="") as file:
@@ -73,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for domain, task, action_repeat in TASKS:
         for seed in range(options.seeds):
             error = zero_error(domain, task, action_repeat, seed)
-            rows.append(dict(zip(COLUMNS, (mujoco.__version__, f"{domain}-{task}", seed, error), strict=True)))
+            rows.append(dict(zip(COLUMNS, (*here, f"{domain}-{task}", seed, error), strict=True)))
             print(f"MuJoCo {mujoco.__version__}, {domain}-{task}, seed {seed}: {error:.4f}", flush=True)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)

@@ -73,24 +73,20 @@ def table(rows: Sequence[Row], elsewhere: Sequence[Row] = ()) -> list[str]:
     :param elsewhere: Rows of ``zero_decoder.csv``: zero's error in the pictures of other versions of MuJoCo
     :return: Lines of a Markdown table: means over seeds beside the paper's
     """
-    versions = list(dict.fromkeys(str(row["mujoco"]) for row in elsewhere))
-    columns = ["task", "paper: random", "paper: cure", *(f"zero, MuJoCo {version}" for version in versions), "zero"]
-    columns += ["mean image", "untrained autoencoder", "updates until the error is below the paper's cure"]
-    columns += ["error at the end (updates)"]
+    others = [{**row, "predictor": f"zero, MuJoCo {row['mujoco']}", "updates": 0} for row in elsewhere]
+    predictors = [*dict.fromkeys(row["predictor"] for row in others), "zero", "mean_image", "autoencoder"]
+    columns = ["task", "paper: random", "paper: cure", *predictors[:-2], "mean image", "untrained autoencoder"]
+    columns += ["updates until the error is below the paper's cure", "error at the end (updates)"]
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for task in dict.fromkeys(row["task"] for row in rows):
-        own = [row for row in rows if row["task"] == task]
-        constant = {name: _mean(own, name, 0) for name in ("zero", "mean_image", "autoencoder")}
+        own = [row for row in (*rows, *others) if row["task"] == task]
+        constant = [_mean(own, name, 0) for name in predictors]
         published = SRL_ERROR[task_key(task)]
         measured = sorted({row["updates"] for row in own})
         below = [number for number in measured if _mean(own, "autoencoder", number) < published["curious"].mean]
         crossing = str(below[0]) if below else f"more than {measured[-1]}"
         last = f"{_mean(own, 'autoencoder', measured[-1]):.4f} ({measured[-1]})"
-        older = [
-            float(np.mean([each["error_mean"] for each in elsewhere if (str(each["mujoco"]), each["task"]) == key]))
-            for key in ((version, task) for version in versions)
-        ]
-        shown = (published["random"].mean, published["curious"].mean, *older, *constant.values())
+        shown = (published["random"].mean, published["curious"].mean, *constant)
         lines.append(f"| {task} | " + " | ".join([*(f"{value:.4f}" for value in shown), crossing, last]) + " |")
     return lines
 
