@@ -1,9 +1,10 @@
 """Callbacks for ``learn``: evaluation, videos, pictures and warnings. All serve any SB3 algorithm (warnings: any
-off-policy one), but for the SRL errors in them, and for reconstructions, which need an encoder of ``CuReSAC``."""
+off-policy one), but for the SRL errors in them."""
 
 import contextlib
 import importlib
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from sb3_cure.envs import physics_state, physics_state_names, physics_state_unit
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
 from sb3_cure.metrics import newest_frames
+from sb3_cure.policies import encoder_of
 from sb3_cure.values import check_folder, is_integer, is_number
 
 
@@ -294,23 +296,28 @@ class PolicyVideoCallback(_PictureCallback):
             video.write_video(path, episode, self.fps, repeat, title)
 
 
+#: Observations that ``ReconstructionCallback`` keeps where there is no replay buffer
+LATEST = 1000
+
+
 class ReconstructionCallback(_PictureCallback):
     """Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations.
 
-    For heads that do not draw (contrastive ones, say) a decoder is fitted to the latents for each row, anew so that
-    rows can be compared; the agent does not learn from it. The file is rewritten with each row.
+    For heads that do not draw (contrastive ones, say), and for SB3's own algorithms, a decoder is fitted to the latents
+    for each row, anew so that rows can be compared; the agent does not learn from it. It is fitted to what the replay
+    buffer holds, or without one (PPO, A2C) to the latest ``LATEST`` observations. The file is rewritten with each row.
 
     :param folder: Where to write
     :param every: Agent steps between two rows
     :param observations: Images to reconstruct, uint8 [n, C, H, W]; the first row is then that of the untrained model.
-        By default ``columns`` from the replay buffer, spread over what it holds when the first row is drawn
+        By default ``columns`` of those that the decoder would be fitted to, spread over the time that they span when
+        the first row is drawn
     :param columns: How many observations to take
     :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment tells
     :param probe_updates: Updates of the decoder for heads that do not draw; 0: say once that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
-    :raises ValueError: if an argument is out of range, or the model does not learn from images with an encoder of
-        ``CuReSAC``
+    :raises ValueError: if an argument is out of range, or the model does not learn from images with an encoder
     :raises ImportError: if matplotlib is not installed
     """
 
@@ -348,13 +355,15 @@ class ReconstructionCallback(_PictureCallback):
         #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
         self.rows: list[tuple[int, np.ndarray]] = []
         self._said = False
+        self._latest: deque[np.ndarray] = deque(maxlen=LATEST)
 
     def _init_callback(self) -> None:
         space = self.model.observation_space
-        if getattr(self.model.policy, "encoder", None) is None or not is_image_space(space):
+        if encoder_of(self.model.policy) is None or not is_image_space(space):
             raise ValueError(
-                f"ReconstructionCallback got a {type(self.model).__name__} that learns from {space}, but it draws "
-                "images from the latents of CuReSAC's encoder: use it with CuReSAC('CnnPolicy', ...)."
+                f"ReconstructionCallback got a {type(self.model).__name__} that learns from {space} by "
+                f"{type(self.model.policy).__name__}, but it draws images of uint8 from an encoder's latents: use it "
+                "with 'CnnPolicy', where observations are such images."
             )
         if self.observations is not None and self.observations.shape[1:] != space.shape:
             raise ValueError(
@@ -365,31 +374,38 @@ class ReconstructionCallback(_PictureCallback):
     def _on_training_start(self) -> None:
         super()._on_training_start()
         # A resumed training has had its first row, or nothing to fit a decoder to.
-        resumed = self.model._run.resumed is not None  # type: ignore[attr-defined]
+        run = getattr(self.model, "_run", None)
+        resumed = run is not None and run.resumed is not None
         if self.observations is not None and not self.rows and not resumed:
             with _untouched_randomness(self.model.device):
                 self.on_period()
+
+    def _on_step(self) -> bool:
+        if self._buffer is None:
+            self._latest.extend(np.array(self.locals["new_obs"]))
+        return super()._on_step()
 
     def on_period(self) -> None:
         """Add a row."""
         model: Any = self.model
         model.policy.set_training_mode(False)
         if self.observations is None:
-            if model.replay_buffer.size() == 0:
+            if not self._has_seen_any():
                 return
-            self.observations = _spread_over(model.replay_buffer, self.columns)
+            self.observations = self._spread(self.columns)
         observed = th.as_tensor(self.observations, device=model.device)
+        head = getattr(model.policy, "srl", None)
         with th.no_grad():
-            drawn = None if model.policy.srl is None else model.policy.srl.reconstruct(model.policy.encode(observed))
+            drawn = None if head is None else head.reconstruct(model.policy.encode(observed))
         title = "Reconstructions over training"
         if drawn is None:
             if self.probe_updates == 0:
                 self._say_once_that_nothing_is_drawn()
                 return
-            if model.replay_buffer.size() == 0:  # nothing to fit a decoder to before the first steps
+            if not self._has_seen_any():  # nothing to fit a decoder to before the first steps
                 return
             probe = self._import_room("probe")
-            decoder = probe.fit_probe(model, self.probe_updates)
+            decoder = probe.fit_probe(model, self._sample, self.probe_updates)
             observed, drawn = probe.draw_with_probe(model, decoder, observed)
             title = "What a decoder fitted afterwards draws from the latents"
         attribute = self.training_env.get_attr("frame_stack") if self.training_env.has_attr("frame_stack") else [1]
@@ -403,12 +419,35 @@ class ReconstructionCallback(_PictureCallback):
             title,
         )
 
+    @property
+    def _buffer(self) -> ReplayBuffer | None:
+        return getattr(self.model, "replay_buffer", None)
+
+    def _has_seen_any(self) -> bool:
+        return len(self._latest) > 0 if self._buffer is None else self._buffer.size() > 0
+
+    def _sample(self, n: int) -> th.Tensor:
+        """Observations that the model has seen, at random, on its device, [n, *shape]."""
+        if self._buffer is not None:
+            return self._buffer.sample(n).observations
+        chosen = np.random.randint(len(self._latest), size=n)
+        return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
+
+    def _spread(self, n: int) -> np.ndarray:
+        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape]."""
+        if self._buffer is not None:
+            return _spread_over(self._buffer, n)
+        chosen = np.linspace(0, len(self._latest) - 1, n).round().astype(int)
+        return np.stack([self._latest[index] for index in chosen])
+
     def _say_once_that_nothing_is_drawn(self) -> None:
         if not self._said:
             self._said = True
+            head = getattr(self.model.policy, "srl", None)
+            who = type(self.model).__name__ if head is None else f"the head {type(head).__name__}"
             warnings.warn(
-                f"ReconstructionCallback draws nothing: the head {type(self.model.policy.srl).__name__} does not "
-                "reconstruct and probe_updates is 0; give probe_updates=500 to fit a decoder to the latents.",
+                f"ReconstructionCallback draws nothing: {who} does not reconstruct and probe_updates is 0; give "
+                "probe_updates=500 to fit a decoder to the latents.",
                 stacklevel=2,
             )
 

@@ -4,13 +4,11 @@ Each check measures one number on observations that the agent has seen, and says
 out of bounds. A check that does not apply to a model (no images, no autoencoder, no temperature) yields nothing.
 """
 
-import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
@@ -18,7 +16,7 @@ from torch import nn
 
 from sb3_cure import doctor
 from sb3_cure.buffers import transitions
-from sb3_cure.policies import CuRePolicy
+from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import RAE
 
 #: Transitions, of all environments together, within which a constant image is looked for
@@ -295,20 +293,10 @@ def software_rendering(env: VecEnv) -> Finding | None:
 
 def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str, float]] | None:
     """Latents, [n, features_dim], and for each ReLU of the encoder the share of its units that never fire."""
-    if isinstance(model.observation_space, spaces.Dict):
+    found = encoder_of(model.policy)
+    if found is None:
         return None
-    policy = model.policy
-    encoder: nn.Module | None
-    if isinstance(policy, CuRePolicy):
-        encoder, encode = policy.encoder, policy.encode
-    else:
-        # The features extractor of whichever network has one: critics, DQN's only network.
-        networks = [getattr(policy, name, None) for name in ("critic", "q_net", "actor")]
-        owner: Any = next((each for each in networks if getattr(each, "features_extractor", None) is not None), None)
-        encoder = None if owner is None else owner.features_extractor
-        encode = functools.partial(_extract, owner)
-    if encoder is None or not any(True for _ in encoder.parameters()):
-        return None
+    encoder, encode = found
     silent: dict[str, float] = {}
     handles = []
     for name, module in encoder.named_modules():
@@ -325,10 +313,6 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
         for handle in handles:
             handle.remove()
     return latents, silent
-
-
-def _extract(network: Any, observations: th.Tensor) -> th.Tensor:
-    return network.extract_features(observations, network.features_extractor)
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:

@@ -2,14 +2,15 @@
 
 import contextlib
 import copy
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
 from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -375,3 +376,29 @@ class MlpPolicy(CuRePolicy):
         super().__init__(
             observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
         )
+
+
+def encoder_of(policy: BasePolicy) -> tuple[nn.Module, Callable[[th.Tensor], th.Tensor]] | None:
+    """Where a policy of any SB3 algorithm makes latents of observations.
+
+    Of other policies than ``CuRePolicy`` it is the features extractor of the critic, else of DQN's networks, of the
+    actor, or of the policy itself (PPO, A2C).
+
+    :param policy: A policy
+    :return: The encoder, and what it makes, as when acting, of observations as stored ([B, *shape], images in 0-255):
+        latents [B, features_dim]. None for dictionaries, and where nothing is learned in between
+    """
+    encoder: Any
+    encode: Callable[[th.Tensor], th.Tensor]
+    if isinstance(policy, CuRePolicy):
+        encoder, encode = policy.encoder, policy.encode
+    else:
+        networks = [*(getattr(policy, name, None) for name in ("critic", "q_net", "quantile_net", "actor")), policy]
+        owner: Any = next((each for each in networks if getattr(each, "features_extractor", None) is not None), None)
+        if owner is None:
+            return None
+        encoder = owner.features_extractor
+        # BaseModel's, as an actor-critic's own returns features of both where these are not shared.
+        encode = functools.partial(BaseModel.extract_features, owner, features_extractor=encoder)
+    learned = any(True for _ in encoder.parameters())
+    return (encoder, encode) if learned and not isinstance(policy.observation_space, spaces.Dict) else None

@@ -42,6 +42,7 @@ from sb3_cure.allocator import tune_allocator
 from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
+from sb3_cure.settings import entry_for
 from sb3_cure.values import arguments_of, check_folder, check_keywords, is_integer, is_number
 
 ALGO = "cure_sac"
@@ -125,6 +126,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     """rl-zoo3's, which reads the YAML and makes environments and model, with these additions:
 
     - ``env_kwargs`` of the YAML file hold for the evaluation's environments too, and ``record`` finds them again;
+    - an entry ``dmc_pixels:`` of the YAML file holds for all tasks of this namespace that have none of their own;
     - ``srl: my_package.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - ``optimize`` samples only the hyper-parameters that the chosen kind of curiosity uses, and several processes may
       start at once on a database that does not exist yet;
@@ -208,12 +210,18 @@ class ExperimentManager(exp_manager.ExperimentManager):
             ) from error
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        self._check_file()
+        entry = self._check_file()
         if self.trial_id is not None:
             trial = self._trial()
             self.trial_id = None
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
-        hyperparams, saved = super().read_hyperparameters()
+        asked = self.env_name
+        if entry not in (None, "default"):
+            self.env_name = type(asked)(entry)  # by which rl-zoo3 looks it up
+        try:
+            hyperparams, saved = super().read_hyperparameters()
+        finally:
+            self.env_name = asked
         if self.algo == ALGO:
             self._check_values(hyperparams)
         return hyperparams, saved
@@ -252,7 +260,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
             "which is 0: name one of them."
         )
 
-    def _check_file(self) -> None:
+    def _check_file(self) -> str | None:
+        """The entry of a YAML file that holds for the environment."""
         path = Path(self.config)
         if (self.config.endswith((".yml", ".yaml", ".py")) and not path.is_file()) or path.is_dir():
             given = f"the settings file {path} is no file"
@@ -262,7 +271,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"{given}: give one with --conf-file, such as zoo_configs/cure_sac_ae.yml of sb3_cure's sources."
             )
         if not self.config.endswith((".yml", ".yaml")):
-            return
+            return None
         try:
             entries = yaml.safe_load(path.read_text())
         except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -270,10 +279,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if not isinstance(entries, dict):
             raise SettingsError(f"{path} holds {entries!r}, but it must map environments to settings: correct it.")
         task = self.env_name.gym_id
-        if task not in entries and "default" not in entries:
+        name = entry_for(task, entries)
+        if name is None:
             raise SettingsError(f"{path} has neither {task!r} nor 'default': add one of them.")
-        if not isinstance(entries.get(task, entries.get("default")), dict):
+        if not isinstance(entries[name], dict):
             raise SettingsError(f"the settings of {task!r} in {path} are no mapping (key: value): correct them.")
+        return name
 
     def _check_values(self, hyperparams: dict[str, Any]) -> None:
         known = arguments_of(ALGOS[ALGO])

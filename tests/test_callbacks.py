@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 from sb3_contrib import RecurrentPPO
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -296,6 +296,62 @@ def test_heads_that_do_not_draw_get_a_probe_or_one_sentence(tmp_path: Path) -> N
     assert np.abs(probed.rows[-1][1] - observed).mean() < 0.75 * untouched
 
 
+class Compass(gym.ActionWrapper):
+    """Steps to one of four sides, for algorithms with discrete actions."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Discrete(4)
+
+    def action(self, action: int) -> np.ndarray:
+        return np.array([(-1, 0), (1, 0), (0, -1), (0, 1)][action], np.float32)
+
+
+PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed=0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SAC("CnnPolicy", PixelBox(), seed=0, learning_starts=30, policy_kwargs=dict(net_arch=[8])),
+        lambda: DQN("CnnPolicy", Compass(PixelBox()), seed=0, learning_starts=10, buffer_size=100),
+        lambda: PPO("CnnPolicy", PixelBox(), **PPO_ARGUMENTS),
+        lambda: PPO("CnnPolicy", PixelBox(), policy_kwargs=dict(share_features_extractor=False), **PPO_ARGUMENTS),
+        lambda: RecurrentPPO("CnnLstmPolicy", PixelBox(), **PPO_ARGUMENTS),
+        lambda: CuReSAC("CnnPolicy", PixelBox(), srl=None, curiosity=None, seed=0, learning_starts=30),
+    ],
+    ids=["SAC", "DQN", "PPO", "PPO, nothing shared", "RecurrentPPO", "CuReSAC as SAC"],
+)
+def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], tmp_path: Path) -> None:
+    """A decoder makes pictures of its features, another for each observation; training is as without pictures."""
+    callback = ReconstructionCallback(tmp_path, every=20, columns=5, probe_updates=30)
+    watched, alone = make().learn(48, callback=callback), make().learn(48)
+    assert [steps for steps, _ in callback.rows] == [20, 40] and names(tmp_path) == ["reconstructions.png"]
+    observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1]
+    different = len(np.unique(callback.observations, axis=0))
+    assert different >= 3, "of different times"
+    assert np.abs(drawn - observed).mean() < 0.75 * np.abs(observed - 128).mean(), "no grey"
+    assert len(np.unique(drawn, axis=0)) == different, "of different latents"
+    assert differences(watched.get_parameters(), alone.get_parameters()) == []
+
+
+def test_the_latest_observations_serve_where_there_is_no_replay_buffer(tmp_path: Path) -> None:
+    """All of them up to ``LATEST``, of all environments, each as it was returned."""
+    model = PPO("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=40, probe_updates=1)
+    seen: list[np.ndarray] = []
+
+    class Note(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.extend(self.locals["new_obs"].copy() if self.num_timesteps <= 20 else [])
+            return True
+
+    model.learn(32, callback=[Note(), callback])
+    stored = np.stack(seen)
+    assert len(stored) == 20 and len(callback.observations) == 40
+    np.testing.assert_array_equal(np.unique(callback.observations, axis=0), np.unique(stored, axis=0))
+
+
 def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:
     """What was visited is what the policies visit in the same episodes, with their errors."""
     env = PixelBox()
@@ -398,7 +454,10 @@ def test_wrong_arguments_are_one_sentence(make: Callable[..., BaseCallback], mes
             "this model has 'task', 'random': choose",
         ),
         (lambda env, path: CuriosityMapCallback(env, path, actors=["best"], **MAP), r"actors=\['best'\]"),
-        (lambda env, path: ReconstructionCallback(path), "learns from Box.*draws images.*use it with CuReSAC"),
+        (
+            lambda env, path: ReconstructionCallback(path),
+            "SAC that learns from Box.*draws images of uint8.*'CnnPolicy'",
+        ),
     ],
 )
 def test_callbacks_that_do_not_fit_the_model_say_so(

@@ -8,6 +8,8 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import yaml
+from envs_for_tests import PixelBox
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure import CuReSAC, zoo
 from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
@@ -37,16 +39,24 @@ CURE_DEFAULTS = {name: each.default for name, each in inspect.signature(CuReSAC)
 SMALL = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4}}
 
 
+class Dots(PixelBox):
+    """Images that are not as those of DeepMind Control."""
+
+    def __init__(self, **kwargs: Any):
+        super().__init__(frame_stack=1, size=52, channels_last=True, tells_frame_stack=False, **kwargs)
+
+
 def entries(folder: Path) -> list[tuple[str, str]]:
-    """Method and task of every entry of the files in a folder, ``default`` as a task that has none of its own."""
+    """Method and task of every entry for DeepMind Control of the files in a folder, and a task that has none."""
     found = [(path.stem, name) for path in sorted(folder.glob("*.yml")) for name in yaml.safe_load(path.read_text())]
-    return [(method, ANY_OTHER if name == "default" else name) for method, name in found]
+    methods = sorted({method for method, _ in found})
+    return [*(each for each in found if "/" in each[1]), *((method, ANY_OTHER) for method in methods)]
 
 
 def entry_of(path: Path, task: str) -> dict[str, Any]:
     """What the file says about a task."""
     content = yaml.safe_load(path.read_text())
-    return content.get(task, content["default"])
+    return content.get(task, content.get("dmc_pixels", content["default"]))
 
 
 def set_up(config: Path, task: str, log_folder: Path, **changes: Any) -> tuple[CuReSAC, zoo.ExperimentManager]:
@@ -69,8 +79,7 @@ def test_the_files_and_their_entries() -> None:
         assert {path.stem for path in folder.glob("*.yml")} == METHODS.keys()
     for method in METHODS:
         names = yaml.safe_load((FOLDER / f"{method}.yml").read_text()).keys()
-        assert names == SIX_TASKS.keys() | {"default"}
-        assert "default" in yaml.safe_load((FOLDER / "fast" / f"{method}.yml").read_text())
+        assert names - {"dmc_pixels"} == SIX_TASKS.keys() | {"default"}
     assert {task for folder in (FOLDER, FOLDER / "fast") for _, task in entries(folder)} <= gym.registry.keys()
 
 
@@ -128,6 +137,18 @@ def test_each_file_trains(path: str, tmp_path: Path) -> None:
     evaluation.close()
 
 
+@pytest.mark.parametrize("path", [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS])
+def test_the_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of whatever size and order of channels, here 52 pixels, channels last; with that file's head."""
+    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", Dots))
+    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=30, warmup_updates=2, buffer_size=200)
+    model, manager = set_up(FOLDER / path, "Dots-v0", tmp_path, n_timesteps=50, **small)
+    manager.learn(model)
+    assert (model.num_timesteps, model._n_updates) == (50, 2 + 20)
+    assert model.srl == METHODS[path.removeprefix("fast/").removesuffix(".yml")]["srl"]
+    assert float(model.logger.name_to_value["train/srl_loss"]) > 0
+
+
 @pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))
 def test_every_grid_has_a_fast_one(name: str) -> None:
     """Which asks the same: the same methods from the fast files, pretrained in the same proportion."""
@@ -140,6 +161,12 @@ def test_every_grid_has_a_fast_one(name: str) -> None:
             share = method["pretrain"]["budget"] / slow.description["budget"]
             method["pretrain"]["budget"] = share * fast.description["budget"]
     assert list(fast.description["methods"].items()) == list(methods.items())
+
+
+def test_grids_read_the_entry_of_the_namespace() -> None:
+    """As ``train`` does: a task without an entry of its own has that of ``dmc_pixels``, not the default."""
+    cells = load_grid(FOLDER / "experiments" / "fast" / "visitation.yml", tasks=["reacher-easy"], seeds=1).cells
+    assert [cell.env_kwargs for cell in cells] == [{"image_size": 48, "renderer": "fast"}] * 4
 
 
 @pytest.mark.parametrize("folder", ["experiments", "experiments/fast"])

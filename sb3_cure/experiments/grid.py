@@ -15,6 +15,7 @@ import yaml
 from sb3_cure.checks import check_arguments, check_parts
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
+from sb3_cure.settings import entry_for
 from sb3_cure.values import arguments_of, is_integer
 
 #: The file that tells that a cell is finished
@@ -293,9 +294,10 @@ def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[st
     _check_keys(method, _METHOD_KEYS, {"config"}, where)
     config_path = path.parent / str(method["config"])
     entries = _read_yaml(config_path)
-    if task not in entries and "default" not in entries:
+    name = entry_for(task, entries)
+    if name is None:
         raise GridError(f"{config_path} has neither {task!r} nor 'default', but {where} needs one: add one of them.")
-    entry = _mapping(task, entries.get(task, entries.get("default")), config_path)
+    entry = _mapping(name, entries[name], config_path)
     entry = {**entry, **_mapping("overrides", method.get("overrides", {}), path)}
     unknown = sorted(set(entry) - _ENTRY_KEYS - _ARGUMENTS)
     if unknown:

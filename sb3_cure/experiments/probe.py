@@ -1,12 +1,17 @@
 """What do the latents know of the image? A decoder fitted afterwards, on a frozen encoder."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.metrics import image_strip, reconstruction_strip
+from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import PixelDecoder
 
 
@@ -32,27 +37,29 @@ def reconstruct_with_probe(
     strip = reconstruction_strip(policy, shown, frame_stack, columns)
     if strip is not None:
         return strip
-    decoder = fit_probe(model, updates, batch_size)
+    decoder = fit_probe(model, lambda n: buffer.sample(n).observations, updates, batch_size)
     return image_strip(*draw_with_probe(model, decoder, shown.observations), frame_stack)
 
 
-def fit_probe(model: CuReSAC, updates: int = 1000, batch_size: int = 64) -> nn.Module:
+def fit_probe(
+    model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000, batch_size: int = 64
+) -> nn.Module:
     """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
 
-    :param model: A trained model with images as observations and a filled replay buffer
+    :param model: A model of any SB3 algorithm that learns from images with an encoder (``policies.encoder_of``)
+    :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W], on the model's device
     :param updates: Updates of the decoder
     :param batch_size: Observations per update
     :return: The decoder: latents -> images in [-0.5, 0.5]
+    :raises ValueError: if the model has no encoder
     """
-    policy, buffer = model.policy, model.replay_buffer
-    shape = policy.encoder_space.shape or ()
-    decoder: nn.Module = PixelDecoder(policy.encoder.features_dim, shape).to(model.device)
+    encoder: Any = _encoder(model)[0]
+    shape: tuple[int, ...] = getattr(model.policy, "encoder_space", model.observation_space).shape or ()
+    layers = min(4, (min(shape[1:]) + 1) // 4)  # as many as small images allow
+    decoder: nn.Module = PixelDecoder(encoder.features_dim, shape, n_layers=layers).to(model.device)
     optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
     for _ in range(updates):
-        observations = buffer.sample(batch_size).observations  # type: ignore[union-attr]
-        with th.no_grad():
-            images = policy.center(observations)
-            latents = policy.encoder(images)
+        images, latents = _images_and_latents(model, sample(batch_size))
         loss = F.mse_loss(decoder(latents), images - 0.5)
         optimizer.zero_grad()
         loss.backward()
@@ -61,13 +68,29 @@ def fit_probe(model: CuReSAC, updates: int = 1000, batch_size: int = 64) -> nn.M
 
 
 @th.no_grad()
-def draw_with_probe(model: CuReSAC, decoder: nn.Module, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def draw_with_probe(model: BaseAlgorithm, decoder: nn.Module, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
     :param model: The model whose latents are drawn
     :param decoder: Its decoder, of ``fit_probe``
     :param observations: Observations as stored, 0-255, [B, C, H, W]
     :return: What the encoder sees of them (a crop, say) and what is drawn from its latents, both 0-255, [B, C, h, w]
     """
-    images = model.policy.center(observations)
-    drawn = (decoder(model.policy.encoder(images)) + 0.5).clamp(0, 1)
-    return images * 255, drawn * 255
+    images, latents = _images_and_latents(model, observations)
+    return images * 255, (decoder(latents) + 0.5).clamp(0, 1) * 255
+
+
+@th.no_grad()
+def _images_and_latents(model: BaseAlgorithm, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """What the encoder sees of observations, in [0, 1], and what it makes of that."""
+    policy: Any = model.policy
+    if isinstance(policy, CuRePolicy):
+        images = policy.center(observations)
+        return images, policy.encoder(images)
+    return observations.float() / 255, _encoder(model)[1](observations)
+
+
+def _encoder(model: BaseAlgorithm) -> tuple[nn.Module, Callable[[th.Tensor], th.Tensor]]:
+    found = encoder_of(model.policy)
+    if found is None:
+        raise ValueError(f"the {type(model.policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")
+    return found
