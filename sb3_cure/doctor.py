@@ -11,6 +11,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import textwrap
 import time
 import warnings
 from collections.abc import Sequence
@@ -42,6 +43,14 @@ NVIDIA_GL = (
     "install the EGL library of NVIDIA's driver (Debian: `apt-get install libegl-nvidia0`, Ubuntu: `apt-get install "
     "libnvidia-gl-N` with the driver's version for N); in a container set NVIDIA_DRIVER_CAPABILITIES=all"
 )
+MESA_GL = (
+    "install Mesa's drivers (`apt-get install libgl1-mesa-dri`) and let this user open /dev/dri/renderD* (group "
+    "render; in a container: --device /dev/dri)"
+)
+#: Vendors, by their PCI numbers, whose GPUs Mesa draws with
+MESA_VENDORS = {"0x1002": "AMD", "0x8086": "Intel"}
+#: Where Linux lists what can draw
+DRM = Path("/sys/class/drm")
 RENDERING_TIMEOUT = 180
 
 
@@ -130,9 +139,14 @@ def _check_software(report: Report) -> None:
         report.errors.append(f"{'; '.join(problems)}: pip install {install}")
     report.sections["Extras"] = []
     for extra, purpose in EXTRAS.items():
-        problems = unmet(requirements(extra))
+        needed = requirements(extra)
+        problems = unmet(needed)
         state = f'{"; ".join(problems)}: pip install "{PACKAGE}[{extra}]"' if problems else "complete"
         report.sections["Extras"].append((extra, f"{state} ({purpose})"))
+        installed = [
+            f"{name} {version}" for name in sorted({each.name for each in needed}) if (version := _version(name))
+        ]
+        report.sections["Extras"] += [("", line) for line in textwrap.wrap(", ".join(installed), 100)]
 
 
 # ------------------------------------------------------------------- hardware
@@ -140,7 +154,7 @@ def _check_software(report: Report) -> None:
 
 def find_gpus() -> list[str]:
     """
-    :return: Names of the GPUs that torch can use, or else of those that NVIDIA's driver knows
+    :return: Names of the GPUs that torch can use, or else of those that NVIDIA's driver knows, and of AMD's and Intel's
     """
     if th.cuda.is_available():
         return [th.cuda.get_device_name(i) for i in range(th.cuda.device_count())]
@@ -148,7 +162,14 @@ def find_gpus() -> list[str]:
     for path in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):
         fields = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
         names.append(fields.get("Model", "NVIDIA GPU").strip())
+    for path in sorted(DRM.glob("renderD*/device/vendor")):
+        if vendor := MESA_VENDORS.get(path.read_text().strip()):
+            names.append(f"{vendor} GPU")
     return names
+
+
+def _is_mesas(gpu: str) -> bool:
+    return gpu.startswith(tuple(MESA_VENDORS.values()))
 
 
 def cpu_features() -> dict[str, bool]:
@@ -236,9 +257,10 @@ def _check_hardware(report: Report, gpus: Sequence[str]) -> None:
         ('precision="auto"', explain_precision(resolve_precision("auto", device), device)),
         ('compile="auto"', resolve_compile("auto", device)[1]),
     ]
-    if gpus and device.type == "cpu":
+    unused = [gpu for gpu in gpus if not _is_mesas(gpu)]
+    if unused and device.type == "cpu":
         report.warnings.append(
-            f"there is a GPU ({gpus[0]}), but torch {th.__version__} cannot use it: install torch's CUDA build, as "
+            f"there is a GPU ({unused[0]}), but torch {th.__version__} cannot use it: install torch's CUDA build, as "
             "https://pytorch.org/get-started says for this machine."
         )
     if warning := judge_memory(available, needed):
@@ -264,7 +286,8 @@ def judge_renderer(name: str, gpus: Sequence[str]) -> str | None:
     """
     if not is_software_renderer(name) or not gpus:
         return None
-    return f"OpenGL renders on the CPU ({name}), although there is a GPU ({gpus[0]}): {NVIDIA_GL}."
+    remedy = MESA_GL if _is_mesas(gpus[0]) else NVIDIA_GL
+    return f"OpenGL renders on the CPU ({name}), although there is a GPU ({gpus[0]}): {remedy}."
 
 
 def measure_rendering(frames: int = 15) -> dict[str, Any]:

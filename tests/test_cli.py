@@ -6,6 +6,7 @@ import sys
 import tracemalloc
 from collections import OrderedDict
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -233,7 +234,15 @@ def test_the_doctor_on_a_machine_that_works(capsys: pytest.CaptureFixture[str]) 
     """Versions, choices, and the time of a frame with both renderers; status 0."""
     assert cli.main(["doctor"]) == 0
     report = capsys.readouterr().out
-    for text in ("torch  ", "mujoco  ", 'precision="auto"', 'compile="auto"', '(renderer="fast")', "MUJOCO_GL="):
+    for text in (
+        "torch  ",
+        "mujoco  ",
+        f"rl_zoo3 {metadata.version('rl_zoo3')}",
+        'precision="auto"',
+        'compile="auto"',
+        '(renderer="fast")',
+        "MUJOCO_GL=",
+    ):
         assert text in report
     assert "ERROR" not in report and "Training can work here." in report
 
@@ -253,19 +262,36 @@ def test_the_doctor_survives_broken_opengl(
 
 
 @pytest.mark.parametrize(
-    ("renderer", "gpus", "warned"),
+    ("renderer", "gpus", "install"),
     [
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", ["NVIDIA A100"], True),
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", [], False),
-        ("NVIDIA A100/PCIe/SSE2", ["NVIDIA A100"], False),
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", ["NVIDIA A100"], "libegl-nvidia0"),
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", ["Intel GPU"], "libgl1-mesa-dri"),
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", [], None),
+        ("NVIDIA A100/PCIe/SSE2", ["NVIDIA A100"], None),
     ],
 )
-def test_software_rendering_beside_a_gpu_is_warned_of(renderer: str, gpus: list[str], warned: bool) -> None:
+def test_software_rendering_beside_a_gpu_is_warned_of(renderer: str, gpus: list[str], install: str | None) -> None:
     """The warning names both, and what to install; without a GPU there is nothing to warn of."""
     warning = doctor.judge_renderer(renderer, gpus)
-    assert (warning is not None) == warned
-    if warning:
-        assert "llvmpipe" in warning and "NVIDIA A100" in warning and "install" in warning
+    assert (warning is not None) == (install is not None)
+    if warning and install:
+        assert "llvmpipe" in warning and gpus[0] in warning and install in warning
+
+
+def test_gpus_that_draw_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of AMD and Intel, which this torch does not compute on; not the display of a server's board (ASPEED)."""
+    for number, vendor in enumerate(["0x8086", "0x1002", "0x1a03"]):
+        device = tmp_path / f"renderD{128 + number}" / "device"
+        device.mkdir(parents=True)
+        (device / "vendor").write_text(f"{vendor}\n")
+    monkeypatch.setattr(doctor, "DRM", tmp_path)
+    monkeypatch.setattr(doctor.th.cuda, "is_available", lambda: False)
+    gpus = doctor.find_gpus()
+    assert gpus[-2:] == ["Intel GPU", "AMD GPU"]
+    report = doctor.Report()
+    doctor._check_hardware(report, gpus[-2:])
+    assert ("GPU", "Intel GPU, AMD GPU") in report.sections["Hardware"]
+    assert not any("CUDA" in warning for warning in report.warnings), "which they do not run"
 
 
 def test_memory_is_compared_with_the_buffer() -> None:

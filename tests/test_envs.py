@@ -468,9 +468,21 @@ def test_working_gl_names_its_renderer():
     [({}, "egl"), ({"DISPLAY": ":0"}, None), ({"WAYLAND_DISPLAY": "wayland-0"}, None), ({"MUJOCO_GL": "glfw"}, "glfw")],
 )
 def test_egl_is_chosen_only_without_a_display_and_a_choice(environment, chosen):
-    with mock.patch.dict(os.environ, environment, clear=True), mock.patch.object(sys, "platform", "linux"):
+    with (
+        mock.patch.dict(os.environ, environment, clear=True),
+        mock.patch.object(sys, "platform", "linux"),
+        mock.patch("glfw.init", return_value=1),
+    ):
         load_gl()
         assert os.environ.get("MUJOCO_GL") == chosen
+
+
+def test_a_display_that_cannot_be_opened_is_none():
+    """As that of an ssh connection that has ended: frames are drawn, without a word about displays."""
+    code = "from sb3_cure import make_dmc_env as make; print(make('cartpole', 'swingup').reset()[0].std())"
+    result = run_python(code, DISPLAY=":77")
+    assert result.returncode == 0 and float(result.stdout) > 1, result.stderr
+    assert "isplay" not in result.stderr
 
 
 @pytest.mark.parametrize(("backend", "fix"), [("off", "apt-get install"), (None, "apt-get"), ("glfw", "MUJOCO_GL=egl")])

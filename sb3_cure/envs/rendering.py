@@ -3,6 +3,7 @@
 import importlib
 import os
 import sys
+import warnings
 
 
 class GLUnavailableError(RuntimeError):
@@ -21,9 +22,20 @@ def _missing(cause: object) -> GLUnavailableError:
 
 def is_headless() -> bool:
     """
-    :return: Whether there is no display to open a window on
+    :return: Whether there is no display to open a window on: none is named, or that cannot be opened (as one of
+        ``ssh -X`` in a terminal that has outlived it, or on another node)
     """
-    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if sys.platform != "linux":
+        return False
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return True
+    try:
+        glfw = importlib.import_module("glfw")
+    except ImportError:  # nobody to ask
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return not glfw.init()
 
 
 def load_gl() -> None:
@@ -36,8 +48,8 @@ def load_gl() -> None:
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
-    if is_headless():
-        os.environ.setdefault("MUJOCO_GL", "egl")
+    if "MUJOCO_GL" not in os.environ and is_headless():
+        os.environ["MUJOCO_GL"] = "egl"
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     # pygame, which opens windows for render_mode="human", would draw with OpenGL, too: that ends the process (EGL), or
@@ -54,7 +66,7 @@ def load_gl() -> None:
     # dm_control prefers GLFW when it is imported without MUJOCO_GL, even here, where that aborts the process.
     if backend == "glfw" and is_headless():
         raise GLUnavailableError(
-            "dm_control was imported with its GLFW backend, which needs a display, and there is none; set "
+            "dm_control was imported with its GLFW backend, which needs a display, and none can be opened; set "
             "MUJOCO_GL=egl before starting Python."
         )
 
