@@ -30,7 +30,7 @@ from sb3_cure.experiments.cells import (
     is_evaluation_due,
     run_cell,
 )
-from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
+from sb3_cure.experiments.files import Row, checkout_commit, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import DONE, Cell, GridError, load_grid
 
 GRID = Path(__file__).parent.parent / "zoo_configs" / "experiments" / "fast" / "public_sac_ae.yml"
@@ -147,13 +147,16 @@ def run_public(checkout: Path, cell: Cell, results: Path) -> None:
         write_json(folder / "config.json", {**cell.config(), "action_repeat": run.action_repeat})
         write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
         seconds = run.evaluations[-1]["seconds"]
-        conditions = {"device": "cpu", "precision": "fp32", "seconds": seconds, "attempts": 1}
+        conditions = {
+            **{"device": "cpu", "precision": "fp32", "seconds": seconds, "attempts": 1},
+            "implementation": {"source": SOURCE, "commit": checkout_commit(checkout)},
+        }
         write_json(folder / "run.json", {**describe_run(), **conditions})
         write_text(folder / DONE, "")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run all three arms, seed by seed."""
+    """Run all arms, seed by seed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     checkout_argument(parser)
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of results (default: results)")

@@ -57,16 +57,24 @@ def code_commit() -> str | None:
         return os.environ["SB3_CURE_COMMIT"]
     root = Path(sb3_cure.__file__).parent.parent
     if (root / ".git").exists():
-        command = ["git", "-C", str(root), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
-        try:
-            return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-        except (OSError, subprocess.CalledProcessError):
-            return None
+        return checkout_commit(root)
     try:
         origin = json.loads(distribution("sb3-cure").read_text("direct_url.json") or "{}")
     except PackageNotFoundError:
         return None
     return origin.get("vcs_info", {}).get("commit_id", "")[:12] or None
+
+
+def checkout_commit(folder: Path) -> str | None:
+    """
+    :param folder: A checkout
+    :return: Its commit, marked where it has changes; None if git does not know it
+    """
+    command = ["git", "-C", str(folder), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
 
 
 # Of what runs: later the checkout may have moved on.
