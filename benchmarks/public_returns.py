@@ -143,13 +143,14 @@ def run_public(checkout: Path, cell: Cell, results: Path) -> None:
     with alone_in(folder):
         if (folder / DONE).exists():
             return
+        commit = checkout_commit(checkout)  # of what runs: later the checkout may have moved on
         run = _PublicRun(checkout, cell)
         write_json(folder / "config.json", {**cell.config(), "action_repeat": run.action_repeat})
         write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
         seconds = run.evaluations[-1]["seconds"]
         conditions = {
             **{"device": "cpu", "precision": "fp32", "seconds": seconds, "attempts": 1},
-            "implementation": {"source": SOURCE, "commit": checkout_commit(checkout)},
+            "implementation": {"source": SOURCE, "commit": commit},
         }
         write_json(folder / "run.json", {**describe_run(), **conditions})
         write_text(folder / DONE, "")

@@ -25,7 +25,7 @@ from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
-from sb3_cure.metrics import newest_frames
+from sb3_cure.metrics import frame_stack_of, newest_frames
 from sb3_cure.policies import encoder_of
 from sb3_cure.values import check_folder, is_integer, is_number
 
@@ -296,7 +296,7 @@ class PolicyVideoCallback(_PictureCallback):
             video.write_video(path, episode, self.fps, repeat, title)
 
 
-#: Observations that ``ReconstructionCallback`` keeps where there is no replay buffer
+#: Observations that ``ReconstructionCallback`` keeps where there is no replay buffer: 64 MB of three frames of 84 x 84
 LATEST = 1000
 
 
@@ -309,11 +309,12 @@ class ReconstructionCallback(_PictureCallback):
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param observations: Images to reconstruct, uint8 [n, C, H, W]; the first row is then that of the untrained model.
-        By default ``columns`` of those that the decoder would be fitted to, spread over the time that they span when
-        the first row is drawn
+    :param observations: Images to reconstruct, uint8 [n, C, H, W]; where the head itself draws, the first row is then
+        that of the untrained model. By default ``columns`` of those that the decoder would be fitted to, spread over
+        the time that they span when the first row is drawn
     :param columns: How many observations to take
-    :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment tells
+    :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment or
+        ``VecFrameStack`` tells
     :param probe_updates: Updates of the decoder for heads that do not draw; 0: say once that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
@@ -381,7 +382,7 @@ class ReconstructionCallback(_PictureCallback):
                 self.on_period()
 
     def _on_step(self) -> bool:
-        if self._buffer is None:
+        if self._buffer is None and self.probe_updates > 0:
             self._latest.extend(np.array(self.locals["new_obs"]))
         return super()._on_step()
 
@@ -408,8 +409,7 @@ class ReconstructionCallback(_PictureCallback):
             decoder = probe.fit_probe(model, self._sample, self.probe_updates)
             observed, drawn = probe.draw_with_probe(model, decoder, observed)
             title = "What a decoder fitted afterwards draws from the latents"
-        attribute = self.training_env.get_attr("frame_stack") if self.training_env.has_attr("frame_stack") else [1]
-        frame_stack = self.frame_stack or attribute[0]
+        frame_stack = self.frame_stack or frame_stack_of(self.training_env)
         self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
         self._import_room("plots").reconstructions_over_training(

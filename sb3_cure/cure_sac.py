@@ -53,7 +53,7 @@ from sb3_cure.guards import (
     look_before_steps,
     post_mortem_of_a_step,
 )
-from sb3_cure.metrics import Metrics, reconstruction_strip
+from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
@@ -380,7 +380,7 @@ class CuReSAC(SAC):
     def _read_env_attributes(self) -> None:
         """What logging needs to know; again before each ``learn``, as ``set_env`` may have changed it."""
         self._action_repeat = self._env_attribute("action_repeat") or 1
-        self._frame_stack = self._env_attribute("frame_stack") or 1
+        self._frame_stack = 1 if self.env is None else frame_stack_of(self.env)
 
     def _env_attribute(self, name: str) -> Any:
         """An attribute that the environments tell, or None."""

@@ -143,10 +143,11 @@ def _check_software(report: Report) -> None:
         problems = unmet(needed)
         state = f'{"; ".join(problems)}: pip install "{PACKAGE}[{extra}]"' if problems else "complete"
         report.sections["Extras"].append((extra, f"{state} ({purpose})"))
-        installed = [
-            f"{name} {version}" for name in sorted({each.name for each in needed}) if (version := _version(name))
-        ]
-        report.sections["Extras"] += [("", line) for line in textwrap.wrap(", ".join(installed), 100)]
+        names = sorted({each.name for each in needed})
+        # Parted between packages, not before a version.
+        installed = [f"{name}\xa0{version}" for name in names if (version := _version(name))]
+        lines = textwrap.wrap(", ".join(installed), 100, break_on_hyphens=False)
+        report.sections["Extras"] += [("", line.replace("\xa0", " ")) for line in lines]
 
 
 # ------------------------------------------------------------------- hardware

@@ -6,6 +6,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_cure.policies import CuRePolicy
 
@@ -96,3 +97,13 @@ def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
     if channels not in (1, 3):
         channels = 1
     return images[:, -channels:].to(th.uint8)
+
+
+def frame_stack_of(env: VecEnv) -> int:
+    """
+    :param env: Environments
+    :return: Frames per observation, as they and SB3's ``VecFrameStack`` around them tell; 1 where nothing tells
+    """
+    stacked = unwrap_vec_wrapper(env, VecFrameStack)
+    own = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else 1
+    return own if stacked is None else own * stacked.stacked_obs.n_stack

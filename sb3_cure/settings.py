@@ -6,7 +6,7 @@ Classes are looked up by name in a fixed table; nothing that a file names is imp
 import math
 import pathlib
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -391,13 +391,3 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
     }.items()
     for name in names.split()
 }
-
-
-def entry_for(task: str, entries: Collection[str]) -> str | None:
-    """Which entry of a YAML file of settings holds for a task.
-
-    :param task: Id of the environment, such as ``"dmc_pixels/walker-walk-v0"``
-    :param entries: The file's keys
-    :return: Its own, else that of its namespace (``"dmc_pixels"``), else ``"default"``; None if there is none of these
-    """
-    return next((name for name in (task, task.rpartition("/")[0], "default") if name and name in entries), None)

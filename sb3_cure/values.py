@@ -3,7 +3,7 @@
 import difflib
 import inspect
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,3 +107,13 @@ def check_folder(name: str, folder: Any) -> None:
 def _is_read_only(folder: Path) -> bool:
     """Of a file system: root may write where others may not, but not there."""
     return bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+
+
+def entry_for(task: str, entries: Collection[str]) -> str | None:
+    """Which entry of a YAML file of settings holds for a task.
+
+    :param task: Id of the environment, such as ``"dmc_pixels/walker-walk-v0"``
+    :param entries: The file's keys
+    :return: Its own, else that of its namespace (``"dmc_pixels"``), else ``"default"``; None if there is none of these
+    """
+    return next((name for name in (task, task.rpartition("/")[0], "default") if name and name in entries), None)

@@ -42,8 +42,7 @@ from sb3_cure.allocator import tune_allocator
 from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
-from sb3_cure.settings import entry_for
-from sb3_cure.values import arguments_of, check_folder, check_keywords, is_integer, is_number
+from sb3_cure.values import arguments_of, check_folder, check_keywords, entry_for, is_integer, is_number
 
 ALGO = "cure_sac"
 PROGRAMS = ("train", "enjoy", "record", "optimize")
@@ -216,7 +215,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             self.trial_id = None
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
         asked = self.env_name
-        if entry not in (None, "default"):
+        if entry is not None:
             self.env_name = type(asked)(entry)  # by which rl-zoo3 looks it up
         try:
             hyperparams, saved = super().read_hyperparameters()
@@ -280,10 +279,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
             raise SettingsError(f"{path} holds {entries!r}, but it must map environments to settings: correct it.")
         task = self.env_name.gym_id
         name = entry_for(task, entries)
+        if name in (None, "default") and self._is_atari and "atari" in entries:
+            name = "atari"  # as rl-zoo3's own files have it
         if name is None:
             raise SettingsError(f"{path} has neither {task!r} nor 'default': add one of them.")
         if not isinstance(entries[name], dict):
-            raise SettingsError(f"the settings of {task!r} in {path} are no mapping (key: value): correct them.")
+            raise SettingsError(f"the settings of {name!r} in {path} are no mapping (key: value): correct them.")
         return name
 
     def _check_values(self, hyperparams: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from test_bad_input import files_in, is_one_sentence
 
-from sb3_cure import cli, zoo
+from sb3_cure import cli
 from sb3_cure.srl import RAE
 
 TASK = "tests/PixelBox-v0"
@@ -82,8 +82,7 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     ),
     "a list of settings": (
         "default: [1]",
-        "sb3-cure train: the settings of 'tests/PixelBox-v0' in settings.yml are no mapping "
-        "(key: value): correct them.",
+        "sb3-cure train: the settings of 'default' in settings.yml are no mapping (key: value): correct them.",
     ),
     "a misspelt argument": (
         {"curiousity": None},
@@ -586,7 +585,7 @@ def test_models(
     damaged.write_bytes(damaged.read_bytes()[:3000])
     gym.registry[TASK] = EnvSpec(TASK, Drawn)
     monkeypatch.setitem(sys.modules, "pygame", None)  # as if it were not installed
-    monkeypatch.setattr(zoo, "is_headless", lambda: False)
+    monkeypatch.setenv("DISPLAY", ":0")
     assert refusal(command, capsys) == MODELS[command].replace("{folder}", str(tmp_path))
 
 

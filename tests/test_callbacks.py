@@ -20,9 +20,9 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure import CuReSAC, callbacks, make_dmc_env
 from sb3_cure.callbacks import (
     CuriosityMapCallback,
     ExactCheckpoint,
@@ -31,6 +31,7 @@ from sb3_cure.callbacks import (
     ReconstructionCallback,
 )
 from sb3_cure.evaluation import Episode, binned_errors, run_episodes
+from sb3_cure.experiments import plots
 from sb3_cure.experiments.video import annotated_frames
 from sb3_cure.srl import SRLHead, SRLOutput
 
@@ -335,8 +336,11 @@ def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], t
     assert differences(watched.get_parameters(), alone.get_parameters()) == []
 
 
-def test_the_latest_observations_serve_where_there_is_no_replay_buffer(tmp_path: Path) -> None:
-    """All of them up to ``LATEST``, of all environments, each as it was returned."""
+def test_the_latest_observations_serve_where_there_is_no_replay_buffer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last ``LATEST``, of all environments, each as it was returned."""
+    monkeypatch.setattr(callbacks, "LATEST", 12)
     model = PPO("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
     callback = ReconstructionCallback(tmp_path, every=20, columns=40, probe_updates=1)
     seen: list[np.ndarray] = []
@@ -347,9 +351,20 @@ def test_the_latest_observations_serve_where_there_is_no_replay_buffer(tmp_path:
             return True
 
     model.learn(32, callback=[Note(), callback])
-    stored = np.stack(seen)
-    assert len(stored) == 20 and len(callback.observations) == 40
+    assert len(seen) == 20 and len(callback.observations) == 40
+    stored = np.stack(seen[-12:])
     np.testing.assert_array_equal(np.unique(callback.observations, axis=0), np.unique(stored, axis=0))
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_the_newest_frame_of_a_stack_is_shown(frames: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In colour, where SB3 stacks, and around environments that stack."""
+    shown: list[np.ndarray] = []
+    monkeypatch.setattr(plots, "reconstructions_over_training", lambda _, observed, *__: shown.append(observed))
+    env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=frames)]), 3)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=4, probe_updates=1)
+    PPO("CnnPolicy", env, **PPO_ARGUMENTS).learn(32, callback=callback)
+    np.testing.assert_array_equal(shown[0], callback.observations[:, -3:])
 
 
 def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:

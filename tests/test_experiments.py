@@ -33,7 +33,7 @@ from sb3_cure import CuReSAC, files, generations
 from sb3_cure.experiments import cells, heads, media, plots, probe, run, yardsticks
 from sb3_cure.experiments import files as experiment_files
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.files import read_rows, write_csv
+from sb3_cure.experiments.files import checkout_commit, read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
 from sb3_cure.experiments.visitation import COLUMNS
 from sb3_cure.generations import Generations
@@ -444,6 +444,20 @@ def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
     assert json.loads((out / "tiny" / "grid.json").read_text())["seeds"] == [0, 1]
 
 
+def test_a_commit_is_that_of_the_folder_itself(tmp_path: Path) -> None:
+    """Marked where files differ from it; a folder inside a checkout, an unpacked archive say, has none."""
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "file").write_text("one")
+    author = ["-c", "user.name=a", "-c", "user.email=a@example.com"]
+    for command in (["init", "-q"], ["add", "file"], [*author, "commit", "-q", "-m", "one"]):
+        subprocess.run(["git", *command], cwd=tmp_path, check=True)
+    commit = checkout_commit(tmp_path)
+    assert commit is not None and len(commit) == 12 and checkout_commit(folder) is None
+    (tmp_path / "file").write_text("two")
+    assert checkout_commit(tmp_path) == f"{commit}-dirty"
+
+
 def test_arms_reconstruct_the_same_observations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that their errors compare; and a cell that is drawn is trained as one that is not."""
     methods = {
@@ -452,7 +466,7 @@ def test_arms_reconstruct_the_same_observations(tmp_path: Path, monkeypatch: pyt
         "curl": {"config": "zoo.yml", "overrides": {"srl": "curl", "srl_kwargs": {"bank_size": 8}}},
     }
     fit = probe.fit_probe
-    monkeypatch.setattr(probe, "fit_probe", lambda model, updates: fit(model, 1))  # not 500
+    monkeypatch.setattr(probe, "fit_probe", lambda model, sample, updates: fit(model, sample, 1))  # not 500
     observed, rows = [], []
     monkeypatch.setattr(
         plots,

@@ -163,6 +163,22 @@ def test_every_grid_has_a_fast_one(name: str) -> None:
     assert list(fast.description["methods"].items()) == list(methods.items())
 
 
+def test_rl_zoos_entry_for_atari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Holds before the default where there is one, as in rl-zoo3's files; without one the default does."""
+
+    class AtariEnv(Dots):  # by this name rl-zoo3 tells them
+        pass
+
+    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", AtariEnv))
+    settings = {"default": {**yaml.safe_load((FOLDER / "sac_ae.yml").read_text())["default"], "gamma": 0.5}}
+    for gamma in (0.5, 0.7):
+        path = tmp_path / f"{gamma}.yml"
+        path.write_text(yaml.safe_dump(settings))
+        model, _ = set_up(path, "Dots-v0", tmp_path, policy_kwargs=SMALL, buffer_size=200)
+        assert model.gamma == gamma
+        settings["atari"] = {**settings["default"], "gamma": 0.7}
+
+
 def test_grids_read_the_entry_of_the_namespace() -> None:
     """As ``train`` does: a task without an entry of its own has that of ``dmc_pixels``, not the default."""
     cells = load_grid(FOLDER / "experiments" / "fast" / "visitation.yml", tasks=["reacher-easy"], seeds=1).cells

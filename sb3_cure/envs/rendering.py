@@ -22,25 +22,27 @@ def _missing(cause: object) -> GLUnavailableError:
 
 def is_headless() -> bool:
     """
-    :return: Whether there is no display to open a window on: none is named, or that cannot be opened (as one of
-        ``ssh -X`` in a terminal that has outlived it, or on another node)
+    :return: Whether no display is named on which a window could be opened
     """
-    if sys.platform != "linux":
+    return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _glfw_has_a_display() -> bool:
+    """Whether GLFW can open the display that is named: not that of an ``ssh -X`` that has ended, or of another node."""
+    if is_headless():
         return False
-    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        return True
     try:
         glfw = importlib.import_module("glfw")
-    except ImportError:  # nobody to ask
-        return False
+    except ImportError:  # then dm_control does not choose it
+        return True
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return not glfw.init()
+        return bool(glfw.init())
 
 
 def load_gl() -> None:
     """
-    Load the OpenGL backend of dm_control: EGL if there is no display and ``MUJOCO_GL`` is not set.
+    Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
     Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set, and SDL's windows to do
     without OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is. No rendering context is made, so a process that has only
@@ -48,7 +50,7 @@ def load_gl() -> None:
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
-    if "MUJOCO_GL" not in os.environ and is_headless():
+    if "MUJOCO_GL" not in os.environ and not _glfw_has_a_display():
         os.environ["MUJOCO_GL"] = "egl"
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -64,7 +66,7 @@ def load_gl() -> None:
     if backend in (None, "off"):
         raise _missing("no rendering backend")
     # dm_control prefers GLFW when it is imported without MUJOCO_GL, even here, where that aborts the process.
-    if backend == "glfw" and is_headless():
+    if backend == "glfw" and not _glfw_has_a_display():
         raise GLUnavailableError(
             "dm_control was imported with its GLFW backend, which needs a display, and none can be opened; set "
             "MUJOCO_GL=egl before starting Python."

@@ -56,8 +56,8 @@ def code_commit() -> str | None:
     if os.environ.get("SB3_CURE_COMMIT"):
         return os.environ["SB3_CURE_COMMIT"]
     root = Path(sb3_cure.__file__).parent.parent
-    if (root / ".git").exists():
-        return checkout_commit(root)
+    if commit := checkout_commit(root):
+        return commit
     try:
         origin = json.loads(distribution("sb3-cure").read_text("direct_url.json") or "{}")
     except PackageNotFoundError:
@@ -67,9 +67,11 @@ def code_commit() -> str | None:
 
 def checkout_commit(folder: Path) -> str | None:
     """
-    :param folder: A checkout
-    :return: Its commit, marked where it has changes; None if git does not know it
+    :param folder: A checkout, its uppermost folder
+    :return: Its commit, marked where it has changes; None if it is no checkout
     """
+    if not (folder / ".git").exists():  # git would look in the folders above
+        return None
     command = ["git", "-C", str(folder), "describe", "--always", "--abbrev=12", "--exclude=*", "--dirty"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -15,8 +15,7 @@ import yaml
 from sb3_cure.checks import check_arguments, check_parts
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
-from sb3_cure.settings import entry_for
-from sb3_cure.values import arguments_of, is_integer
+from sb3_cure.values import arguments_of, entry_for, is_integer
 
 #: The file that tells that a cell is finished
 DONE = "DONE"
