@@ -147,9 +147,11 @@ def run_public(checkout: Path, cell: Cell, results: Path) -> None:
         run = _PublicRun(checkout, cell)
         write_json(folder / "config.json", {**cell.config(), "action_repeat": run.action_repeat})
         write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
-        seconds = run.evaluations[-1]["seconds"]
         conditions = {
-            **{"device": "cpu", "precision": "fp32", "seconds": seconds, "attempts": 1},
+            "device": "cpu",
+            "precision": "fp32",
+            "seconds": run.evaluations[-1]["seconds"],
+            "attempts": 1,
             "implementation": {"source": SOURCE, "commit": commit},
         }
         write_json(folder / "run.json", {**describe_run(), **conditions})
