@@ -13,6 +13,7 @@ from scipy import stats
 
 from sb3_cure.experiments import published, statistics
 from sb3_cure.experiments.results import ResultsError, read_results
+from sb3_cure.experiments.tables import aggregate_table
 from sb3_cure.experiments.visit_statistics import (
     GRID_INTERVALS,
     entropy_bits,
@@ -220,6 +221,23 @@ def test_an_arm_may_have_a_baseline_of_its_own(tmp_path: Path) -> None:
     (experiment,) = read_results(folder)
     found = {(row.method, row.other): row.t.value for row in statistics.paired_differences(experiment, "finals")}
     assert found == {("one", "base"): 200, ("two", "one"): 40}
+
+
+def test_improvement_is_over_an_arms_own_baseline(tmp_path: Path) -> None:
+    """Two beats the experiment's baseline always, the one it is compared with never."""
+    pytest.importorskip("rliable")
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=2, methods={"base": {}, "one": {}, "two": {"baseline": "one"}}, baseline="base")
+    for method, final in (("base", 100), ("one", 300), ("two", 200)):
+        for seed in (0, 1):
+            write_cell(folder, TASK, method, seed, curve(0, final))
+    (experiment,) = read_results(folder)
+    aggregates = statistics.aggregate(experiment)
+    assert aggregates is not None
+    assert {method: estimate.value for method, estimate in aggregates.improvement.items()} == {"one": 1, "two": 0}
+    table = aggregate_table(experiment, aggregates)
+    assert ">P(arm > its baseline)" in table.columns
+    assert table.note.endswith("Baseline: base, of two one.")
 
 
 def test_experiments_are_found_at_any_depth(tmp_path: Path) -> None:

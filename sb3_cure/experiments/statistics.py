@@ -290,7 +290,7 @@ class Aggregates:
     :param tasks: Tasks that count: those on which every arm that has begun has two or more seeds in common
     :param seeds: Seeds of each task
     :param iqm: Interquartile mean by arm, with the stratified bootstrap's percentile interval
-    :param improvement: Probability that a run of the arm beats one of the baseline (seeds not paired), by arm
+    :param improvement: Probability that a run of the arm beats one of its baseline (seeds not paired), by arm
     :param taus: Scores at which the profiles are read
     :param profiles: Share of runs above each, by arm: value, low, high
     """
@@ -363,9 +363,13 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
 
     with _fixed_numpy_seed():
         iqm = estimates(scores, interquartile_mean)
-        base = scores.get(experiment.baseline)
-        others = {} if base is None else {name: (own, base) for name, own in scores.items() if own is not base}
-        improvement = estimates(others, probability_of_improvement)
+        baselines = {name: experiment.baseline_of(name) for name in scores}
+        pairs = {
+            name: (scores[name], scores[other])
+            for name, other in baselines.items()
+            if other in scores and other != name
+        }
+        improvement = estimates(pairs, probability_of_improvement)
         points, intervals = library.create_performance_profile(
             scores, taus, custom_profile_func=share_above, reps=RLIABLE_REPS
         )

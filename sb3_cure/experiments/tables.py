@@ -274,13 +274,16 @@ def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Tab
         ]
         for method, iqm in found.iqm.items()
     ]
+    varied = any(experiment.baseline_of(method) != experiment.baseline for method in found.improvement)
+    compared = "its baseline" if varied else experiment.baseline
     return Table(
         "Aggregates over tasks (rliable)",
-        ["arm", ">IQM", ">95 %", f">P(arm > {experiment.baseline})", ">95 %"],
+        ["arm", ">IQM", ">95 %", f">P(arm > {compared})", ">95 %"],
         rows,
         f"Scores: final return / {statistics.HIGHEST_RETURN:.0f}. {plural(len(found.tasks), 'task')} "
         f"({', '.join(found.tasks)}), {found.seeds} seeds each: those that all arms have done. Stratified percentile "
-        "bootstrap over seeds: too narrow for few of them. The probability of improvement does not pair seeds.",
+        "bootstrap over seeds: too narrow for few of them. The probability of improvement does not pair seeds."
+        + (f" Baseline: {_baselines(experiment)}." if varied else ""),
     )
 
 
