@@ -383,7 +383,8 @@ class ReconstructionCallback(_PictureCallback):
 
     def _on_step(self) -> bool:
         if self._buffer is None and self.probe_updates > 0:
-            self._latest.extend(np.array(self.locals["new_obs"]))
+            # Not `new_obs` of the locals: the rollouts of third parties' algorithms may call it otherwise.
+            self._latest.extend(np.array(self.model._last_obs))
         return super()._on_step()
 
     def on_period(self) -> None:

@@ -339,15 +339,22 @@ def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], t
 def test_the_latest_observations_serve_where_there_is_no_replay_buffer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The last ``LATEST``, of all environments, each as it was returned."""
+    """The last ``LATEST``, of all environments, each as it was acted upon; whatever the rollouts call what follows."""
+
+    class Renamed(PPO):
+        def collect_rollouts(self, env: Any, callback: BaseCallback, *args: Any, **kwargs: Any) -> bool:
+            update_locals = callback.update_locals
+            callback.update_locals = lambda found: update_locals({**found, "new_obs": None})  # type: ignore[method-assign]
+            return super().collect_rollouts(env, callback, *args, **kwargs)
+
     monkeypatch.setattr(callbacks, "LATEST", 12)
-    model = PPO("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
+    model = Renamed("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
     callback = ReconstructionCallback(tmp_path, every=20, columns=40, probe_updates=1)
     seen: list[np.ndarray] = []
 
     class Note(BaseCallback):
         def _on_step(self) -> bool:
-            seen.extend(self.locals["new_obs"].copy() if self.num_timesteps <= 20 else [])
+            seen.extend(self.locals["obs_tensor"].numpy().copy() if self.num_timesteps <= 20 else [])
             return True
 
     model.learn(32, callback=[Note(), callback])
