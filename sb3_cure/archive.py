@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import stable_baselines3
 import torch as th
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 VERSION = 1
 
 _FORMAT = "sb3_cure"
+_CLASS = "class"
 _PLACEHOLDER = "placeholder"
 _SYSTEM_INFO = "system_info.txt"
 _VARIABLES = "pytorch_variables.pth"
@@ -86,7 +88,7 @@ def save_model(model: "CuReSAC", path: PathOrFile, exclude: Any = None, include:
     for name, value in vars(model).items():
         if name not in left_out:
             settings[name] = _encode_setting(encoder, name, value)
-    data = dump_json({_FORMAT: VERSION, "settings": settings})
+    data = dump_json({_FORMAT: VERSION, _CLASS: _name_of(type(model)), "settings": settings})
     tensors = {f"{name}.pth": state for name, state in model.get_parameters().items()}
     tensors[_VARIABLES] = {name: recursive_getattr(model, name) for name in variables}
     with writing(path, "zip") as target, zipfile.ZipFile(target, "w") as archive:
@@ -97,6 +99,10 @@ def save_model(model: "CuReSAC", path: PathOrFile, exclude: Any = None, include:
                 th.save(state, member)
         archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
         archive.writestr(_SYSTEM_INFO, get_system_info(print_info=False)[1])
+
+
+def _name_of(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
 
 
 def _encode_setting(encoder: SettingsEncoder, name: str, value: Any) -> Any:
@@ -117,6 +123,7 @@ class ModelArchive:
     """What an archive holds, checked, and nothing of it run.
 
     :param name: What to call the file
+    :param saved_by: Name of the class of the model, empty if it was not read or is not known
     :param settings: Value of each setting; None if the settings were not read
     :param placeholders: What each of the settings was that could not be saved
     :param params: State dicts by name
@@ -126,6 +133,7 @@ class ModelArchive:
     """
 
     name: str
+    saved_by: str
     settings: dict[str, Any] | None
     placeholders: dict[str, str]
     params: dict[str, Any]
@@ -172,10 +180,10 @@ def read_model(path: PathOrFile, settings: bool = True) -> ModelArchive:
     """
     with reading(path, "zip") as (file, name):
         archive = Archive(file, name)
-        found: dict[str, Any] | None = None
+        saved_by, found = "", None
         placeholders: dict[str, str] = {}
         if settings:
-            found, placeholders = _read_settings(archive)
+            saved_by, found, placeholders = _read_settings(archive)
         states: dict[str, Any] = {}
         tensors: list[TensorInfo] = []
         for member in [member for member in archive.sizes if member.endswith(".pth")]:
@@ -187,10 +195,10 @@ def read_model(path: PathOrFile, settings: bool = True) -> ModelArchive:
             archive.check_all_read()
     variables = states.pop(_VARIABLES, {})
     params = {member.removesuffix(".pth"): state for member, state in states.items()}
-    return ModelArchive(name, found, placeholders, params, variables, tensors, info)
+    return ModelArchive(name, saved_by, found, placeholders, params, variables, tensors, info)
 
 
-def _read_settings(archive: Archive) -> tuple[dict[str, Any], dict[str, str]]:
+def _read_settings(archive: Archive) -> tuple[str, dict[str, Any], dict[str, str]]:
     if _is_pickled(archive):
         raise ArchiveError(
             f"{archive.name} holds pickled settings, as SB3 saves them, and unpickling runs any code that is in them: "
@@ -199,7 +207,9 @@ def _read_settings(archive: Archive) -> tuple[dict[str, Any], dict[str, str]]:
     data = archive.json(MODEL_MEMBER)
     if not isinstance(data, dict):
         raise archive.error("holds no settings")
-    if data.keys() != {_FORMAT, "settings"} or data[_FORMAT] != VERSION or not isinstance(data["settings"], dict):
+    saved_by = data.pop(_CLASS, "")
+    is_known = data.keys() == {_FORMAT, "settings"} and data[_FORMAT] == VERSION and isinstance(saved_by, str)
+    if not is_known or not isinstance(data["settings"], dict):
         raise archive.error(f"has no settings of version {VERSION}")
     nodes = dict(data["settings"])
     placeholders: dict[str, str] = {}
@@ -207,7 +217,7 @@ def _read_settings(archive: Archive) -> tuple[dict[str, Any], dict[str, str]]:
         if isinstance(node, dict) and isinstance(node.get(_PLACEHOLDER), str):
             placeholders[key] = "".join(filter(str.isprintable, node[_PLACEHOLDER]))[:200]
             del nodes[key]
-    return SettingsDecoder(archive.arrays()).decode_all({"dict": nodes}), placeholders
+    return saved_by, SettingsDecoder(archive.arrays()).decode_all({"dict": nodes}), placeholders
 
 
 def _read_tensors(archive: Archive, member: str) -> tuple[Any, list[TensorInfo]]:
@@ -249,6 +259,9 @@ def load_model(
         settings["n_envs"] = env.num_envs
         if force_reset:
             settings["_last_obs"] = None
+        noise = settings.get("action_noise")
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != env.num_envs:
+            settings["action_noise"] = noise.base_noise  # of which `learn` makes one for each environment
     with sentences(archive.name, _SMALLER):
         model = cls(settings["policy_class"], env, device=device, _init_setup_model=False)
         later = _apply(model, settings, archive, trusted)
@@ -256,6 +269,10 @@ def load_model(
         with contextlib.nullcontext() if trusted else Allowance(archive.tensors, archive.name):
             model._setup_model()
         unknown = sorted(key for key in later if key not in vars(model) and not trusted)
+        # What a callback, say, has noted at a model of this class. Nothing of the class is covered by it.
+        noted = {key for key in unknown if not hasattr(cls, key)} if _is_saved_by(archive, cls) else set()
+        vars(model).update({key: settings[key] for key in noted})
+        unknown = [key for key in unknown if key not in noted]
         if unknown:
             raise ArchiveError(
                 f"{archive.name} has the setting {unknown[0]!r:.50}, which {cls.__name__} does not have: load it with "
@@ -267,6 +284,11 @@ def load_model(
         if model.use_sde:
             model.policy.reset_noise()  # type: ignore[operator]
     return model
+
+
+def _is_saved_by(archive: ModelArchive, cls: type) -> bool:
+    """Whether by the class, or one that it extends."""
+    return archive.saved_by in map(_name_of, cls.__mro__)
 
 
 def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dict[str, Any]) -> dict[str, Any]:

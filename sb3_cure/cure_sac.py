@@ -2,7 +2,7 @@
 
 import io
 import pathlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, TypeVar
@@ -24,7 +24,7 @@ from stable_baselines3.common.type_aliases import (
     TrainFreq,
 )
 from stable_baselines3.common.utils import update_learning_rate
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 from stable_baselines3.sac import policies as sb3_policies
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
@@ -74,7 +74,6 @@ class Agent:
     """One actor-critic with its temperature: the task agent, or the curious one.
 
     :param name: ``"task"`` or ``"curious"``; prefix or suffix of its metrics
-    :param gamma: Discount factor
     :param trains_encoder: Whether its critics' gradient reaches the shared encoder
     :param log_ent_coef: Logarithm of the learned temperature, or None if it is fixed
     :param ent_coef_optimizer: Its optimiser, or None
@@ -85,7 +84,6 @@ class Agent:
     actor: TrunkActor
     critic: LatentCritic
     critic_target: LatentCritic
-    gamma: float
     trains_encoder: bool
     log_ent_coef: th.Tensor | None
     ent_coef_optimizer: th.optim.Optimizer | None
@@ -167,7 +165,7 @@ class CuReSAC(SAC):
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000)
-    :param actor_update_interval: Updates between two updates of actors and temperatures
+    :param actor_update_interval: Updates between two updates of actors and temperatures; when alternating, those of RL
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
     :param update: ``"joint"`` (one encoder pass for all, see ``EncoderOptimizer``) or ``"sequential"`` (a pass and a
@@ -234,8 +232,7 @@ class CuReSAC(SAC):
     ):
         env = make_env(env, kwargs.get("verbose", 0))
         check_construction(self, policy, env, kwargs)
-        if kwargs.get("policy_kwargs") is not None:
-            kwargs["policy_kwargs"] = dict(kwargs["policy_kwargs"])  # SB3 writes into it
+        kwargs = _plain(kwargs)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -253,7 +250,7 @@ class CuReSAC(SAC):
             **kwargs,
         )
         self.srl = srl
-        self.srl_kwargs = srl_kwargs or {}
+        self.srl_kwargs = dict(srl_kwargs) if isinstance(srl_kwargs, Mapping) else srl_kwargs or {}
         self.srl_schedule = srl_schedule
         self.srl_period = srl_period
         self.curiosity = curiosity
@@ -325,8 +322,6 @@ class CuReSAC(SAC):
             self.policy_kwargs = user_kwargs
         if self._mixer is None:
             self._mixer = CuriousMixer(self.curiosity_prob, self.seed)
-        # A loaded mixer goes on with its random stream, but `load` may have been given another probability.
-        self._mixer.probability = self.curiosity_prob
         self._computed_precision = resolve_precision(self.precision, self.device)
         if self.verbose >= 1:
             print(f"Networks compute in {self._computed_precision} (precision={self.precision!r})")
@@ -364,7 +359,9 @@ class CuReSAC(SAC):
 
     def _choose_replay_buffer(self) -> None:
         """Keep each frame once where the environment says that its observations are stacked frames."""
-        frame_stack = self._env_attribute("frame_stack")
+        # Of ``VecFrameStack`` those slide, whatever the environments in it stack.
+        stacked = None if self.env is None else unwrap_vec_wrapper(self.env, VecFrameStack)
+        frame_stack = self._env_attribute("frame_stack") if stacked is None else stacked.stacked_obs.n_stack
         if self.env is not None and frame_stack is None and "frames_dir" in self.replay_buffer_kwargs:
             if "frame_stack" not in self.replay_buffer_kwargs:
                 raise ValueError(
@@ -405,7 +402,7 @@ class CuReSAC(SAC):
             self.curious_ent_coef_optimizer = self._make_temperature_optimizer(log_ent_coef)
 
     def _make_temperature_optimizer(self, log_ent_coef: th.Tensor) -> th.optim.Adam:
-        learning_rate = self.lr_schedule(1) * self.ent_coef_lr_factor
+        learning_rate = self.lr_schedule(1) * float(self.ent_coef_lr_factor)
         return th.optim.Adam([log_ent_coef], lr=learning_rate, betas=(0.5, 0.999), fused=True)
 
     def _create_agents(self) -> None:
@@ -416,7 +413,6 @@ class CuReSAC(SAC):
             policy.actor,
             policy.critic,
             policy.critic_target,
-            self.gamma,
             True,
             self.log_ent_coef,
             self.ent_coef_optimizer,
@@ -429,7 +425,6 @@ class CuReSAC(SAC):
                 policy.curious_actor,
                 policy.curious_critic,
                 policy.curious_critic_target,
-                self.curiosity_gamma,
                 self.curiosity_encoder_grad,
                 self.curious_log_ent_coef,
                 self.curious_ent_coef_optimizer,
@@ -527,6 +522,8 @@ class CuReSAC(SAC):
         if self._collector is not None:
             return np.ones(n_envs, dtype=bool)
         if self.curiosity in ("separate", "random") and self.task:
+            # `load` may have been given another probability than its mixer's, and users may change it while training.
+            self._mixer.probability = self.curiosity_prob  # type: ignore[union-attr]
             return self._mixer.choose(n_envs, self._progress_remaining)  # type: ignore[union-attr]
         return np.zeros(n_envs, dtype=bool)
 
@@ -708,7 +705,8 @@ class CuReSAC(SAC):
         with th.set_grad_enabled(trains), self._autocast():
             output = srl.loss(batch, latents)
         check_srl_output(srl, output, trains)
-        loss, error = output
+        # In full precision, whatever the head computes in.
+        loss, error = output[0].float(), output[1].float()
         if trains:
             if srl.optimizer is not None:
                 srl.optimizer.zero_grad()
@@ -724,13 +722,16 @@ class CuReSAC(SAC):
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features).float()
                 _, error = srl.loss(batch._replace(observations=batch.next_observations), next_latents)  # type: ignore[arg-type]
+            error = error.float()
         return error
 
     def _curious_reward(self, error: th.Tensor) -> th.Tensor:
         """r_cure of this batch, [B, 1]: computed afresh, never stored, hence never stale."""
         self._guard.check("SRL error", error.square().mean())
-        self.policy.curiosity.update(error)
-        reward = self.policy.curiosity(error)
+        curiosity = self.policy.curiosity
+        curiosity.beta, curiosity.normalize = self.curiosity_beta, self.normalize_curiosity
+        curiosity.update(error)
+        reward = curiosity(error)
         self._log(
             {
                 "train/curious_reward_raw_mean": error.mean(),
@@ -758,7 +759,9 @@ class CuReSAC(SAC):
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
         """
-        discounts = agent.gamma if batch.discounts is None else batch.discounts
+        # Read here, as users may change it between or during calls of `learn`.
+        gamma = self.gamma if agent is self._task_agent else self.curiosity_gamma
+        discounts = gamma if batch.discounts is None else batch.discounts
         with th.no_grad(), self._autocast():
             next_actions, next_log_prob = agent.actor.action_log_prob(encoded.next_features)
             next_q = th.cat(agent.critic_target(next_latents, next_actions), dim=1).amin(dim=1, keepdim=True)
@@ -777,7 +780,7 @@ class CuReSAC(SAC):
         self._guard.step(agent.critic.optimizer)
         prefix = self._prefix(agent)
         self._log({f"{prefix}critic_loss": critic_loss, f"{prefix}q_value": q_values[0].mean()})  # type: ignore[dict-item]
-        if self._n_updates % self.actor_update_interval == 0:
+        if self._n_rl_updates % self.actor_update_interval == 0:
             self._update_actor(agent, *encoded.for_actor())
 
     def _update_actor(self, agent: Agent, features: th.Tensor, latents: th.Tensor) -> None:
@@ -825,6 +828,14 @@ class CuReSAC(SAC):
         return self.srl_schedule == "simultaneous" or not self._in_srl_phase
 
     @property
+    def _n_rl_updates(self) -> int:
+        """How many of the updates before this one, which is of RL, were of RL, too."""
+        if self.srl_schedule == "simultaneous":
+            return self._n_updates
+        periods, position = divmod(self._n_updates, 2 * self.srl_period)
+        return periods * self.srl_period + position - self.srl_period
+
+    @property
     def _progress_remaining(self) -> float:
         """What schedules get: SB3's own goes below zero where the last rollout goes beyond ``total_timesteps``."""
         return max(self._current_progress_remaining, 0.0)
@@ -844,7 +855,7 @@ class CuReSAC(SAC):
                 update_learning_rate(owner.optimizer, learning_rate)  # type: ignore[arg-type]
         for optimizer in (self.ent_coef_optimizer, self.curious_ent_coef_optimizer):
             if optimizer is not None:
-                update_learning_rate(optimizer, learning_rate * self.ent_coef_lr_factor)
+                update_learning_rate(optimizer, learning_rate * float(self.ent_coef_lr_factor))
 
     def learn(
         self: SelfCuReSAC,
@@ -871,7 +882,9 @@ class CuReSAC(SAC):
         self._end_pretraining()
         if self._is_pretrained:
             self._restart_random_streams()
-        self._learn("learn", total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        self._learn(
+            "learn", int(total_timesteps), callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
         return self
 
     def _learn(self, call: str, *arguments: Any) -> None:
@@ -949,7 +962,7 @@ class CuReSAC(SAC):
         self._create_agents()
         try:
             self._learn(
-                "pretrain", total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+                "pretrain", int(total_timesteps), callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
             )
         finally:
             self._end_pretraining()
@@ -1159,6 +1172,21 @@ class CuReSAC(SAC):
                 state_dicts.append("curious_ent_coef_optimizer")
                 variables = [*variables, "curious_log_ent_coef"]
         return state_dicts, variables
+
+
+def _plain(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """SAC's arguments as SB3 takes them and archives hold them; of dictionaries copies, as SB3 writes into one."""
+    plain: dict[str, Any] = {}
+    for name, value in kwargs.items():
+        if isinstance(value, Mapping):
+            plain[name] = dict(value)
+            if isinstance(value.get("net_arch"), tuple):
+                plain[name]["net_arch"] = list(value["net_arch"])
+        elif isinstance(value, bool | np.integer) and name in ("verbose", "seed", "stats_window_size"):
+            plain[name] = int(value)
+        else:
+            plain[name] = value
+    return plain
 
 
 @th.no_grad()

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.buffers import transitions, unmarked
@@ -26,7 +27,8 @@ class Episode:
 
     :param rewards: Reward of each agent step, [T]
     :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
-    :param observations: The observations before each step, [T, *shape]
+    :param observations: The observations before each step, [T, *shape]; of images the channels come first, as for the
+        model
     :param frames: ``env.render()`` after each step, if asked for
     :param states: The true state of the environment before each step, [T, d], if asked for; else empty
     """
@@ -60,7 +62,7 @@ def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> 
             part = ReplayBufferSamples(*[field[start : start + chunk] for field in batch if field is not None])
             error = policy.srl.error(part, policy.encode(part.observations))  # type: ignore[union-attr]
             check_srl_error(error, len(part.observations), look=False)
-            errors.append(error.cpu().numpy())
+            errors.append(error.float().cpu().numpy())
     return np.concatenate(errors)
 
 
@@ -89,7 +91,7 @@ def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Non
         return
     actors = [*trained_actors(model), "random"]
     share = max(len(head.bank) // len(actors), 1)  # type: ignore[arg-type]
-    seen = [next(run_episodes(model, env, 1, actor, seed=seed)).observations for actor in actors]
+    seen = [_as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
     frames = [each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen]
     head.set_bank(th.as_tensor(np.concatenate(frames)[: len(head.bank)]))  # type: ignore[arg-type]
 
@@ -185,7 +187,7 @@ def run_episodes(
             dones.append(terminated)
             if render:
                 frames.append(env.render())
-        seen = np.stack(observations)
+        seen = maybe_transpose(np.stack(observations), model.observation_space)
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "srl", None) is not None:
             errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))

@@ -128,6 +128,8 @@ class Encoder:
         kind = type(value)
         if kind in _PLAIN or (kind is int and abs(value) < _LARGEST_PLAIN_INT):
             return value
+        if kind is np.str_:
+            return str(value)
         if kind is float:
             return value if math.isfinite(value) else {"float": struct.pack(">d", value).hex()}
         if kind is int:

@@ -339,10 +339,12 @@ def _is_observation(value: Any) -> bool:
 SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
     name: entry
     for names, entry in {
-        "num_timesteps _total_timesteps _num_timesteps_at_start _episode_num _n_updates": (
+        "num_timesteps _num_timesteps_at_start _stats_window_size _episode_num _n_updates": (
             "a whole number >= 0",
             _is_count,
         ),
+        # 1e5 where it was saved as it was given
+        "_total_timesteps": ("a whole number >= 0", lambda value: is_number(value, low=0) and value == int(value)),
         "start_time": ("a number", is_number),
         "verbose gradient_steps sde_sample_freq": ("a whole number", _is_integer),
         "n_steps srl_period actor_update_interval target_update_interval _action_repeat _frame_stack batch_size": (
@@ -351,7 +353,6 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
         ),
         "buffer_size": ("a whole number >= 1", lambda value: _is_count(value) and value >= 1),
         "n_envs": (f"a whole number from 1 to {MAX_ENVS}", lambda value: _is_count(value) and 1 <= value <= MAX_ENVS),
-        "_stats_window_size": ("a whole number below a million", lambda value: _is_count(value) and value < 10**6),
         "seed warmup_updates": ("a whole number >= 0 or None", _or_none(_is_count)),
         "learning_starts tau gamma curiosity_beta curiosity_gamma encoder_tau ent_coef_lr_factor "
         "_current_progress_remaining": (

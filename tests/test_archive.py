@@ -13,6 +13,7 @@ import pickletools
 import struct
 import tracemalloc
 import zipfile
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,13 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from benchmarks.fuzz import example_model, examples, fuzz, load, members_of, outcome, watching, zip_of
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer
+from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.encoders import VectorEncoder
 from sb3_cure.serialization import ArchiveError
 from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA
@@ -140,6 +143,77 @@ def test_settings_that_the_class_has_not() -> None:
     with pytest.raises(ArchiveError, match=r"the setting 'spam', which CuReSAC does not have"):
         CuReSAC.load(file)
     assert CuReSAC.load(file, trusted=True).spam == 0.5
+
+
+def test_what_was_noted_at_a_model_comes_back(tmp_path: Path) -> None:
+    """An attribute that a callback has set, say; to a class that did not save it an archive gives none, nor a method's.
+
+    Loading is by the class itself, by one that extends it, and from a checkpoint.
+    """
+    arguments: dict[str, Any] = dict(learning_starts=5, policy_kwargs=dict(net_arch=[4]), device="cpu")
+    model: Any = OwnModel("MlpPolicy", VectorBox(), warmup_updates=0, **arguments)
+    model.run_id, model.names = "abc", [np.str_("spam")]
+    model.learn(10, callback=ExactCheckpoint(5, tmp_path))
+    file = io.BytesIO()
+    model.save(file)
+
+    class Extended(OwnModel):
+        """A user's class that extends the one that was saved."""
+
+    loaded: list[Any] = [OwnModel.load(file), Extended.load(file), OwnModel.resume(tmp_path, VectorBox())]
+    assert [(each.run_id, each.names) for each in loaded] == [("abc", ["spam"])] * 3
+    with pytest.raises(ArchiveError, match=r"the setting 'names', which CuReSAC does not have"):
+        CuReSAC.load(file)
+    model.learn = "spam"
+    model.save(file := io.BytesIO())
+    with pytest.raises(ArchiveError, match=r"the setting 'learn', which OwnModel does not have"):
+        OwnModel.load(file)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(verbose=True),
+        dict(srl_kwargs=OrderedDict(latent_penalty=1e-6)),
+        dict(replay_buffer_kwargs=OrderedDict()),
+        dict(policy_kwargs=dict(net_arch=(8,))),
+        dict(policy_kwargs=dict(net_arch=OrderedDict(pi=(8,), qf=[np.int64(8)]))),
+        dict(seed=np.int64(3), stats_window_size=np.int64(5)),
+        dict(stats_window_size=10**7),
+        dict(ent_coef=np.str_("auto_0.1"), srl=np.str_("rae")),
+        {name: np.int64(2) for name in ("batch_size", "learning_starts", "gradient_steps", "warmup_updates")},
+        {name: np.int64(2) for name in ("srl_period", "actor_update_interval", "target_update_interval")},
+        {name: np.float32(0.5) for name in ("tau", "gamma", "curiosity_prob", "curiosity_beta", "curiosity_gamma")},
+        {name: np.float32(0.5) for name in ("encoder_tau", "ent_coef_lr_factor", "target_entropy")},
+        dict(ent_coef=np.float32(0.5), learning_starts=1e1),
+    ],
+    ids=str,
+)
+def test_whatever_can_be_trained_can_be_loaded(kwargs: dict[str, Any]) -> None:
+    """Arguments of types that are not quite the documented ones, and a number of steps with an exponent."""
+    model = tiny_model("MlpPolicy", VectorBox(), **kwargs).pretrain(1.2e1).learn(1.4e1)
+    file = io.BytesIO()
+    model.save(file)
+    loaded = CuReSAC.load(file, env=VectorBox())
+    assert differences(state_of(model), state_of(loaded)) == []
+    assert loaded.learn(1e1, reset_num_timesteps=False).num_timesteps == 24
+
+
+def test_steps_that_were_saved_as_a_float_are_read() -> None:
+    """As files before have them."""
+    CuReSAC.load(io.BytesIO(setting("_total_timesteps", 14.0)()))
+    with pytest.raises(ArchiveError, match=r"_total_timesteps=14.5, but _total_timesteps is a whole number"):
+        CuReSAC.load(io.BytesIO(setting("_total_timesteps", 14.5)()))
+
+
+@pytest.mark.parametrize(("before", "after"), [(3, 1), (3, 2), (2, 3)])
+def test_noise_of_another_number_of_environments(before: int, after: int) -> None:
+    """Each has its own when training goes on."""
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(2), np.ones(2))
+    file = io.BytesIO()
+    tiny_model("MlpPolicy", DummyVecEnv([VectorBox] * before), action_noise=noise).learn(12).save(file)
+    loaded = CuReSAC.load(file, env=DummyVecEnv([VectorBox] * after)).learn(12)
+    assert np.shape(loaded.action_noise()) == ((after, 2) if after > 1 else (2,))
 
 
 @pytest.mark.parametrize(

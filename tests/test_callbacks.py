@@ -25,6 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from sb3_cure import CuReSAC, callbacks, make_dmc_env
 from sb3_cure.callbacks import (
     CuriosityMapCallback,
+    EvalBothCallback,
     ExactCheckpoint,
     PeriodicCallback,
     PolicyVideoCallback,
@@ -392,6 +393,25 @@ def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:
         if actor == "curious":  # random actions come from each environment's own space
             np.testing.assert_array_equal(states, np.concatenate([episode.states for episode in episodes]))
     assert np.asarray(Image.open(tmp_path / "curiosity_map_25_steps.png").convert("L")).std() > 5
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_images_with_the_channels_last(srl: str, tmp_path: Path) -> None:
+    """SB3 moves the channels for training: policies are watched, and errors measured, as if they had come first."""
+    seen: list[dict[str, Any]] = []
+    for last in (False, True):
+        env = PixelBox(channels_last=last)
+        folder = tmp_path / str(last)
+        evaluation = EvalBothCallback(env, eval_freq=20, n_episodes=1, seed=0)
+        film = PolicyVideoCallback(Filmed(PixelBox(channels_last=last)), folder, every=20, seed=4)
+        curiosity_map = CuriosityMapCallback(env, folder, every=20, n_episodes=1, seed=0, bins=5, **MAP)
+        model = tiny_model("CnnPolicy", PixelBox(channels_last=last), srl=srl)
+        model.learn(25, callback=[evaluation, film, curiosity_map])
+        kinds = ["curiosity_map_20_steps.png", "curious_policy_20_steps.mp4", "task_policy_20_steps.mp4"]
+        assert names(folder) == kinds
+        (episode,) = run_episodes(model, env, 1, seed=0)
+        seen.append({"history": evaluation.history, "errors": episode.srl_errors, "images": episode.observations})
+    assert len(seen[0]["history"]) == 1 and differences(*seen) == []
 
 
 def test_map_of_an_algorithm_without_errors(tmp_path: Path) -> None:

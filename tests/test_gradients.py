@@ -380,3 +380,31 @@ def test_keys_get_no_gradient() -> None:
     th.testing.assert_close(w_grad, latents.detach().T @ residual @ keys, rtol=1e-4, atol=1e-7)
     for target in (model.policy.encoder_target, model.policy.encoder):
         assert all(parameter.grad is None for parameter in target.parameters())
+
+
+@pytest.mark.parametrize(("period", "interval"), [(1, 1), (1, 2), (2, 4), (3, 2), (100, 2)])
+def test_actors_follow_every_few_updates_of_their_critics(
+    period: int, interval: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the periods of SRL and RL: of n updates of the critics each ``interval``-th, the first one included."""
+    kwargs: dict[str, Any] = dict(srl_schedule="alternating", srl_period=period, actor_update_interval=interval)
+    model = filled_model(learning_rate=0.0, **kwargs)
+    done: list[str] = []
+    for name in ("_update_actor_critic", "_update_actor"):
+        update = getattr(model, name)
+
+        def note(agent: Any, *args: Any, name: str = name, update: Any = update) -> None:
+            done.append(name + agent.name)
+            update(agent, *args)
+
+        monkeypatch.setattr(model, name, note)
+    model.train(2 * max(8 * interval, 2 * period), batch_size=4)
+    for agent in ("task", "curious"):
+        own = [name for name in done if name.endswith(agent)]
+        critics = own.count("_update_actor_critic" + agent)
+        expected = [
+            name
+            for index in range(critics)
+            for name in ["_update_actor_critic", "_update_actor"][: 1 + (index % interval == 0)]
+        ]
+        assert critics >= 4 and own == [name + agent for name in expected]

@@ -17,11 +17,12 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.evaluation import run_episodes
 from sb3_cure.metrics import Metrics
 from sb3_cure.policies import CnnPolicy, TrunkActor
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -762,3 +763,71 @@ def test_the_users_policy_kwargs_stay_as_they_were() -> None:
         CuReSAC("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs, buffer_size=10, device="cpu", **extras)
         assert policy_kwargs == before
         policy_kwargs.pop("share_encoder", None)
+
+
+class Divergence(SRLHead):
+    """Of a Gaussian from the standard one; computed in the number format that autocast chooses."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.parameters_of = th.nn.Linear(self.encoder.features_dim, 8)
+
+    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+        mean, log_var = self.parameters_of(latents).chunk(2, dim=1)
+        error = 0.5 * (mean.square() + log_var.exp() - log_var - 1).mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+class Double(Divergence):
+    """The same in double precision."""
+
+    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+        return SRLOutput(*(part.double() for part in super().loss(batch, latents)))
+
+
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+@pytest.mark.parametrize(("head", "precision"), [(Divergence, "bf16"), (Double, "fp32")])
+def test_a_heads_error_may_have_any_number_format(head: type[SRLHead], precision: str, target: str) -> None:
+    """All that is made of it is in full precision, in training and when policies are compared."""
+    arguments: dict[str, Any] = dict(srl=head, precision=precision, curiosity_target=target)
+    model = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(25)
+    assert model.policy.curiosity.mean.dtype is th.float32 and float(model.policy.curiosity.mean) > 0
+    (episode,) = run_episodes(model, PixelBox(), 1, seed=0)
+    assert episode.srl_errors.dtype == np.float32 and (episode.srl_errors > 0).all()
+
+
+def test_settings_can_be_changed_while_training() -> None:
+    """As in SB3: what is set at the model holds from the next step on."""
+    changes: dict[str, Any] = dict(gamma=0.0, curiosity_gamma=0.0, curiosity_beta=100.0, normalize_curiosity=False)
+
+    def parameters(**change: Any) -> dict[str, Any]:
+        model = tiny_model("MlpPolicy", VectorBox(), curiosity_prob=0.5).learn(15)
+        vars(model).update(change)
+        return model.learn(15, reset_num_timesteps=False).get_parameters()
+
+    usual = parameters()
+    assert differences(usual, parameters()) == []
+    for name, value in changes.items():
+        assert differences(usual, parameters(**{name: value})) != [], name
+
+
+def test_exploration_can_be_ended_and_fine_tuning_begun() -> None:
+    """By p_c, between two calls of ``learn``."""
+    model = tiny_model("MlpPolicy", VectorBox(), curiosity_prob=1.0).learn(30, log_interval=10**9)
+    assert model._mixer.pop_share() == 1
+    model.curiosity_prob = 0.0
+    model.learn(30, log_interval=10**9, reset_num_timesteps=False)
+    assert model._mixer.n_steps > 0 and model._mixer.pop_share() == 0
+
+
+@pytest.mark.parametrize(("own", "around", "last"), [(1, 3, False), (3, 2, False), (2, 3, True)])
+def test_stacks_of_vec_frame_stack_are_stored_once(own: int, around: int, last: bool) -> None:
+    """Each of its frames (which may be stacks of the environment's) is kept once, and nothing is evicted early."""
+    make = lambda: PixelBox(frame_stack=own, channels_last=last)  # noqa: E731
+    env = VecFrameStack(DummyVecEnv([make]), around)
+    model = tiny_model("CnnPolicy", env, buffer_size=100, learning_starts=1000).learn(150)
+    buffer = model.replay_buffer
+    assert isinstance(buffer, FrameStackReplayBuffer) and buffer.frame_stack == around
+    # Of an episode of 20 steps all frames are new, but for the stack that it begins with.
+    assert buffer.frames.shape[-3:] == (3 * own, 36, 36) and buffer.size() >= 85
+    assert buffer.sample(64).observations.shape[1] == 3 * own * around
