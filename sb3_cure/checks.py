@@ -25,7 +25,15 @@ from sb3_cure.mixers import CuriousMixer
 from sb3_cure.policies import CnnPolicy, CuRePolicy, MlpPolicy
 from sb3_cure.precision import COMPILE, resolve_precision
 from sb3_cure.srl import get_srl_class
-from sb3_cure.values import arguments_of, check_folder, check_keywords, is_integer, is_number, is_one_of
+from sb3_cure.values import (
+    MAX_STATS_WINDOW,
+    arguments_of,
+    check_folder,
+    check_keywords,
+    is_integer,
+    is_number,
+    is_one_of,
+)
 
 if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC
@@ -203,6 +211,11 @@ def _check_numbers(model: "CuReSAC") -> None:
     ):
         _check_integer(name, getattr(model, name), 1)
     _check_integer("stats_window_size", model._stats_window_size, 1)
+    if model._stats_window_size > MAX_STATS_WINDOW:
+        raise ValueError(
+            f"stats_window_size is {model._stats_window_size}, but it must be {MAX_STATS_WINDOW} episodes at most: "
+            "change stats_window_size."
+        )
     _check_integer("sde_sample_freq", model.sde_sample_freq, -1)
     if model.warmup_updates is not None:
         _check_integer("warmup_updates", model.warmup_updates, 0)

@@ -38,7 +38,7 @@ from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.serialization import ArchiveError, Decoder, Encoder, numeric_dtype
 from sb3_cure.srl import SRL_HEADS, SRLHead
-from sb3_cure.values import is_integer, is_number
+from sb3_cure.values import MAX_STATS_WINDOW, is_integer, is_number
 
 #: Most numbers in one observation or action; a space of them takes some 20 bytes each
 MAX_SPACE_SIZE = 2**22
@@ -339,7 +339,7 @@ def _is_observation(value: Any) -> bool:
 SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
     name: entry
     for names, entry in {
-        "num_timesteps _num_timesteps_at_start _stats_window_size _episode_num _n_updates": (
+        "num_timesteps _num_timesteps_at_start _episode_num _n_updates": (
             "a whole number >= 0",
             _is_count,
         ),
@@ -353,6 +353,10 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
         ),
         "buffer_size": ("a whole number >= 1", lambda value: _is_count(value) and value >= 1),
         "n_envs": (f"a whole number from 1 to {MAX_ENVS}", lambda value: _is_count(value) and 1 <= value <= MAX_ENVS),
+        "_stats_window_size": (
+            f"a whole number from 1 to {MAX_STATS_WINDOW}",
+            lambda value: _is_count(value) and 1 <= value <= MAX_STATS_WINDOW,
+        ),
         "seed warmup_updates": ("a whole number >= 0 or None", _or_none(_is_count)),
         "learning_starts tau gamma curiosity_beta curiosity_gamma encoder_tau ent_coef_lr_factor "
         "_current_progress_remaining": (

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+#: Most episodes that logged means are over
+MAX_STATS_WINDOW = 10**6
+
 
 def is_integer(value: Any, low: int) -> bool:
     """

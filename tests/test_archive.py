@@ -179,7 +179,7 @@ def test_what_was_noted_at_a_model_comes_back(tmp_path: Path) -> None:
         dict(policy_kwargs=dict(net_arch=(8,))),
         dict(policy_kwargs=dict(net_arch=OrderedDict(pi=(8,), qf=[np.int64(8)]))),
         dict(seed=np.int64(3), stats_window_size=np.int64(5)),
-        dict(stats_window_size=10**7),
+        dict(stats_window_size=10**6),
         dict(ent_coef=np.str_("auto_0.1"), srl=np.str_("rae")),
         {name: np.int64(2) for name in ("batch_size", "learning_starts", "gradient_steps", "warmup_updates")},
         {name: np.int64(2) for name in ("srl_period", "actor_update_interval", "target_update_interval")},
@@ -199,8 +199,9 @@ def test_whatever_can_be_trained_can_be_loaded(kwargs: dict[str, Any]) -> None:
     assert loaded.learn(1e1, reset_num_timesteps=False).num_timesteps == 24
 
 
-def test_steps_that_were_saved_as_a_float_are_read() -> None:
-    """As files before have them."""
+def test_files_of_before_are_read() -> None:
+    """Which hold the number of steps as it was given, and no class."""
+    CuReSAC.load(io.BytesIO(saved_by(None)))
     CuReSAC.load(io.BytesIO(setting("_total_timesteps", 14.0)()))
     with pytest.raises(ArchiveError, match=r"_total_timesteps=14.5, but _total_timesteps is a whole number"):
         CuReSAC.load(io.BytesIO(setting("_total_timesteps", 14.5)()))
@@ -482,6 +483,16 @@ def setting(name: str, value: Any) -> Callable[[], bytes]:
     return lambda: changed_json("model", lambda settings: settings.update({name: value}))
 
 
+def saved_by(name: Any, **settings: Any) -> bytes:
+    """A model of another class, or without one as in files before there were any, with further settings."""
+    members = members_of(examples()["model"])
+    content = json.loads(members["data"])
+    content["settings"].update(settings)
+    del content["class"]
+    content |= {} if name is None else {"class": name}
+    return zip_of({**members, "data": json.dumps(content).encode()})
+
+
 def policy_kwarg(name: str, value: Any) -> Callable[[], bytes]:
     """A model with another argument of its policy."""
     return lambda: changed_json("model", lambda settings: settings["policy_kwargs"]["dict"].update({name: value}))
@@ -678,7 +689,9 @@ MODELS: dict[str, Callable[[], bytes]] = {
     "an unknown type": setting("gamma", {"eval": "1"}),
     "an unknown class": setting("policy_class", {"name": "os.system"}),
     "a class of another kind": setting("policy_class", {"name": "torch.nn.modules.activation.ReLU"}),
-    "an unknown setting": setting("spam", 1),
+    "an unknown setting": lambda: saved_by("test_archive.OwnModel", spam=1),
+    "an unknown setting of nobody": lambda: saved_by(None, spam=1),
+    "a class that is no name": lambda: saved_by(7),
     "a part of the running model": setting("policy", 1),
     "a method's name": setting("_setup_model", 1),
     "a placeholder": setting("gamma", {"placeholder": "\x1b[2J" + "x" * 10_000}),

@@ -719,6 +719,12 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         {"stats_window_size": 0},
         "stats_window_size is 0, but it must be a whole number of at least 1: change stats_window_size.",
     ),
+    "stats_window_size that no archive may have": (
+        "CnnPolicy",
+        FakeEnv(),
+        {"stats_window_size": 10**6 + 1},
+        "stats_window_size is 1000001, but it must be 1000000 episodes at most: change stats_window_size.",
+    ),
     "optimize_memory_usage": (
         "CnnPolicy",
         FakeEnv(),
