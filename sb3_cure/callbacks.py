@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure import diagnostics
@@ -366,6 +366,8 @@ class ReconstructionCallback(_PictureCallback):
                 f"{type(self.model.policy).__name__}, but it draws images of uint8 from an encoder's latents: use it "
                 "with 'CnnPolicy', where observations are such images."
             )
+        if self.observations is not None:
+            self.observations = maybe_transpose(self.observations, space)
         if self.observations is not None and self.observations.shape[1:] != space.shape:
             raise ValueError(
                 f"ReconstructionCallback got observations of shape {self.observations.shape}, but the model learns "

@@ -115,8 +115,10 @@ def _is_read_only(folder: Path) -> bool:
 def entry_for(task: str, entries: Collection[str]) -> str | None:
     """Which entry of a YAML file of settings holds for a task.
 
-    :param task: Id of the environment, such as ``"dmc_pixels/walker-walk-v0"``
+    :param task: Id of the environment, such as ``"dmc_pixels/walker-walk-v0"``, perhaps with the module that registers
+        it (``"my_module:My-v0"``)
     :param entries: The file's keys
     :return: Its own, else that of its namespace (``"dmc_pixels"``), else ``"default"``; None if there is none of these
     """
-    return next((name for name in (task, task.rpartition("/")[0], "default") if name and name in entries), None)
+    name = task.rpartition(":")[2]
+    return next((each for each in (task, name, name.rpartition("/")[0], "default") if each and each in entries), None)

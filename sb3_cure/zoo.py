@@ -25,12 +25,13 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from stable_baselines3.common.monitor import Monitor
 
 try:
     import optuna
     import yaml
     from optuna.storages.journal import JournalFileBackend
-    from rl_zoo3 import ALGOS, exp_manager
+    from rl_zoo3 import ALGOS, exp_manager, utils
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
     from rl_zoo3.utils import StoreDict, get_class_by_name
 except ModuleNotFoundError as missing:
@@ -50,6 +51,14 @@ PROGRAMS = ("train", "enjoy", "record", "optimize")
 _ZOO_KEYS = {
     "n_timesteps", "n_envs", "env_kwargs", "normalize", "frame_stack", "env_wrapper", "vec_env_wrapper", "callback",
     "monitor_kwargs", "noise_type", "noise_std",
+}  # fmt: skip
+#: Arguments of the algorithm that rl-zoo3 takes from the command line only
+_FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose", "tensorboard_log": "-tb"}
+_NOISES = ("normal", "ornstein-uhlenbeck")
+#: The least that flags may be; what rl-zoo3 has as the default is allowed, too
+_LEAST = {
+    "n_eval_envs": 1, "eval_episodes": 1, "n_envs": 1, "n_trials": 1, "n_evaluations": 1, "max_total_trials": 1,
+    "n_startup_trials": 0,
 }  # fmt: skip
 #: What wrong settings make others raise, where that is raised by one of these packages (and not by a user's own code)
 _OF_INPUT = (
@@ -78,6 +87,8 @@ class ActingCuReSAC(CuReSAC):
 
     #: What models hold no more of than a placeholder: the head that ``--srl`` names
     objects: ClassVar[dict[str, Any]] = {}
+    #: What ``--gym-packages`` names, for `record`, which has no such flag in rl-zoo3
+    gym_packages: ClassVar[list[str]] = []
 
     @classmethod
     def load(cls, *args: Any, **kwargs: Any) -> "ActingCuReSAC":
@@ -184,12 +195,17 @@ class ExperimentManager(exp_manager.ExperimentManager):
     def learn(self, model: Any) -> None:
         if self.log_interval == 0:  # the constructor's own default, by which SB3 divides
             self.log_interval = -1
+        before = model.num_timesteps
         try:
             super().learn(model)
-        except gym.error.DependencyNotInstalled:
-            if model.num_timesteps == 0:  # as for a window, which is opened by the first reset
-                self._remove_run()
-            raise
+        except (gym.error.DependencyNotInstalled, ValueError, OSError) as error:
+            if model.num_timesteps > before + model.n_envs:
+                raise
+            self._remove_run()  # nothing was trained: a callback refuses, say, or a window, which the first reset opens
+            if isinstance(error, gym.error.DependencyNotInstalled | SettingsError) or not _is_about_input(error):
+                raise
+            sentence = _explained(error)
+            raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
 
     def _open_storage(self, storage: str) -> None:
         journal = Path(storage) if storage.endswith(".log") else None
@@ -290,6 +306,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
     def _check_values(self, hyperparams: dict[str, Any]) -> None:
         known = arguments_of(ALGOS[ALGO])
         for name, value in hyperparams.items():
+            if name in _FLAGS:
+                raise SettingsError(
+                    f"{self._source(name)} has {name}: {value!r}, but the command line says that: remove it, and add "
+                    f"{_FLAGS[name]} {value}."
+                )
             with _refusing():
                 check_keywords(self._source(name), {name: value}, known and known | _ZOO_KEYS, CuReSAC.__name__)
         if not is_number(hyperparams.get("n_timesteps"), low=1):
@@ -307,12 +328,32 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"env_kwargs in {self._source('env_kwargs')} is {hyperparams['env_kwargs']!r}, but it must be a "
                 "mapping (key: value): change env_kwargs."
             )
+        self._check_noise(hyperparams)
+        if isinstance(kwargs := hyperparams.get("monitor_kwargs"), dict):
+            with _refusing():
+                where = f"monitor_kwargs in {self._source('monitor_kwargs')}"
+                check_keywords(where, kwargs, arguments_of(Monitor), "SB3's Monitor")
         rate = hyperparams.get("learning_rate", 0.0)
         if isinstance(rate, str) and not re.fullmatch(r"lin_\d*\.?\d+(e-?\d+)?", rate):
             raise SettingsError(
                 f"learning_rate in {self._source('learning_rate')} is {rate!r}, but it must be a number, or "
                 "'lin_<number>' for one that falls to 0: write for example lin_0.001 (YAML reads 1e-3 as text, 1.0e-3 "
                 "as a number)."
+            )
+
+    def _check_noise(self, hyperparams: dict[str, Any]) -> None:
+        kind = hyperparams.get("noise_type")
+        if kind is None:
+            return
+        if not isinstance(kind, str) or kind not in _NOISES:
+            raise SettingsError(
+                f"noise_type in {self._source('noise_type')} is {kind!r}, but it must be one of "
+                f"{', '.join(map(repr, _NOISES))}: choose one."
+            )
+        if not is_number(hyperparams.get("noise_std"), low=0):
+            raise SettingsError(
+                f"noise_std in {self._source('noise_std')} is {hyperparams.get('noise_std')!r}, but noise_type needs a "
+                "standard deviation of at least 0, of actions in [-1, 1]: write for example noise_std: 0.1."
             )
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
@@ -323,13 +364,24 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 self.eval_env_kwargs = self.args.env_kwargs
         if "." in str(hyperparams.get("srl")):
             hyperparams["srl"] = _head("srl", hyperparams["srl"])
+        buffer = hyperparams.get("replay_buffer_class")
+        if isinstance(buffer, str) and re.fullmatch(r"\w+(\.\w+)+", buffer):  # else it is Python, for rl-zoo3
+            hyperparams["replay_buffer_class"] = _imported("replay_buffer_class", buffer)
         return super()._preprocess_hyperparams(hyperparams)
 
     def hyperparameters_optimization(self) -> None:
         if self.algo == ALGO:
             curiosity = self._hyperparams.get("curiosity", "separate")
             HYPERPARAMS_SAMPLER[ALGO] = partial(sample_cure_sac_params, curiosity=curiosity)
-        super().hyperparameters_optimization()
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if "No trials are completed" not in str(error):
+                raise
+            raise SettingsError(
+                "no trial was finished (all were interrupted or pruned, or have failed, as told above), so that there "
+                "is no best one: start again; with --storage and --study-name it goes on with what was tried."
+            ) from error
 
 
 def _head(where: str, name: Any) -> Any:
@@ -339,6 +391,11 @@ def _head(where: str, name: Any) -> Any:
             f"{where} is {name!r}, but it must be a head of your own as module.Class: write that, or leave {where} out "
             "for 'rae' and 'curl', which models are saved with."
         )
+    return _imported(where, name)
+
+
+def _imported(where: str, name: str) -> type:
+    """A class that settings name."""
     try:
         return get_class_by_name(name)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:  # ValueError: no module
@@ -520,9 +577,20 @@ def _load_run(load: Callable[..., Any], stream: Any, Loader: Any) -> Any:
     )
 
 
-def _reading_runs() -> Any:
-    """rl-zoo3 would run what a run's folder names, which may come from anyone."""
-    return mock.patch.multiple(yaml, UnsafeLoader=RunLoader, load=partial(_load_run, yaml.load))
+@contextmanager
+def _reading_runs() -> Iterator[None]:
+    """rl-zoo3 would run what a run's folder names, which may come from anyone, and choose runs without a model."""
+    latest = partial(_latest_run, utils.get_latest_run_id)
+    with mock.patch.multiple(yaml, UnsafeLoader=RunLoader, load=partial(_load_run, yaml.load)):
+        with mock.patch.object(utils, "get_latest_run_id", latest):
+            yield
+
+
+def _latest_run(latest: Callable[..., int], log_path: str, env_name: str) -> int:
+    """For ``get_latest_run_id``: the latest run that holds a model, which `optimize` and failed runs do not."""
+    runs = [run for run in Path(log_path).glob("*") if re.fullmatch(rf"{re.escape(env_name)}_\d+", run.name)]
+    with_model = [int(run.name.rpartition("_")[2]) for run in runs if any(run.glob("*.zip"))]
+    return max(with_model) if with_model else latest(log_path, env_name)
 
 
 def enjoy() -> None:
@@ -550,12 +618,20 @@ def _parse_flags(
     # Its own --env is CartPole-v1, which suits its own algorithms.
     with mock.patch.object(StoreDict, "__call__", _store_each):
         given = _parse_args(parser, args, argparse.Namespace(env=None))
+    if not hasattr(given, "gym_packages"):  # `record` has no such flag
+        given.gym_packages = ActingCuReSAC.gym_packages
     flags = vars(given)
     if given.env is None:
         if given.algo == ALGO:
             example = "dmc_pixels/finger-spin-v0"
             raise SettingsError(f"--env is missing: add the id of an environment, such as --env {example}.")
         given.env = parser.get_default("env")
+    _import_environment(given, acts="no_render" in flags)
+    for name, low in _LEAST.items():
+        value = flags.get(name)
+        if value is not None and value != parser.get_default(name) and value < low:
+            flag = f"--{name.replace('_', '-')}"
+            raise SettingsError(f"{flag} is {value}, but it must be at least {low}: change it, or leave it out.")
     if given.n_timesteps < 1 and given.n_timesteps != parser.get_default("n_timesteps"):
         raise SettingsError(
             f"-n/--n-timesteps is {given.n_timesteps}, but it must be a number of agent steps of at least 1: give one, "
@@ -572,11 +648,33 @@ def _parse_flags(
         raise SettingsError(
             "--sampler auto needs optunahub, which is not installed: pip install optunahub, or choose --sampler tpe."
         )
-    for name in ("output_folder", "optimization_log_path", "reward_log"):
+    for name in ("output_folder", "optimization_log_path", "reward_log", "log_folder", "tensorboard_log"):
         if flags.get(name):
             with _refusing():
                 check_folder(f"--{name.replace('_', '-')}", flags[name])
     return given
+
+
+def _import_environment(given: argparse.Namespace, acts: bool) -> None:
+    """Import what registers the environment: the modules of ``--gym-packages``, and that of ``--env module:id``."""
+    module, _, task = getattr(given.env, "gym_id", given.env).rpartition(":")
+    for name, flag in [
+        *((name, "--gym-packages") for name in given.gym_packages),
+        *([(module, "--env")] if module else []),
+    ]:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise SettingsError(
+                f"{flag} names the module {name!r}, which cannot be imported ({_one_line(error)}): name one of the "
+                "working directory or an installed one."
+            ) from error
+    given.env = type(given.env)(task)
+    if acts and task not in gym.registry:  # `train` says so itself
+        raise SettingsError(
+            f"--env is {task!r}, which is not registered with Gymnasium: correct it, or name the module that registers "
+            f"it (--gym-packages my_module, or --env my_module:{task})."
+        )
 
 
 def _store_each(
@@ -601,7 +699,7 @@ def run(program: str, arguments: Sequence[str]) -> None:
     """
     :param program: One of ``PROGRAMS``
     :param arguments: Its command line; ``enjoy`` and ``record`` also take ``--srl my_package.MyHead``, the class of a
-        head of your own, which a saved model does not hold
+        head of your own, which a saved model does not hold. All programs take ``--env my_module:Env-v0``, too
     """
     acts = program in ("enjoy", "record")
     # Classes that settings and `--srl` name may lie in the working directory.
@@ -610,7 +708,10 @@ def run(program: str, arguments: Sequence[str]) -> None:
     if acts:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--srl")
+        if program == "record":
+            parser.add_argument("--gym-packages", nargs="+", default=[])
         own, arguments = parser.parse_known_args(arguments)
+        ActingCuReSAC.gym_packages = vars(own).get("gym_packages", [])
         ActingCuReSAC.objects = {} if own.srl is None else {"srl": _head("--srl", own.srl)}
     register(ActingCuReSAC if acts else CuReSAC)
     # argparse takes the last of repeated flags, so that these are defaults.

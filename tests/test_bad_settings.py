@@ -16,7 +16,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from test_bad_input import files_in, is_one_sentence
 
-from sb3_cure import cli
+from sb3_cure import cli, zoo
 from sb3_cure.srl import RAE
 
 TASK = "tests/PixelBox-v0"
@@ -146,6 +146,31 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
         "sb3-cure train: policy_kwargs has 'net_ach', but CnnPolicy has no such argument: "
         "write 'net_arch' (settings: settings.yml).",
     ),
+    "a setting that is a flag": (
+        {"seed": 3},
+        "sb3-cure train: settings.yml has seed: 3, but the command line says that: remove it, and add --seed 3.",
+    ),
+    "an unknown kind of noise": (
+        {"noise_type": "gauss", "noise_std": 0.1},
+        "sb3-cure train: noise_type in settings.yml is 'gauss', but it must be one of 'normal', "
+        "'ornstein-uhlenbeck': choose one.",
+    ),
+    "noise in words": (
+        {"noise_type": "normal", "noise_std": "x"},
+        "sb3-cure train: noise_std in settings.yml is 'x', but noise_type needs a standard deviation of at least 0, of "
+        "actions in [-1, 1]: write for example noise_std: 0.1.",
+    ),
+    "a misspelt argument of Monitor": (
+        {"monitor_kwargs": {"info_keyword": ["x"]}},
+        "sb3-cure train: monitor_kwargs in settings.yml has 'info_keyword', but SB3's Monitor has no such argument: "
+        "write 'info_keywords'.",
+    ),
+    "no such buffer": (
+        {"replay_buffer_class": "sb3_cure.buffers.FrameBuffer"},
+        "sb3-cure train: replay_buffer_class is 'sb3_cure.buffers.FrameBuffer', which cannot be imported (module "
+        "'sb3_cure.buffers' has no attribute 'FrameBuffer'): name a class as module.Class, in a module of the working "
+        "directory or an installed one.",
+    ),
     "text that is no Python": (
         {"policy_kwargs": "dict(net_arch=["},
         "sb3-cure train: a text that is to be evaluated is no Python ('[' was never closed "
@@ -232,6 +257,42 @@ COMMANDS: dict[str, str] = {
         "sb3-cure enjoy: --env-kwargs has 'size:1/0', but it takes name:value, with a value of Python (division by "
         "zero): write for example batch_size:128; text needs quotes of its own, as in \"srl:'curl'\"."
     ),
+    **{
+        f"{TRAIN} {flag} {value}": (
+            f"sb3-cure train: {flag} is {value}, but it must be at least {least}: change it, or leave it out."
+        )
+        for flag, value, least in (
+            ("--n-eval-envs", 0, 1),
+            ("--eval-episodes", 0, 1),
+            ("--eval-episodes", -1, 1),
+            ("--n-trials", -2, 1),
+            ("--n-evaluations", 0, 1),
+            ("--max-total-trials", 0, 1),
+            ("--n-startup-trials", -1, 0),
+        )
+    },
+    f"record --env {TASK} --n-envs 0": (
+        "sb3-cure record: --n-envs is 0, but it must be at least 1: change it, or leave it out."
+    ),
+    **{
+        f"{program} --env No-v0": (
+            f"sb3-cure {program}: --env is 'No-v0', which is not registered with Gymnasium: correct it, or name the "
+            "module that registers it (--gym-packages my_module, or --env my_module:No-v0)."
+        )
+        for program in ("enjoy", "record")
+    },
+    "record --env my_cameras:No-v0": (
+        "sb3-cure record: --env names the module 'my_cameras', which cannot be imported (No module named "
+        "'my_cameras'): name one of the working directory or an installed one."
+    ),
+    "record --env No-v0 --gym-packages my_cameras": (
+        "sb3-cure record: --gym-packages names the module 'my_cameras', which cannot be imported (No module named "
+        "'my_cameras'): name one of the working directory or an installed one."
+    ),
+    f"{TRAIN} -tb settings.yml": (
+        "sb3-cure train: --tensorboard-log is 'settings.yml', but {folder}/settings.yml is a file: name a folder, or "
+        "remove the file."
+    ),
     f"{TRAIN} --device gpu": (
         "sb3-cure train: device is 'gpu', which PyTorch cannot use here: use 'auto', 'cpu', "
         "or 'cuda' on a machine with a GPU (settings: settings.yml, but device from --device)."
@@ -269,12 +330,12 @@ COMMANDS: dict[str, str] = {
         )
     },
     f"{TRAIN} -f settings.yml": (
-        "sb3-cure train: settings.yml/cure_sac cannot be used (Not a directory): name "
-        "another folder or file (settings: settings.yml)."
+        "sb3-cure train: --log-folder is 'settings.yml', but {folder}/settings.yml is a file: name a folder, or remove "
+        "the file."
     ),
     f"{TRAIN} --gym-packages no_such_envs": (
-        "sb3-cure train: what is named cannot be imported (No module named 'no_such_envs'): "
-        "correct the name, or install it."
+        "sb3-cure train: --gym-packages names the module 'no_such_envs', which cannot be imported (No module named "
+        "'no_such_envs'): name one of the working directory or an installed one."
     ),
     f"{TRAIN} --storage sqlite:///no.db --study-name mine --trial-id 3": (
         "sb3-cure train: --storage is 'sqlite:///no.db', but there is no such file: name one "
@@ -406,6 +467,32 @@ def test_command_lines(
     for name in ("mine", "yours"):
         optuna.create_study(study_name=name, storage=storage).ask()
     assert refusal(command, capsys) == COMMANDS[command].replace("{folder}", str(tmp_path))
+
+
+def test_what_is_refused_by_the_first_step_leaves_no_run(capsys: pytest.CaptureFixture[str]) -> None:
+    """A callback refuses when training begins: the checkpoints of another training are in its folder."""
+    settings = copy.deepcopy(SETTINGS)
+    checkpoint = {"sb3_cure.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
+    settings["default"]["callback"] = [checkpoint]
+    Path("settings.yml").write_text(yaml.safe_dump(settings))
+    assert cli.main(TRAIN.split()) == 0
+    said = refusal(TRAIN, capsys)
+    assert said.startswith("sb3-cure train: checkpoints holds checkpoints of another training")
+    assert said.endswith("(settings: settings.yml).")
+
+
+def test_a_study_without_a_trial_that_was_finished(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its end is told, as rl-zoo3 asks the study for the best trial."""
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+
+    def interrupted(*args: Any, **kwargs: Any) -> float:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(zoo.ExperimentManager, "objective", interrupted)
+    assert cli.main([*TRAIN.replace("train", "optimize", 1).split(), "--n-trials", "1"]) == 2
+    assert "no trial was finished" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_the_length_of_the_file_can_be_asked_for(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """The command line: training, replaying, filming and tuning from a YAML file, and the doctor."""
 
+import itertools
 import os
 import subprocess
 import sys
@@ -154,6 +155,43 @@ def test_train_enjoy_record(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
     record += ["--srl", "my_heads.Gentle"]
     finish(start(record))
     (video,) = run.glob("videos/*.mp4")
+    assert video.stat().st_size > 1000
+
+
+CAMERA = """
+import gymnasium as gym
+from envs_for_tests import PixelBox
+
+class Camera(PixelBox):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode=None, channels_last=True, **kwargs):
+        super().__init__(channels_last=channels_last, episode_length=10, **kwargs)
+        self.render_mode = render_mode
+
+    def render(self):
+        return self.frames[-1].transpose(1, 2, 0)
+
+gym.register("Camera-v0", Camera)
+"""
+
+
+def test_an_environment_of_ones_own(folder: Path) -> None:
+    """All programs find what a module of the working directory registers, by either flag; `record` and `enjoy` take the
+    latest run that has a model, which `optimize` leaves none in."""
+    (folder / "camera_of_mine.py").write_text(CAMERA)
+    settings = {key: value for key, value in SETTINGS["default"].items() if key != "env_kwargs"}
+    (folder / "tiny.yml").write_text(yaml.safe_dump({"Camera-v0": settings}))
+    own = {"PYTHONPATH": str(Path(__file__).parent)}
+    by_flag, by_name = ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"], ["--env", "camera_of_mine:Camera-v0"]
+    for flags, program in itertools.product((by_flag, by_name), ("train", "optimize", "enjoy", "record")):
+        rest = ["-n", "20", "--no-render"]
+        if program in ("train", "optimize"):
+            rest = ["--conf-file", "tiny.yml", "--n-trials", "1", "--n-evaluations", "1"]
+        output = finish(start([script(), program, *flags, *rest], **own))
+        if program in ("enjoy", "record"):
+            assert f"Loading latest experiment, id={1 if flags is by_flag else 3}" in output
+    (video,) = folder.glob("logs/cure_sac/Camera-v0_3/videos/*.mp4")
     assert video.stat().st_size > 1000
 
 

@@ -430,6 +430,43 @@ def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
     assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "test_save_load.Denoising"
 
 
+CAMERA = """
+import gymnasium as gym
+from envs_for_tests import PixelBox
+
+gym.register("tests/Camera-v0", lambda **kwargs: PixelBox(channels_last=True, **kwargs))
+"""
+
+
+@pytest.mark.parametrize("kind", ["curves", "visitation"])
+def test_an_environment_of_ones_own_is_named_with_its_module(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its images have the channels last, and its frames lie on disk."""
+    (tmp_path / "camera_of_a_grid.py").write_text(CAMERA)
+    (tmp_path / "frames").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    overrides = {"replay_buffer_kwargs": {"frames_dir": str(tmp_path / "frames")}}
+    methods = {"cure": {"config": "zoo.yml", "overrides": overrides}}
+    path = write_grid(tmp_path, kind=kind, tasks=["camera_of_a_grid:tests/Camera-v0"], methods=methods, seeds=2)
+    grid = load_grid(path)
+    (tmp_path / "zoo.yml").write_text(yaml.safe_dump({"tests/Camera-v0": TINY}))  # by its id alone
+    assert load_grid(path) == grid
+    try:
+        assert run.run_grid(grid, tmp_path / "out") == []
+    finally:
+        gym.registry.pop("tests/Camera-v0", None)
+        sys.modules.pop("camera_of_a_grid", None)
+    assert [cell.folder for cell in grid.cells] == [Path("tiny", "Camera", "cure", f"seed{seed}") for seed in (0, 1)]
+    assert all(cell.is_done(tmp_path / "out") for cell in grid.cells)
+    assert (tmp_path / "out" / grid.cells[0].folder / "reconstructions.png").is_file()
+
+
+def test_a_module_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(GridError, match=r"names the module 'no_camera', which cannot be imported \(No module named"):
+        load_grid(write_grid(tmp_path, tasks=["no_camera:tests/Camera-v0"]))
+
+
 def test_other_settings_in_the_same_folder_are_refused(tmp_path: Path) -> None:
     """A finished cell is not taken for one of another budget, and the grid's description stays as it was."""
     path = write_grid(tmp_path, budget=80)

@@ -1,6 +1,7 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
+import importlib
 import math
 import pkgutil
 import re
@@ -137,9 +138,9 @@ class Grid:
 def short_name(task: str) -> str:
     """
     :param task: Gymnasium id
-    :return: The id without namespace and version: a folder's name
+    :return: The id without module, namespace and version: a folder's name
     """
-    return re.sub(r"-v\d+$", "", task.split("/")[-1])
+    return re.sub(r"-v\d+$", "", re.split("[:/]", task)[-1])
 
 
 def seed_of(folder: Path) -> int | None:
@@ -265,6 +266,8 @@ def check_arms(cells: Iterable[Cell]) -> None:
                     envs[key] = _make(task, cell.env_kwargs)
                 model = CuReSAC(env=envs[key], _init_setup_model=False, **cell.build_arguments())
                 check_arguments(model)
+                if not model.is_plain_sac:
+                    model._choose_replay_buffer()
                 check_parts(model)
             except GLUnavailableError:  # with Ray other machines may have what this one has not
                 return
@@ -403,10 +406,19 @@ def _tasks(value: Any, path: Path) -> dict[str, str]:
     if not isinstance(value, list) or not value:
         raise GridError(f"tasks in {path} is {value!r}, but it must be a list of Gymnasium ids: write some.")
     for task in value:
-        if not isinstance(task, str) or task not in gym.registry:
+        module, _, name = task.rpartition(":") if isinstance(task, str) else ("", "", task)
+        if module:
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                raise GridError(
+                    f"task {task!r} in {path} names the module {module!r}, which cannot be imported ({error}): name "
+                    "one of the working directory or an installed one."
+                ) from error
+        if not isinstance(name, str) or name not in gym.registry:
             raise GridError(
                 f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
-                "dmc_pixels/<domain>-<task>-v0)."
+                "dmc_pixels/<domain>-<task>-v0; one of your own is my_module:My-v0, with the module that registers it)."
             )
     return {**{short_name(task): task for task in value}, **{task: task for task in value}}
 
