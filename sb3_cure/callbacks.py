@@ -556,12 +556,14 @@ class CuriosityMapCallback(_PictureCallback):
                 )
                 pairs = [(episode.states, episode.srl_errors) for episode in episodes]
                 states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-                self.visits[actor] = states, errors
-        if states.shape[1:] != (len(self.names),):
-            raise ValueError(
-                f"CuriosityMapCallback got {len(self.names)} names for states of shape {states.shape[1:]}: state must "
-                "return a vector, and names have one name for each of its values."
-            )
+                if states.shape[1:] != (len(self.names),):
+                    raise ValueError(
+                        f"CuriosityMapCallback got {len(self.names)} names for states of shape {states.shape[1:]}: "
+                        "state must return a vector, and names have one name for each of its values."
+                    )
+                self.visits[actor] = self._finite(actor, states, errors)
+        if not any(len(states) for states, _ in self.visits.values()):
+            return
         steps = self.num_timesteps
         self._import_room("plots").curiosity_map(
             self._path(f"curiosity_map_{steps}_steps.png"),
@@ -572,6 +574,19 @@ class CuriosityMapCallback(_PictureCallback):
             units=self.units,
             bins=self.bins,
         )
+
+    def _finite(self, actor: str, states: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Without the states that have no place on a map: that is no reason to end a training."""
+        finite = np.isfinite(states).all(axis=1)
+        if finite.all():
+            return states, errors
+        names = [name for name, values in zip(self.names, states.T, strict=True) if not np.isfinite(values).all()]
+        warnings.warn(
+            f"CuriosityMapCallback leaves out {np.count_nonzero(~finite)} of {len(states)} states of the {actor} "
+            f"policy, whose {', '.join(names)} is not finite: look at what `state` returns.",
+            stacklevel=2,
+        )
+        return states[finite], errors[finite] if len(errors) else errors
 
 
 class DiagnosticsCallback(PeriodicCallback):

@@ -1,8 +1,9 @@
 """Wrong arguments of ``CuReSAC``, each in one sentence that names the value, what is expected and the fix."""
 
+import contextlib
 import inspect
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +90,8 @@ def check_construction(model: "CuReSAC", policy: Any, env: GymEnv | str | None, 
         )
     if isinstance(env, gym.Env | VecEnv):
         check_action_space(env.action_space)
+        if isinstance(env.observation_space, spaces.Dict) and policy in ("CnnPolicy", "MlpPolicy"):
+            raise ValueError(_reads_one_entry(env.observation_space))
     for name, whose in ("policy_kwargs", "the policy"), ("replay_buffer_kwargs", "the replay buffer"):
         if kwargs.get(name) is not None:
             check_keywords(name, kwargs[name], None, whose)
@@ -128,8 +131,9 @@ def check_action_space(action_space: spaces.Space) -> None:
         )
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
         raise ValueError(
-            f"the action space is {action_space}, but SAC needs finite bounds: wrap the environment so that its "
-            "actions lie in, say, [-1, 1] (gymnasium's RescaleAction or ClipAction)."
+            f"the action space is {action_space}, but SAC needs finite bounds: give it some that suit the environment, "
+            "such as gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(-1, 1, "
+            f"{action_space.shape}))."
         )
 
 
@@ -352,6 +356,23 @@ def check_parts(model: "CuReSAC") -> None:
     _check_replay_buffer(model)
 
 
+@contextlib.contextmanager
+def explaining_memory(model: "CuReSAC") -> Iterator[None]:
+    """While the replay buffer is made.
+
+    :param model: The model
+    :raises ValueError: if there is not enough memory for it
+    """
+    try:
+        yield
+    except MemoryError as error:
+        raise ValueError(
+            f"a replay buffer of buffer_size={model.buffer_size} observations {model.observation_space} does not fit "
+            f"into memory ({error}): make images smaller (make_pixel_env does), or buffer_size, or keep frames on a "
+            "disk with make_pixel_env and replay_buffer_kwargs=dict(frames_dir='/some/disk')."
+        ) from error
+
+
 def _check_replay_buffer(model: "CuReSAC") -> None:
     chosen, space = model.replay_buffer_class, model.observation_space
     if chosen is not None and not (inspect.isclass(chosen) and issubclass(chosen, ReplayBuffer)):
@@ -475,11 +496,7 @@ def check_shared_encoder_space(observation_space: spaces.Space, policy_class: ty
     :raises ValueError: if it cannot
     """
     if isinstance(observation_space, spaces.Dict | spaces.Tuple):
-        raise ValueError(
-            f"observations are {observation_space}, but the shared encoder reads one image or one vector: pick one "
-            "entry with a wrapper (gymnasium's FilterObservation and FlattenObservation), or use srl=None and "
-            "curiosity=None, which is SB3's own SAC."
-        )
+        raise ValueError(_reads_one_entry(observation_space))
     image_like = isinstance(observation_space, spaces.Box) and len(observation_space.shape) == 3
     if image_like and (
         observation_space.dtype != np.uint8
@@ -497,6 +514,19 @@ def check_shared_encoder_space(observation_space: spaces.Space, policy_class: ty
         )
     if issubclass(policy_class, CnnPolicy) and not image_like:
         raise ValueError(_reads_images(observation_space))
+
+
+def _reads_one_entry(observation_space: spaces.Dict | spaces.Tuple) -> str:
+    parts = observation_space.spaces
+    named = list(parts.items()) if isinstance(parts, Mapping) else list(enumerate(parts))
+    images = [name for name, part in named if len(part.shape or ()) == 3]
+    entry = repr((images or [name for name, _ in named])[0])
+    return (
+        f"observations are {observation_space}, but the shared encoder reads one image or one vector: keep one entry "
+        f"with gymnasium.wrappers.TransformObservation(env, lambda seen: seen[{entry}], "
+        f"env.observation_space[{entry}]), or use 'MultiInputPolicy' with srl=None and curiosity=None, which is SB3's "
+        "own SAC."
+    )
 
 
 def _reads_images(observation_space: spaces.Space) -> str:

@@ -42,6 +42,7 @@ from sb3_cure.checks import (
     check_shared_encoder_space,
     check_srl_error,
     check_srl_output,
+    explaining_memory,
     make_env,
 )
 from sb3_cure.files import PathOrFile
@@ -52,6 +53,7 @@ from sb3_cure.guards import (
     check_actions,
     look_before_steps,
     post_mortem_of_a_step,
+    warn_of_dark_images,
 )
 from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip
 from sb3_cure.mixers import CuriousMixer
@@ -305,7 +307,8 @@ class CuReSAC(SAC):
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
             check_parts(self)
-            super()._setup_model()
+            with explaining_memory(self):
+                super()._setup_model()
             # SB3's update knows no guard: its optimisers look before they step.
             optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
             look_before_steps(self, {**optimizers, "temperature": self.ent_coef_optimizer})
@@ -317,7 +320,8 @@ class CuReSAC(SAC):
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_blueprint()}
         try:
-            super()._setup_model()
+            with explaining_memory(self):
+                super()._setup_model()
         finally:
             self.policy_kwargs = user_kwargs
         if self._mixer is None:
@@ -605,6 +609,7 @@ class CuReSAC(SAC):
         )
         if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
             self._warmed_up = True
+            warn_of_dark_images(self.observation_space, replay_buffer)
             updates = self.warmup_updates
             if updates is None:
                 updates = 0 if self.srl is None else get_srl_class(self.srl).warmup_updates

@@ -20,7 +20,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.sac.sac import SAC
@@ -405,6 +407,24 @@ def _plain(value: Any) -> Any:
 
 
 # ------------------------------------------------------------------- transitions
+
+
+def warn_of_dark_images(observation_space: spaces.Space, replay_buffer: ReplayBuffer) -> None:
+    """Floats in [0, 1] that an environment returns for a space of uint8 are cast without a word, to black.
+
+    :param observation_space: Observation space of the model
+    :param replay_buffer: What its environments have returned
+    """
+    stored = getattr(replay_buffer, "frames", getattr(replay_buffer, "observations", None))
+    if not is_image_space(observation_space) or not isinstance(stored, np.ndarray):
+        return
+    brightest = int(stored[: min(replay_buffer.size(), 1000)].max())
+    if brightest <= 1:
+        warnings.warn(
+            f"no pixel of the images so far is brighter than {brightest} of 255, so that the policy sees black: if the "
+            "environment returns floats in [0, 1], return (255 * image).astype(np.uint8) instead.",
+            stacklevel=2,
+        )
 
 
 class TransitionGuard:

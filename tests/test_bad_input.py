@@ -469,8 +469,18 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         {},
         "observations are Dict('camera': Box(0, 255, (3, 36, 36), uint8), 'joints': "
         "Box(-1.0, 1.0, (3,), float32)), but the shared encoder reads one image or one "
-        "vector: pick one entry with a wrapper (gymnasium's FilterObservation and "
-        "FlattenObservation), or use srl=None and curiosity=None, which is SB3's own SAC.",
+        "vector: keep one entry with gymnasium.wrappers.TransformObservation(env, lambda seen: "
+        "seen['camera'], env.observation_space['camera']), or use 'MultiInputPolicy' with srl=None "
+        "and curiosity=None, which is SB3's own SAC.",
+    ),
+    "dictionary, by another policy": (
+        "CnnPolicy",
+        FakeEnv(spaces.Dict(a=VECTOR)),
+        {},
+        "observations are Dict('a': Box(-1.0, 1.0, (3,), float32)), but the shared encoder reads one image or one "
+        "vector: keep one entry with gymnasium.wrappers.TransformObservation(env, lambda seen: seen['a'], "
+        "env.observation_space['a']), or use 'MultiInputPolicy' with srl=None and curiosity=None, which is SB3's own "
+        "SAC.",
     ),
     "MultiInputPolicy without dictionary": (
         "MultiInputPolicy",
@@ -529,16 +539,16 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         actions(spaces.Box(-np.inf, np.inf, (2,), np.float32)),
         {},
         "the action space is Box(-inf, inf, (2,), float32), but SAC needs finite bounds: "
-        "wrap the environment so that its actions lie in, say, [-1, 1] (gymnasium's "
-        "RescaleAction or ClipAction).",
+        "give it some that suit the environment, such as gymnasium.wrappers.TransformAction(env, "
+        "lambda action: action, gymnasium.spaces.Box(-1, 1, (2,))).",
     ),
     "unbounded above": (
         "CnnPolicy",
         actions(spaces.Box(np.zeros(2, np.float32), np.array([1, np.inf], np.float32))),
         {},
         "the action space is Box(0.0, [ 1. inf], (2,), float32), but SAC needs finite "
-        "bounds: wrap the environment so that its actions lie in, say, [-1, 1] (gymnasium's "
-        "RescaleAction or ClipAction).",
+        "bounds: give it some that suit the environment, such as gymnasium.wrappers.TransformAction(env, "
+        "lambda action: action, gymnasium.spaces.Box(-1, 1, (2,))).",
     ),
     # --- policies
     "SB3's policy class": (
@@ -998,10 +1008,30 @@ def test_unknown_keywords(name: str) -> None:
     assert is_one_sentence(sentence)
 
 
-def test_dictionaries_lead_to_the_explanation() -> None:
-    """With another policy's name SB3 asks for 'MultiInputPolicy', whose refusal (above) explains."""
-    with pytest.raises(ValueError, match="use `MultiInputPolicy`"):
-        CuReSAC("CnnPolicy", FakeEnv(spaces.Dict(camera=IMAGE)))
+def test_the_ways_out_that_sentences_name_work() -> None:
+    """Copied as they stand: an entry of a dictionary, and bounds for actions."""
+    env: Any = FakeEnv(spaces.Dict(joints=VECTOR, camera=IMAGE))
+    with pytest.raises(ValueError) as error:
+        CuReSAC("CnnPolicy", env)
+    way_out = str(error.value).partition(" with ")[2].partition(", or use")[0]
+    kept = eval(way_out, {"gymnasium": gym, "env": env})
+    assert kept.observation_space == IMAGE
+    CuReSAC("CnnPolicy", kept, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+    env = actions(spaces.Box(-np.inf, np.inf, (2,), np.float32))
+    with pytest.raises(ValueError) as error:
+        CuReSAC("CnnPolicy", env)
+    bounded = eval(str(error.value).partition("such as ")[2].rstrip("."), {"gymnasium": gym, "env": env})
+    assert CuReSAC("CnnPolicy", bounded, buffer_size=10, policy_kwargs=dict(net_arch=[4])).action_space.shape == (2,)
+
+
+@pytest.mark.parametrize("kwargs", [{}, dict(srl=None, curiosity=None)], ids=["CuRe", "SAC"])
+def test_a_buffer_that_no_memory_holds(kwargs: dict[str, Any]) -> None:
+    """Of a camera as it comes, on a machine of any size."""
+    camera = FakeEnv(spaces.Box(0, 255, (3, 4800, 6400), np.uint8))
+    with pytest.raises(
+        ValueError, match=r"buffer_size=900000000 observations Box\(0, 255, \(3, 4800, 6400\), uint8\) does "
+    ):
+        CuReSAC("CnnPolicy", camera, buffer_size=900_000_000, policy_kwargs=dict(net_arch=[4]), **kwargs)
 
 
 class RewardAtStep(PixelBox):

@@ -414,6 +414,29 @@ def test_images_with_the_channels_last(srl: str, tmp_path: Path) -> None:
     assert len(seen[0]["history"]) == 1 and differences(*seen) == []
 
 
+def test_states_that_are_not_finite_are_left_out_of_a_map(tmp_path: Path) -> None:
+    """A callback that only draws ends no training; without any state there is no picture."""
+    places: list[np.ndarray] = []
+
+    def at_times(env: gym.Env) -> np.ndarray:
+        places.append(position(env))
+        return places[-1] * (np.nan if len(places) % 4 == 0 else 1.0)
+
+    model = tiny_model("CnnPolicy", PixelBox())
+    callback = CuriosityMapCallback(PixelBox(), tmp_path, every=20, n_episodes=1, state=at_times, names=["x", "y"])
+    with pytest.warns(UserWarning, match="leaves out 5 of 20 states of the task policy, whose x, y is not finite"):
+        model.learn(25, callback=callback)
+    assert names(tmp_path) == ["curiosity_map_20_steps.png"]
+    states, errors = callback.visits["task"]
+    assert len(states) == len(errors) == 15 and np.isfinite(states).all()
+    nowhere = CuriosityMapCallback(
+        PixelBox(), tmp_path / "none", every=20, n_episodes=1, state=lambda env: np.full(2, np.nan), names=["x", "y"]
+    )
+    with pytest.warns(UserWarning, match="leaves out 20 of 20 states"):
+        tiny_model("CnnPolicy", PixelBox()).learn(25, callback=nowhere)
+    assert not (tmp_path / "none").exists() or names(tmp_path / "none") == []
+
+
 def test_map_of_an_algorithm_without_errors(tmp_path: Path) -> None:
     """SB3's PPO has visits and no errors: the picture has one column instead of two."""
     callback = CuriosityMapCallback(VectorBox(), tmp_path, every=16, n_episodes=1, **MAP)
