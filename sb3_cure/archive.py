@@ -28,7 +28,15 @@ from sb3_cure.serialization import (
     sentences,
     write_arrays,
 )
-from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA, SettingsDecoder, SettingsEncoder, check_sizes
+from sb3_cure.settings import (
+    DERIVED,
+    NEVER_SAVED,
+    SCHEMA,
+    SettingsDecoder,
+    SettingsEncoder,
+    check_sizes,
+    plain_arguments,
+)
 from sb3_cure.weights import Allowance, TensorInfo, TorchFile, check_parameters, check_tensor, expect_keys
 
 if TYPE_CHECKING:
@@ -246,13 +254,14 @@ def load_model(
     """
     if custom_objects is not None and not isinstance(custom_objects, dict):
         raise ValueError(f"custom_objects is a {type(custom_objects).__name__}, but it must be a dict or None.")
+    custom_objects, kwargs = plain_arguments(custom_objects or {}), plain_arguments(kwargs)
     archive = read_model(path)
     if print_system_info:
         print("== CURRENT SYSTEM INFO ==")
         get_system_info()
         print("== SAVED MODEL SYSTEM INFO ==")
         print("".join(character for character in archive.system_info if character.isprintable() or character == "\n"))
-    settings = _complete(archive, custom_objects or {}, kwargs)
+    settings = _complete(archive, custom_objects, kwargs)
     if env is not None:
         env = cls._wrap_env(env, settings.get("verbose", 0))
         _check_spaces(archive.name, settings, env)

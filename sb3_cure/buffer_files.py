@@ -32,12 +32,12 @@ _BUFFERS = (
 )
 
 
-def can_be_kept(buffer: Any) -> bool:
+def can_be_kept(kind: type) -> bool:
     """
-    :param buffer: A replay buffer
+    :param kind: Class of a replay buffer
     :return: Whether it is written without pickle, and so can be read back without trust
     """
-    return type(buffer) in _BUFFERS
+    return kind in _BUFFERS
 
 
 def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Callable[[Any], None]) -> None:
@@ -48,7 +48,7 @@ def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Call
     :param pickle: Writes it to a path or file as SB3 does, for classes of which no more is known
     """
     with writing(path, "pkl") as target:
-        if not can_be_kept(buffer):
+        if not can_be_kept(type(buffer)):
             # A name with a suffix, as SB3 would add one.
             pickle(target)
             return

@@ -366,7 +366,7 @@ class ReconstructionCallback(_PictureCallback):
                 f"{type(self.model.policy).__name__}, but it draws images of uint8 from an encoder's latents: use it "
                 "with 'CnnPolicy', where observations are such images."
             )
-        if self.observations is not None:
+        if self.observations is not None and self.observations.ndim == 4:
             self.observations = maybe_transpose(self.observations, space)
         if self.observations is not None and self.observations.shape[1:] != space.shape:
             raise ValueError(

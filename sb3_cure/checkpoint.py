@@ -637,7 +637,7 @@ class ExactCheckpoint(BaseCallback):
                 "CheckpointCallback, or CuReSAC (with srl=None, curiosity=None it is SB3's SAC)."
             )
         buffer = self.model.replay_buffer
-        if not can_be_kept(buffer):
+        if not can_be_kept(type(buffer)):
             raise ValueError(
                 f"ExactCheckpoint got a model whose replay buffer is a {type(buffer).__name__}, which it cannot read "
                 "back without pickle: train with a FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."

@@ -366,10 +366,12 @@ def explaining_memory(model: "CuReSAC") -> Iterator[None]:
     try:
         yield
     except MemoryError as error:
+        is_image = len(model.observation_space.shape or ()) == 3
+        images = "images smaller (make_pixel_env does), or " if is_image else ""
+        disk = ", or keep frames on a disk with make_pixel_env and replay_buffer_kwargs=dict(frames_dir='/some/disk')"
         raise ValueError(
             f"a replay buffer of buffer_size={model.buffer_size} observations {model.observation_space} does not fit "
-            f"into memory ({error}): make images smaller (make_pixel_env does), or buffer_size, or keep frames on a "
-            "disk with make_pixel_env and replay_buffer_kwargs=dict(frames_dir='/some/disk')."
+            f"into memory ({error}): make {images}buffer_size smaller{disk if is_image else ''}."
         ) from error
 
 

@@ -61,7 +61,7 @@ from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
 from sb3_cure.serialization import ArchiveError
-from sb3_cure.settings import NEVER_SAVED
+from sb3_cure.settings import NEVER_SAVED, plain_arguments
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.weights import check_parameters
 
@@ -234,7 +234,7 @@ class CuReSAC(SAC):
     ):
         env = make_env(env, kwargs.get("verbose", 0))
         check_construction(self, policy, env, kwargs)
-        kwargs = _plain(kwargs)
+        kwargs = plain_arguments(kwargs)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -1177,21 +1177,6 @@ class CuReSAC(SAC):
                 state_dicts.append("curious_ent_coef_optimizer")
                 variables = [*variables, "curious_log_ent_coef"]
         return state_dicts, variables
-
-
-def _plain(kwargs: dict[str, Any]) -> dict[str, Any]:
-    """SAC's arguments as SB3 takes them and archives hold them; of dictionaries copies, as SB3 writes into one."""
-    plain: dict[str, Any] = {}
-    for name, value in kwargs.items():
-        if isinstance(value, Mapping):
-            plain[name] = dict(value)
-            if isinstance(value.get("net_arch"), tuple):
-                plain[name]["net_arch"] = list(value["net_arch"])
-        elif isinstance(value, bool | np.integer) and name in ("verbose", "seed", "stats_window_size"):
-            plain[name] = int(value)
-        else:
-            plain[name] = value
-    return plain
 
 
 @th.no_grad()

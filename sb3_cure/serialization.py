@@ -346,9 +346,10 @@ def sentences(name: str, smaller: str) -> Iterator[None]:
         yield
     except ArchiveError:
         raise
-    except MemoryError as error:
-        raise ArchiveError(f"{name} needs more memory than there is ({one_line(error)}): {smaller}.") from error
     except Exception as error:
+        lack = error if isinstance(error, MemoryError) else error.__cause__
+        if isinstance(lack, MemoryError):
+            raise ArchiveError(f"{name} needs more memory than there is ({one_line(lack)}): {smaller}.") from error
         # What is no ValueError was not written to be read alone.
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise ArchiveError(f"{name} cannot be loaded: {kind}{one_line(error, 1000)}.") from error

@@ -6,7 +6,7 @@ Classes are looked up by name in a fixed table; nothing that a file names is imp
 import math
 import pathlib
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -300,6 +300,22 @@ _READERS: dict[str, Callable[..., Any]] = {
 
 
 # --------------------------------------------------------------- schema
+
+
+def plain_arguments(arguments: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param arguments: Of ``CuReSAC``
+    :return: The same as SB3 takes them and archives hold them; of dictionaries copies, as SB3 writes into one
+    """
+    plain = dict(arguments)
+    for name, value in arguments.items():
+        if isinstance(value, Mapping) and name.endswith("_kwargs"):
+            plain[name] = dict(value)
+            if isinstance(value.get("net_arch"), tuple):
+                plain[name]["net_arch"] = list(value["net_arch"])
+        elif isinstance(value, bool | np.integer) and name in ("verbose", "seed", "stats_window_size"):
+            plain[name] = int(value)
+    return plain
 
 
 def _is_integer(value: Any) -> bool:

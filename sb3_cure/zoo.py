@@ -25,6 +25,7 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 
 try:
@@ -99,7 +100,11 @@ class ActingCuReSAC(CuReSAC):
         :raises SettingsError: if it cannot be loaded
         """
         # rl-zoo3 asks for a buffer of 1 too, but only for the off-policy algorithms that it knows by name.
-        objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects}
+        no_buffer: dict[str, Any] = {
+            "replay_buffer_class": None,
+            "replay_buffer_kwargs": {},
+        }  # not even a class of the user's
+        objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects, **no_buffer}
         kwargs.update(custom_objects=objects, buffer_size=1)
         try:
             model = super().load(*args, **kwargs)
@@ -130,6 +135,13 @@ class ActingCuReSAC(CuReSAC):
                 f"the model was trained with the observations {self.observation_space}, but the environment has others "
                 f"({given}): correct --env-kwargs (images: the same image_size, grayscale, frame_stack)."
             ) from error
+
+
+class _Steps(BaseCallback):
+    """Counts the steps of one call of ``learn``."""
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class ExperimentManager(exp_manager.ExperimentManager):
@@ -170,7 +182,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
 
     def _remove_run(self) -> None:
         """Remove the folder of a run that cannot begin, unless it was there before."""
-        if self._fresh[:1] != [Path(self.save_path)]:
+        if self._fresh[:1] != [Path(self.save_path)] or any(Path(self.save_path).rglob("*.zip")):
             return
         shutil.rmtree(self.save_path, ignore_errors=True)
         for folder in self._fresh[1:]:
@@ -195,11 +207,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
     def learn(self, model: Any) -> None:
         if self.log_interval == 0:  # the constructor's own default, by which SB3 divides
             self.log_interval = -1
-        before = model.num_timesteps
+        self.callbacks.append(steps := _Steps())
         try:
             super().learn(model)
         except (gym.error.DependencyNotInstalled, ValueError, OSError) as error:
-            if model.num_timesteps > before + model.n_envs:
+            if steps.n_calls > 1:
                 raise
             self._remove_run()  # nothing was trained: a callback refuses, say, or a window, which the first reset opens
             if isinstance(error, gym.error.DependencyNotInstalled | SettingsError) or not _is_about_input(error):
@@ -294,7 +306,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if not isinstance(entries, dict):
             raise SettingsError(f"{path} holds {entries!r}, but it must map environments to settings: correct it.")
         task = self.env_name.gym_id
-        name = entry_for(task, entries)
+        with_module = (f"{module}:{task}" for module in self.args.gym_packages)
+        name = next((name for name in with_module if name in entries), entry_for(task, entries))
         if name in (None, "default") and self._is_atari and "atari" in entries:
             name = "atari"  # as rl-zoo3's own files have it
         if name is None:
@@ -664,12 +677,13 @@ def _import_environment(given: argparse.Namespace, acts: bool) -> None:
     ]:
         try:
             importlib.import_module(name)
-        except ImportError as error:
+        except (ImportError, TypeError, ValueError) as error:  # TypeError: of a relative name
             raise SettingsError(
                 f"{flag} names the module {name!r}, which cannot be imported ({_one_line(error)}): name one of the "
                 "working directory or an installed one."
             ) from error
     given.env = type(given.env)(task)
+    given.gym_packages = [*given.gym_packages, *([module] if module else [])]  # with which the run is saved
     if acts and task not in gym.registry:  # `train` says so itself
         raise SettingsError(
             f"--env is {task!r}, which is not registered with Gymnasium: correct it, or name the module that registers "

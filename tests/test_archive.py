@@ -196,7 +196,26 @@ def test_whatever_can_be_trained_can_be_loaded(kwargs: dict[str, Any]) -> None:
     model.save(file)
     loaded = CuReSAC.load(file, env=VectorBox())
     assert differences(state_of(model), state_of(loaded)) == []
+    if not {"policy_kwargs", "srl"} & kwargs.keys():  # of which others cannot be given
+        for given in (dict(kwargs), dict(custom_objects=kwargs)):
+            CuReSAC.load(file, **given).save(again := io.BytesIO())
+            CuReSAC.load(again)
     assert loaded.learn(1e1, reset_num_timesteps=False).num_timesteps == 24
+
+
+def test_a_model_for_which_memory_is_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its replay buffer is what can be smaller here."""
+
+    def allocate(*args: Any, **kwargs: Any) -> None:
+        raise MemoryError("Unable to allocate 68.7 GiB")
+
+    file = io.BytesIO()
+    tiny_model("MlpPolicy", VectorBox()).save(file)
+    monkeypatch.setattr(ReplayBuffer, "__init__", allocate)
+    with pytest.raises(
+        ArchiveError, match=r"needs more memory than there is \(Unable to allocate 68.7 GiB\): load it with "
+    ):
+        CuReSAC.load(file, env=VectorBox())
 
 
 def test_files_of_before_are_read() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -445,6 +446,10 @@ COMMANDS: dict[str, str] = {
     "experiment grid.yml --checkpoint-minutes nan": (
         "sb3-cure experiment: error: --checkpoint-minutes is nan, but it must be a number of at least 0: change it."
     ),
+    "train --env .cameras:No-v0 --conf-file settings.yml": (
+        "sb3-cure train: --env names the module '.cameras', which cannot be imported (the 'package' argument is "
+        "required to perform a relative import for '.cameras'): name one of the working directory or an installed one."
+    ),
     "experiment grid.yml --out grid.yml": (
         "sb3-cure experiment: error: --out is grid.yml, which is a file: give a folder."
     ),
@@ -479,6 +484,27 @@ def test_what_is_refused_by_the_first_step_leaves_no_run(capsys: pytest.CaptureF
     said = refusal(TRAIN, capsys)
     assert said.startswith("sb3-cure train: checkpoints holds checkpoints of another training")
     assert said.endswith("(settings: settings.yml).")
+
+
+class Breaks(PixelBox):
+    """Its camera does, at the 30th step."""
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        self.seen = getattr(self, "seen", 0) + 1
+        if self.seen > 30:
+            raise ValueError("the camera is broken")
+        return super().observe(first)
+
+
+@pytest.mark.filterwarnings("ignore:.*Monitor.*:UserWarning")
+def test_a_run_that_breaks_later_keeps_its_checkpoints(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one that goes on with a model that has seen more steps than it makes."""
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    assert cli.main([*TRAIN.split(), "-n", "60"]) == 0
+    monkeypatch.setitem(gym.registry, TASK, EnvSpec(TASK, Breaks))
+    with pytest.raises(ValueError, match="the camera is broken"):
+        cli.main([*TRAIN.split(), "-n", "60", "-i", f"{RUN}_1/tests-PixelBox-v0.zip", "--save-freq", "10"])
+    assert Path(f"{RUN}_2/rl_model_10_steps.zip").is_file()
 
 
 def test_a_study_without_a_trial_that_was_finished(

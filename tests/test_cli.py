@@ -161,6 +161,7 @@ def test_train_enjoy_record(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
 CAMERA = """
 import gymnasium as gym
 from envs_for_tests import PixelBox
+from stable_baselines3.common.buffers import ReplayBuffer
 
 class Camera(PixelBox):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -173,6 +174,9 @@ class Camera(PixelBox):
         return self.frames[-1].transpose(1, 2, 0)
 
 gym.register("Camera-v0", Camera)
+
+class Buffer(ReplayBuffer):
+    pass
 """
 
 
@@ -181,17 +185,23 @@ def test_an_environment_of_ones_own(folder: Path) -> None:
     latest run that has a model, which `optimize` leaves none in."""
     (folder / "camera_of_mine.py").write_text(CAMERA)
     settings = {key: value for key, value in SETTINGS["default"].items() if key != "env_kwargs"}
-    (folder / "tiny.yml").write_text(yaml.safe_dump({"Camera-v0": settings}))
+    settings["replay_buffer_class"] = "camera_of_mine.Buffer"
     own = {"PYTHONPATH": str(Path(__file__).parent)}
     by_flag, by_name = ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"], ["--env", "camera_of_mine:Camera-v0"]
+    entries = {True: "Camera-v0", False: "camera_of_mine:Camera-v0"}
     for flags, program in itertools.product((by_flag, by_name), ("train", "optimize", "enjoy", "record")):
         rest = ["-n", "20", "--no-render"]
         if program in ("train", "optimize"):
+            (folder / "tiny.yml").write_text(yaml.safe_dump({entries[flags is by_flag]: settings}))
             rest = ["--conf-file", "tiny.yml", "--n-trials", "1", "--n-evaluations", "1"]
         output = finish(start([script(), program, *flags, *rest], **own))
         if program in ("enjoy", "record"):
             assert f"Loading latest experiment, id={1 if flags is by_flag else 3}" in output
-    (video,) = folder.glob("logs/cure_sac/Camera-v0_3/videos/*.mp4")
+    runs = folder / "logs" / "cure_sac"
+    for number in (1, 3):  # so that each can be run again from what it has kept
+        kept = yaml.unsafe_load((runs / f"Camera-v0_{number}" / "Camera-v0" / "args.yml").read_text())
+        assert (kept["env"], kept["gym_packages"]) == ("Camera-v0", ["camera_of_mine"])
+    (video,) = runs.glob("Camera-v0_3/videos/*.mp4")
     assert video.stat().st_size > 1000
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
+from sb3_cure.buffer_files import can_be_kept
 from sb3_cure.checks import check_arguments, check_parts
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
@@ -26,6 +27,8 @@ _GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "m
 _METHOD_KEYS = {"config", "overrides", "pretrain", "train", "baseline"}
 # Of a zoo entry: what is no argument of CuReSAC. `n_timesteps` is rl-zoo's; here the grid's budget says how long.
 _ENTRY_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
+# What a string with a dot names: a class of one's own.
+_CLASSES = ("srl", "replay_buffer_class")
 _ARGUMENTS = (arguments_of(CuReSAC) or set()) - {"env", "seed", "_init_setup_model"}
 
 
@@ -82,16 +85,17 @@ class Cell:
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
 
     def build_arguments(self) -> dict[str, Any]:
-        """A copy of ``arguments``, as SB3 writes into some, with the class of a head that is named like a module's."""
+        """A copy of ``arguments``, as SB3 writes into some, with the classes that are named by their modules."""
         arguments = copy.deepcopy(self.arguments)
-        if "." in str(arguments.get("srl")):
-            arguments["srl"] = pkgutil.resolve_name(arguments["srl"])
+        for name in _CLASSES:
+            if "." in str(arguments.get(name)):
+                arguments[name] = pkgutil.resolve_name(arguments[name])
         return arguments
 
     def custom_objects(self) -> dict[str, Any]:
-        """What ``CuReSAC.load`` needs besides the archive: a head that is named like a module's."""
+        """What ``CuReSAC.load`` needs besides the archive: classes that are named by their modules."""
         arguments = self.build_arguments()
-        return {"srl": arguments["srl"]} if "srl" in arguments else {}
+        return {name: arguments[name] for name in _CLASSES if name in arguments}
 
     def is_done(self, results: Path) -> bool:
         """
@@ -269,6 +273,12 @@ def check_arms(cells: Iterable[Cell]) -> None:
                 if not model.is_plain_sac:
                     model._choose_replay_buffer()
                 check_parts(model)
+                buffer = model.replay_buffer_class
+                if buffer is not None and not can_be_kept(buffer):
+                    raise ValueError(
+                        f"replay_buffer_class is {buffer.__name__}, which checkpoints of cells cannot hold without "
+                        "pickle: leave it out, or name FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
+                    )
             except GLUnavailableError:  # with Ray other machines may have what this one has not
                 return
             except GridError:
@@ -313,12 +323,14 @@ def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[st
             raise GridError(
                 f"{key} in {config_path} is {value!r}, but grids evaluate no strings: write a YAML mapping."
             )
-    if "." in str(arguments.get("srl")):
+    for key in _CLASSES:
+        if "." not in str(arguments.get(key)):
+            continue
         try:
-            pkgutil.resolve_name(arguments["srl"])
+            pkgutil.resolve_name(arguments[key])
         except (ImportError, AttributeError, ValueError) as error:
             raise GridError(
-                f"srl of {where} is {arguments['srl']!r}, which cannot be imported ({error}): name a class as "
+                f"{key} of {where} is {arguments[key]!r}, which cannot be imported ({error}): name a class as "
                 "module.Class, in a module of the working directory or an installed one."
             ) from None
     pretrain = None
@@ -410,7 +422,7 @@ def _tasks(value: Any, path: Path) -> dict[str, str]:
         if module:
             try:
                 importlib.import_module(module)
-            except ImportError as error:
+            except (ImportError, TypeError, ValueError) as error:  # TypeError: of a relative name
                 raise GridError(
                     f"task {task!r} in {path} names the module {module!r}, which cannot be imported ({error}): name "
                     "one of the working directory or an installed one."
