@@ -306,7 +306,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if not isinstance(entries, dict):
             raise SettingsError(f"{path} holds {entries!r}, but it must map environments to settings: correct it.")
         task = self.env_name.gym_id
-        with_module = (f"{module}:{task}" for module in self.args.gym_packages)
+        with_module = (f"{module}:{task}" for module in getattr(self.args, "gym_packages", ()))
         name = next((name for name in with_module if name in entries), entry_for(task, entries))
         if name in (None, "default") and self._is_atari and "atari" in entries:
             name = "atari"  # as rl-zoo3's own files have it

@@ -751,7 +751,7 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
         {"tasks": ["dmc_pixels/cartpole-swing-v0"]},
         "sb3-cure experiment: error: task 'dmc_pixels/cartpole-swing-v0' in grid.yml is not "
         "registered with Gymnasium: correct it (sb3_cure registers "
-        "dmc_pixels/<domain>-<task>-v0).",
+        "dmc_pixels/<domain>-<task>-v0; one of your own is my_module:My-v0, with the module that registers it).",
     ),
     "a list of methods": (
         {"methods": ["a"]},

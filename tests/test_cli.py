@@ -1,6 +1,5 @@
 """The command line: training, replaying, filming and tuning from a YAML file, and the doctor."""
 
-import itertools
 import os
 import subprocess
 import sys
@@ -189,19 +188,21 @@ def test_an_environment_of_ones_own(folder: Path) -> None:
     own = {"PYTHONPATH": str(Path(__file__).parent)}
     by_flag, by_name = ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"], ["--env", "camera_of_mine:Camera-v0"]
     entries = {True: "Camera-v0", False: "camera_of_mine:Camera-v0"}
-    for flags, program in itertools.product((by_flag, by_name), ("train", "optimize", "enjoy", "record")):
+    programs = [(by_flag, "train"), (by_flag, "record")]
+    programs += [(by_name, program) for program in ("train", "optimize", "enjoy", "record")]
+    for flags, program in programs:
         rest = ["-n", "20", "--no-render"]
         if program in ("train", "optimize"):
             (folder / "tiny.yml").write_text(yaml.safe_dump({entries[flags is by_flag]: settings}))
             rest = ["--conf-file", "tiny.yml", "--n-trials", "1", "--n-evaluations", "1"]
         output = finish(start([script(), program, *flags, *rest], **own))
         if program in ("enjoy", "record"):
-            assert f"Loading latest experiment, id={1 if flags is by_flag else 3}" in output
+            assert f"Loading latest experiment, id={1 if flags is by_flag else 2}" in output
     runs = folder / "logs" / "cure_sac"
-    for number in (1, 3):  # so that each can be run again from what it has kept
+    for number in (1, 2):  # so that each can be run again from what it has kept
         kept = yaml.unsafe_load((runs / f"Camera-v0_{number}" / "Camera-v0" / "args.yml").read_text())
         assert (kept["env"], kept["gym_packages"]) == ("Camera-v0", ["camera_of_mine"])
-    (video,) = runs.glob("Camera-v0_3/videos/*.mp4")
+    (video,) = runs.glob("Camera-v0_2/videos/*.mp4")
     assert video.stat().st_size > 1000
 
 

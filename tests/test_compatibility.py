@@ -244,7 +244,7 @@ def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
 def test_dictionaries_with_extras_are_refused(kwargs: dict[str, Any], buffer: Any) -> None:
     """At once, whatever the replay buffer: nothing is half done."""
     with pytest.raises(
-        ValueError, match=r"observations are Dict\(.*shared encoder reads one image or one vector: pick"
+        ValueError, match=r"observations are Dict\(.*shared encoder reads one image or one vector: keep"
     ):
         CuReSAC("MultiInputPolicy", Goal(), replay_buffer_class=buffer, **kwargs)
 

@@ -440,28 +440,22 @@ gym.register("tests/Camera-v0", lambda **kwargs: PixelBox(channels_last=True, **
 class Buffer(FrameStackReplayBuffer):
     pass
 """
-FRAME_STACK_BUFFER = "sb3_cure.buffers.FrameStackReplayBuffer"
 
 
-@pytest.mark.parametrize("kind", ["curves", "visitation"])
-def test_an_environment_of_ones_own_is_named_with_its_module(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its images have the channels last, and its frames lie on disk."""
+def test_an_environment_of_ones_own_is_named_with_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its images have the channels last, and its frames lie on disk; common heads load what it has trained."""
     (tmp_path / "camera_of_a_grid.py").write_text(CAMERA)
     (tmp_path / "frames").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
-    overrides: dict[str, Any] = {"replay_buffer_kwargs": {"frames_dir": str(tmp_path / "frames")}}
-    if kind == "visitation":  # whose common heads load the models
-        overrides["replay_buffer_class"] = FRAME_STACK_BUFFER
-        overrides["replay_buffer_kwargs"]["frame_stack"] = 2
+    on_disk = {"frames_dir": str(tmp_path / "frames"), "frame_stack": 2}
+    overrides = {"replay_buffer_class": "sb3_cure.buffers.FrameStackReplayBuffer", "replay_buffer_kwargs": on_disk}
     methods = {"cure": {"config": "zoo.yml", "overrides": overrides}}
-    path = write_grid(tmp_path, kind=kind, tasks=["camera_of_a_grid:tests/Camera-v0"], methods=methods, seeds=2)
+    task = "camera_of_a_grid:tests/Camera-v0"
+    path = write_grid(tmp_path, kind="visitation", tasks=[task], methods=methods, seeds=2)
     grid = load_grid(path)
     (tmp_path / "zoo.yml").write_text(yaml.safe_dump({"tests/Camera-v0": TINY}))  # by its id alone
     assert load_grid(path) == grid
     others = {"cure": {"config": "zoo.yml", "overrides": {"replay_buffer_class": "camera_of_a_grid.Buffer"}}}
-    task = "camera_of_a_grid:tests/Camera-v0"
     with pytest.raises(GridError, match="replay_buffer_class is Buffer, which checkpoints of cells cannot hold"):
         run.check_grid(load_grid(write_grid(tmp_path, tasks=[task], methods=others)), tmp_path / "out")
     try:
