@@ -1,6 +1,7 @@
 """What a value must be, and names that were misspelt: the checks that are the same wherever a user types."""
 
 import difflib
+import importlib
 import inspect
 import os
 from collections.abc import Collection, Iterable, Mapping
@@ -84,6 +85,22 @@ def arguments_of(function: Any) -> set[str] | None:
         if not str(constructor.__module__).startswith(("sb3_cure.", "stable_baselines3.")):
             return None
     return None
+
+
+def import_environments(module: str, where: str) -> None:
+    """Import a module that registers environments with Gymnasium.
+
+    :param module: Its name
+    :param where: Where the user gave it
+    :raises ValueError: if it cannot be imported
+    """
+    try:
+        importlib.import_module(module)
+    except (ImportError, TypeError, ValueError) as error:  # TypeError: of a relative name
+        raise ValueError(
+            f"{where} names the module {module!r}, which cannot be imported ({' '.join(str(error).split())}): name one "
+            "of the working directory or an installed one."
+        ) from error
 
 
 def check_folder(name: str, folder: Any) -> None:

@@ -44,7 +44,15 @@ from sb3_cure.allocator import tune_allocator
 from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
-from sb3_cure.values import arguments_of, check_folder, check_keywords, entry_for, is_integer, is_number
+from sb3_cure.values import (
+    arguments_of,
+    check_folder,
+    check_keywords,
+    entry_for,
+    import_environments,
+    is_integer,
+    is_number,
+)
 
 ALGO = "cure_sac"
 PROGRAMS = ("train", "enjoy", "record", "optimize")
@@ -675,13 +683,8 @@ def _import_environment(given: argparse.Namespace, acts: bool) -> None:
         *((name, "--gym-packages") for name in given.gym_packages),
         *([(module, "--env")] if module else []),
     ]:
-        try:
-            importlib.import_module(name)
-        except (ImportError, TypeError, ValueError) as error:  # TypeError: of a relative name
-            raise SettingsError(
-                f"{flag} names the module {name!r}, which cannot be imported ({_one_line(error)}): name one of the "
-                "working directory or an installed one."
-            ) from error
+        with _refusing():
+            import_environments(name, flag)
     given.env = type(given.env)(task)
     given.gym_packages = [*given.gym_packages, *([module] if module else [])]  # with which the run is saved
     if acts and task not in gym.registry:  # `train` says so itself

@@ -1,7 +1,6 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
-import importlib
 import math
 import pkgutil
 import re
@@ -17,7 +16,7 @@ from sb3_cure.buffer_files import can_be_kept
 from sb3_cure.checks import check_arguments, check_parts
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
-from sb3_cure.values import arguments_of, entry_for, is_integer
+from sb3_cure.values import arguments_of, entry_for, import_environments, is_integer
 
 #: The file that tells that a cell is finished
 DONE = "DONE"
@@ -421,12 +420,9 @@ def _tasks(value: Any, path: Path) -> dict[str, str]:
         module, _, name = task.rpartition(":") if isinstance(task, str) else ("", "", task)
         if module:
             try:
-                importlib.import_module(module)
-            except (ImportError, TypeError, ValueError) as error:  # TypeError: of a relative name
-                raise GridError(
-                    f"task {task!r} in {path} names the module {module!r}, which cannot be imported ({error}): name "
-                    "one of the working directory or an installed one."
-                ) from error
+                import_environments(module, f"task {task!r} in {path}")
+            except ValueError as error:
+                raise GridError(str(error)) from error
         if not isinstance(name, str) or name not in gym.registry:
             raise GridError(
                 f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
