@@ -278,26 +278,21 @@ def load_model(
         with contextlib.nullcontext() if trusted else Allowance(archive.tensors, archive.name):
             model._setup_model()
         unknown = sorted(key for key in later if key not in vars(model) and not trusted)
-        # What a callback, say, has noted at a model of this class. Nothing of the class is covered by it.
-        noted = {key for key in unknown if not hasattr(cls, key)} if _is_saved_by(archive, cls) else set()
-        vars(model).update({key: settings[key] for key in noted})
-        unknown = [key for key in unknown if key not in noted]
-        if unknown:
-            raise ArchiveError(
-                f"{archive.name} has the setting {unknown[0]!r:.50}, which {cls.__name__} does not have: load it with "
-                "the class that saved it, or with trusted=True if you know where it comes from."
-            )
+        is_heir = archive.saved_by in map(_name_of, cls.__mro__)
+        for key in unknown:
+            # A callback, say, may have noted it at a model of this class, none of whose own names it may cover.
+            if not is_heir or hasattr(cls, key):
+                raise ArchiveError(
+                    f"{archive.name} has the setting {key!r:.50}, which {cls.__name__} does not have: load it with "
+                    "the class that saved it, or with trusted=True if you know where it comes from."
+                )
+            setattr(model, key, settings[key])
         check_parameters(model, archive.params, archive.name)
         model.set_parameters(archive.params, exact_match=True, device=device)
         _set_variables(model, archive)
         if model.use_sde:
             model.policy.reset_noise()  # type: ignore[operator]
     return model
-
-
-def _is_saved_by(archive: ModelArchive, cls: type) -> bool:
-    """Whether by the class, or one that it extends."""
-    return archive.saved_by in map(_name_of, cls.__mro__)
 
 
 def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -366,9 +366,11 @@ class ReconstructionCallback(_PictureCallback):
                 f"{type(self.model.policy).__name__}, but it draws images of uint8 from an encoder's latents: use it "
                 "with 'CnnPolicy', where observations are such images."
             )
-        if self.observations is not None and self.observations.ndim == 4:
+        if self.observations is None:
+            return
+        if self.observations.ndim == 4:
             self.observations = maybe_transpose(self.observations, space)
-        if self.observations is not None and self.observations.shape[1:] != space.shape:
+        if self.observations.shape[1:] != space.shape:
             raise ValueError(
                 f"ReconstructionCallback got observations of shape {self.observations.shape}, but the model learns "
                 f"from {space.shape}: give them as [n, *{space.shape}]."

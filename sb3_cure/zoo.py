@@ -96,8 +96,6 @@ class ActingCuReSAC(CuReSAC):
 
     #: What models hold no more of than a placeholder: the head that ``--srl`` names
     objects: ClassVar[dict[str, Any]] = {}
-    #: What ``--gym-packages`` names, for `record`, which has no such flag in rl-zoo3
-    gym_packages: ClassVar[list[str]] = []
 
     @classmethod
     def load(cls, *args: Any, **kwargs: Any) -> "ActingCuReSAC":
@@ -108,11 +106,9 @@ class ActingCuReSAC(CuReSAC):
         :raises SettingsError: if it cannot be loaded
         """
         # rl-zoo3 asks for a buffer of 1 too, but only for the off-policy algorithms that it knows by name.
-        no_buffer: dict[str, Any] = {
-            "replay_buffer_class": None,
-            "replay_buffer_kwargs": {},
-        }  # not even a class of the user's
-        objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects, **no_buffer}
+        # Its class may be one of the user's, which archives do not hold.
+        objects = {**(kwargs.pop("custom_objects", None) or {}), **cls.objects}
+        objects.update(replay_buffer_class=None, replay_buffer_kwargs={})
         kwargs.update(custom_objects=objects, buffer_size=1)
         try:
             model = super().load(*args, **kwargs)
@@ -182,9 +178,13 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 self._open_storage(self.storage)
             return super().setup_experiment()
         except Exception as error:
-            self._remove_run()
-            if isinstance(error, SettingsError) or not _is_about_input(error):
-                raise
+            self._refuse(error)
+            raise
+
+    def _refuse(self, error: Exception) -> None:
+        """The run cannot begin: it is removed, and what the settings are to blame for is explained."""
+        self._remove_run()
+        if not isinstance(error, SettingsError) and _is_about_input(error):
             sentence = _explained(error)
             raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
 
@@ -218,14 +218,14 @@ class ExperimentManager(exp_manager.ExperimentManager):
         self.callbacks.append(steps := _Steps())
         try:
             super().learn(model)
-        except (gym.error.DependencyNotInstalled, ValueError, OSError) as error:
-            if steps.n_calls > 1:
-                raise
-            self._remove_run()  # nothing was trained: a callback refuses, say, or a window, which the first reset opens
-            if isinstance(error, gym.error.DependencyNotInstalled | SettingsError) or not _is_about_input(error):
-                raise
-            sentence = _explained(error)
-            raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
+        except gym.error.DependencyNotInstalled:  # as for a window, which is opened by the first reset
+            if steps.n_calls <= 1:
+                self._remove_run()
+            raise
+        except (ValueError, OSError) as error:  # as of a callback, when training begins
+            if steps.n_calls <= 1:
+                self._refuse(error)
+            raise
 
     def _open_storage(self, storage: str) -> None:
         journal = Path(storage) if storage.endswith(".log") else None
@@ -639,8 +639,6 @@ def _parse_flags(
     # Its own --env is CartPole-v1, which suits its own algorithms.
     with mock.patch.object(StoreDict, "__call__", _store_each):
         given = _parse_args(parser, args, argparse.Namespace(env=None))
-    if not hasattr(given, "gym_packages"):  # `record` has no such flag
-        given.gym_packages = ActingCuReSAC.gym_packages
     flags = vars(given)
     if given.env is None:
         if given.algo == ALGO:
@@ -678,15 +676,15 @@ def _parse_flags(
 
 def _import_environment(given: argparse.Namespace, acts: bool) -> None:
     """Import what registers the environment: the modules of ``--gym-packages``, and that of ``--env module:id``."""
+    packages = getattr(given, "gym_packages", [])  # `record` has no such flag
     module, _, task = getattr(given.env, "gym_id", given.env).rpartition(":")
-    for name, flag in [
-        *((name, "--gym-packages") for name in given.gym_packages),
-        *([(module, "--env")] if module else []),
-    ]:
-        with _refusing():
-            import_environments(name, flag)
+    with _refusing():
+        for name in packages:
+            import_environments(name, "--gym-packages")
+        if module:
+            import_environments(module, "--env")
+            given.gym_packages = [*packages, module]  # with which the run is saved
     given.env = type(given.env)(task)
-    given.gym_packages = [*given.gym_packages, *([module] if module else [])]  # with which the run is saved
     if acts and task not in gym.registry:  # `train` says so itself
         raise SettingsError(
             f"--env is {task!r}, which is not registered with Gymnasium: correct it, or name the module that registers "
@@ -728,7 +726,9 @@ def run(program: str, arguments: Sequence[str]) -> None:
         if program == "record":
             parser.add_argument("--gym-packages", nargs="+", default=[])
         own, arguments = parser.parse_known_args(arguments)
-        ActingCuReSAC.gym_packages = vars(own).get("gym_packages", [])
+        for name in getattr(own, "gym_packages", []):
+            with _refusing():
+                import_environments(name, "--gym-packages")
         ActingCuReSAC.objects = {} if own.srl is None else {"srl": _head("--srl", own.srl)}
     register(ActingCuReSAC if acts else CuReSAC)
     # argparse takes the last of repeated flags, so that these are defaults.
