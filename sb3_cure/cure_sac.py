@@ -166,7 +166,8 @@ class CuReSAC(SAC):
         ``"next_observation"``, for which the head gets the batch with the next observations as its observations
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
-    :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000)
+    :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000), or 0
+        where there is no warm-up
     :param actor_update_interval: Updates between two updates of actors and temperatures; when alternating, those of RL
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
@@ -612,7 +613,7 @@ class CuReSAC(SAC):
             warn_of_dark_images(self.observation_space, replay_buffer)
             updates = self.warmup_updates
             if updates is None:
-                updates = 0 if self.srl is None else get_srl_class(self.srl).warmup_updates
+                updates = 0 if self.srl is None or learning_starts == 0 else get_srl_class(self.srl).warmup_updates
             if updates > 0 and self.gradient_steps != 0:
                 if self.verbose >= 1:
                     print(f"{updates} updates on the {self.num_timesteps} agent steps of the random warm-up")

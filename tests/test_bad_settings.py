@@ -799,6 +799,11 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
         "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: batch_size "
         "is '8', but it must be a whole number of at least 1: change batch_size.",
     ),
+    "a policy for other observations": (
+        arm(overrides={"policy": "MlpPolicy"}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: 'MlpPolicy' got "
+        "images of shape (6, 36, 36), but it reads vectors: use 'CnnPolicy'.",
+    ),
     "an unknown head": (
         arm(overrides={"srl": "vae"}),
         "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: srl is "

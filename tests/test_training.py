@@ -138,6 +138,11 @@ def test_burst_after_warmup(
     # Learning begins with the first step after the warm-up of 10, in either run.
     after_warmup = [(step, 1) for step in (11, 12, 13, 14)]
     assert calls == [(11, burst)] * (burst > 0) + after_warmup + after_warmup
+    calls.clear()
+    # Without a warm-up the head wants no burst, which would be one on a single transition.
+    arguments = dict(srl=srl, curiosity=curiosity, warmup_updates=warmup_updates, learning_starts=0)
+    tiny_model("CnnPolicy", PixelBox(), **arguments).learn(2)
+    assert calls == [(1, warmup_updates)] * bool(warmup_updates) + [(1, 1), (2, 1)]
 
 
 @pytest.mark.parametrize("extras", [{}, dict(srl=None, curiosity=None)], ids=["on", "off"])

@@ -13,7 +13,7 @@ import gymnasium as gym
 import yaml
 
 from sb3_cure.buffer_files import can_be_kept
-from sb3_cure.checks import check_arguments, check_parts
+from sb3_cure.checks import check_arguments, check_parts, check_shared_encoder_space
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.values import arguments_of, entry_for, import_environments, is_integer
@@ -270,6 +270,7 @@ def check_arms(cells: Iterable[Cell]) -> None:
                 model = CuReSAC(env=envs[key], _init_setup_model=False, **cell.build_arguments())
                 check_arguments(model)
                 if not model.is_plain_sac:
+                    check_shared_encoder_space(model.observation_space, model.policy_class)
                     model._choose_replay_buffer()
                 check_parts(model)
                 buffer = model.replay_buffer_class
