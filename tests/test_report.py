@@ -150,6 +150,35 @@ def test_headlines_say_on_how_many_seeds_each_of_them_rests(tmp_path: Path) -> N
         made_of = [made_of[0], {"visitation/cure_only/seed0": "late"}]
 
 
+def test_the_overview_comes_first(results: Path) -> None:
+    """What was run, and what it says, before any experiment: in the page with links, in the summary as a table."""
+    summary = (results / "summary.md").read_text()
+    rows = [line.replace("\\", "").split(" | ") for line in summary.split("\n## ")[0].splitlines() if "| " in line][1:]
+    assert [(row[0].strip("| "), row[1]) for row in rows] == [
+        ("curves", "4 of 8"), ("later", "0 of 4"), ("pretraining", "2 of 3"), ("visitation", "3 of 3"),
+    ]  # fmt: skip
+    assert rows[0][2].startswith("cure_sac_ae minus sac_ae: area under the curve 75.0") and rows[1][2].startswith("Not run")
+    assert rows[3][2].endswith("more.) |")
+    page = (results / "report.html").read_text().split("<section>")[0]
+    for index, (name, done, *_) in enumerate(rows):
+        assert f'<a href="#e{index}">{name.strip("| ")}</a></td><td>{done}</td>' in page
+
+
+def test_the_environments_settings_are_told(tmp_path: Path) -> None:
+    """Once where all cells share them, else with their tasks: returns from other pixels do not compare."""
+    write_grid(tmp_path)
+    small = {"image_size": 36, "grayscale": True}
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1), env_kwargs=small)
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, curve(0, 1), env_kwargs={"image_size": 50}, done=False)
+    assert report.main([str(tmp_path)]) == 0
+    told = (tmp_path / "table.md").read_text().replace("\\", "").splitlines()[2]
+    assert told.endswith("; environments: grayscale True, image_size 36")
+    write_cell(tmp_path, "finger-spin", "sac_ae", 0, curve(0, 1))
+    assert report.main([str(tmp_path)]) == 0
+    told = (tmp_path / "table.md").read_text().replace("\\", "").splitlines()[2]
+    assert told.endswith(f"grayscale True, image_size 36 ({TASK}); as registered (finger-spin)")
+
+
 def test_unfinished_cells_enter_nothing(results: Path) -> None:
     for path in (results / "report.html", results / "summary.md"):
         assert "987" not in re.sub(r"data:[^\"]*", "", path.read_text())
@@ -302,8 +331,8 @@ def test_srl_errors_of_both_policies(tmp_path: Path, monkeypatch: pytest.MonkeyP
     # What `write_cell` writes for each policy
     task = {(arm, "task"): pytest.approx(1e-3) for arm in ("sac_ae", "cure_sac_ae")}
     assert means == {**task, ("cure_sac_ae", "curious"): pytest.approx(2e-3)}
-    assert legends[-1] == ["sac_ae", "cure_sac_ae", "task policy", "curious policy"]
-    assert legends[0] == ["sac_ae", "cure_sac_ae"], "returns are the task policy's alone"
+    assert legends[-1] == ["sac_ae (1 seed)", "cure_sac_ae (1 seed)", "task policy", "curious policy"]
+    assert legends[0] == ["sac_ae (1 seed)", "cure_sac_ae (1 seed)"], "returns are the task policy's alone"
     assert "deterministic" in figures["learning_curves"].caption and "deterministic" in figures["srl_error"].caption
 
 

@@ -341,8 +341,15 @@ def _draw_curves(
         if logarithmic:
             axes.set_yscale("log")
         _tidy(axes)
-    arms = dict.fromkeys(arm for lines in curves.values() for arm, _ in lines)
-    handles = {_plain(arm): Line2D([], [], color=colors[arm], linewidth=1.8) for arm in arms}
+    seeds: dict[str, set[int]] = {}
+    for lines in curves.values():
+        for (arm, _), (_, values) in lines.items():
+            seeds.setdefault(arm, set()).add(len(values))
+    labels = {arm: "–".join(map(str, sorted({min(each), max(each)}))) for arm, each in seeds.items()}
+    handles = {
+        f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})": Line2D([], [], color=colors[arm], linewidth=1.8)
+        for arm, n in labels.items()
+    }
     handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
     _legend(figure, handles)
     figure.savefig(path, dpi=150)
@@ -515,7 +522,7 @@ def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
 
 def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
     if handles:
-        columns = min(len(handles), int(figure.get_figwidth() // 1.8))
+        columns = min(len(handles), int(figure.get_figwidth() // 2.4))
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 

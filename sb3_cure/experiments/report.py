@@ -354,7 +354,8 @@ header p { margin: 0; color: #c4ccd6; }
 h2 { font-size: 21px; margin: 44px 0 6px; padding-top: 14px; border-top: 2px solid var(--ink); }
 h1, h2, h3 { overflow-wrap: anywhere; }
 h3 { font-size: 16px; margin: 30px 0 8px; }
-nav ul { display: flex; flex-wrap: wrap; gap: 4px 22px; padding: 0; margin: 0; list-style: none; }
+td.says { max-width: 760px; }
+nav { overflow-x: auto; }
 a { color: var(--accent); }
 .facts, .note, figcaption { color: var(--soft); font-size: 13px; }
 .facts { margin: 0 0 12px; }
@@ -383,7 +384,7 @@ summary { cursor: pointer; font-weight: 600; overflow-wrap: anywhere; }
 pre { background: var(--wash); padding: 10px 14px; font-size: 12px; overflow-x: auto; white-space: pre-wrap; }
 footer { color: var(--soft); font-size: 13px; margin: 50px 0 30px; }
 @media print { header { background: white; color: black; } header p { color: #444; } body { font-size: 11px; }
-  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } nav, video { display: none; } }
+  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } video { display: none; } }
 """
 # Whatever text from a results folder should manage to do, the page loads nothing and runs nothing.
 POLICY = (
@@ -466,12 +467,37 @@ def _facts(experiment: Experiment) -> str:
     every = ""
     if isinstance(evaluation, dict):
         every = f", evaluated every {evaluation.get('every')} of them (episodes: {evaluation.get('episodes')})"
-    done = sum(cell.done for cell in experiment.cells.values())
     return (
         f"{experiment.kind}; {experiment.budget:,} environment steps{every}; {plural(len(experiment.tasks), 'task')}, "
         f"{plural(len(experiment.methods), 'arm')}, seeds {', '.join(map(str, experiment.seeds))}; "
-        f"{done} of {len(experiment.cells)} cells done; baseline {experiment.baseline}"
+        f"{_progress(experiment)} cells done; baseline {experiment.baseline}{_environment(experiment)}"
     )
+
+
+def _progress(experiment: Experiment) -> str:
+    return f"{sum(cell.done for cell in experiment.cells.values())} of {len(experiment.cells)}"
+
+
+def _environment(experiment: Experiment) -> str:
+    """What is asked of the environments beyond their names: it makes returns comparable or not."""
+    tasks: dict[str, dict[str, None]] = {}
+    for cell in experiment.cells.values():
+        if cell.done:
+            kwargs = cell.config.get("env_kwargs") or {}
+            text = ", ".join(f"{key} {value}" for key, value in sorted(kwargs.items())) or "as registered"
+            tasks.setdefault(text, {})[cell.task] = None
+    shown = [text + (f" ({', '.join(names)})" if len(tasks) > 1 else "") for text, names in tasks.items()]
+    return f"; environments: {'; '.join(shown)}" if shown else ""
+
+
+def _overview(sections: Sequence[Section]) -> list[tuple[str, str, str]]:
+    """Of each experiment its name, how many cells are done, and what it says first."""
+    rows = []
+    for section in sections:
+        more = len(section.headlines) - 1
+        says = (section.headlines or ["–"])[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
+        rows.append((section.experiment.name, _progress(section.experiment), says))
+    return rows
 
 
 def render_html(sections: Sequence[Section], comparisons: Table | None, media: str, title: str) -> str:
@@ -482,8 +508,9 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
     :param title: Name of the folder
     :return: The page
     """
-    links = "".join(
-        f'<li><a href="#e{index}">{escape(section.experiment.name)}</a></li>' for index, section in enumerate(sections)
+    rows = "".join(
+        f'<tr><td><a href="#e{index}">{escape(name)}</a></td><td>{done}</td><td class="says">{escape(says)}</td></tr>'
+        for index, (name, done, says) in enumerate(_overview(sections))
     )
     body = []
     for index, section in enumerate(sections):
@@ -497,7 +524,7 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
         ]
         body += [media_html(section.experiment, media), _configs_html(section.experiment), "</section>\n"]
     if comparisons is not None:
-        links += '<li><a href="#published">Beside published returns</a></li>'
+        rows += '<tr><td><a href="#published">Beside published returns</a></td><td></td><td></td></tr>'
         body.append(f'<section id="published">{comparisons.html().replace("h3>", "h2>")}</section>\n')
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     return f"""<!doctype html>
@@ -514,7 +541,7 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
 <header><div><h1>{escape(title)}</h1>
 <p>{plural(len(sections), "experiment")}, sb3_cure {escape(sb3_cure.__version__)}, written {now}</p></div></header>
 <main>
-<nav aria-label="Experiments"><ul>{links}</ul></nav>
+<nav aria-label="Experiments"><table><tr><th>experiment</th><th>cells done</th><th>in short</th></tr>{rows}</table></nav>
 {"".join(body)}<footer>Intervals are 95 %. The arms of an experiment are compared seed by seed.</footer>
 </main>
 </body>
@@ -563,7 +590,9 @@ def write_report(
     table = tables.published_table(comparisons) if comparisons else None
     files: dict[Path, bytes] = {out: render_html(sections, table, media, results.resolve().name).encode()}
     title = markdown_text(results.resolve().name)
-    summary = [f"# {title}\n", *(render_markdown(section, level=2) for section in sections)]
+    overview = ["| experiment | cells done | in short |", "|---|---|---|"]
+    overview += [f"| {' | '.join(map(markdown_text, row))} |" for row in _overview(sections)]
+    summary = [f"# {title}\n", "\n".join(overview) + "\n", *(render_markdown(each, level=2) for each in sections)]
     summary += [table.markdown() + "\n"] if table else []
     files[results / "summary.md"] = "\n".join(summary).encode()
     for section in sections:

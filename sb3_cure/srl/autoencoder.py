@@ -106,7 +106,7 @@ class RAE(SRLHead):
     :param decoder_weight_decay: lambda_theta, applied by the decoder's optimiser
     :param bits: Bits that are left of each pixel's 8
     :param augmentation: ``"none"`` as in SAC-AE and the CuRe paper; ``"shift"``: the encoder sees randomly shifted
-        images, as in DrQ, and the decoder draws the unshifted ones. Learns from far fewer steps
+        images, as in DrQ, and the decoder draws the unshifted ones
     :param pad: Largest shift, pixels
     """
 
