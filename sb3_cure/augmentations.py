@@ -9,7 +9,9 @@ def center_crop(images: th.Tensor, size: int) -> th.Tensor:
     :param images: [B, C, H, W]
     :param size: Side of the square, pixels
     :return: [B, C, size, size]
+    :raises ValueError: if the images are smaller
     """
+    _check_size(images, size)
     top, left = (images.shape[2] - size) // 2, (images.shape[3] - size) // 2
     return images[:, :, top : top + size, left : left + size]
 
@@ -23,7 +25,9 @@ def random_crop(images: th.Tensor, size: int, generator: th.Generator | None = N
     :param size: Side of the square, pixels
     :param generator: Source of the offsets (default: torch's global one)
     :return: [B, C, size, size]
+    :raises ValueError: if the images are smaller
     """
+    _check_size(images, size)
     batch, _, height, width = images.shape
     # Drawn on the CPU: a CUDA draw would not repeat a CPU run, and two short vectors cost nothing to send.
     top = th.randint(height - size + 1, (batch, 1), generator=generator)
@@ -46,6 +50,14 @@ def random_shift(images: th.Tensor, pad: int = 4, generator: th.Generator | None
     rows = (th.arange(height) + down).clamp(0, height - 1)
     columns = (th.arange(width) + right).clamp(0, width - 1)
     return _windows(images, rows, columns)
+
+
+def _check_size(images: th.Tensor, size: int) -> None:
+    if size > min(images.shape[2:]):
+        raise ValueError(
+            f"size is {size}, but the images are {images.shape[2]} x {images.shape[3]} pixels: take smaller crops, or "
+            "larger images."
+        )
 
 
 def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:

@@ -79,7 +79,8 @@ def load_frame_rows(buffer: FrameStackReplayBuffer, rows: dict[str, Any], name: 
     if (rows["buffer_size"], rows["n_envs"]) != (buffer.buffer_size, buffer.n_envs):
         raise ArchiveError(
             f"{name} holds a replay buffer of {rows['buffer_size']} rows for {rows['n_envs']} environments, but this "
-            f"model's has {buffer.buffer_size} for {buffer.n_envs}: load it into a model with the same settings."
+            f"model's has {buffer.buffer_size} for {buffer.n_envs}: give as many environments, and "
+            f"buffer_size={rows['buffer_size'] * rows['n_envs']}."
         )
     expect_keys(rows["rows"], set(buffer._ROW_ARRAYS), name)
     _check_rows(buffer, rows, name)

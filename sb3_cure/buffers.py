@@ -218,8 +218,8 @@ class FrameStackReplayBuffer(_SkipsMarked):
     # What `pos` and the frame counter index: only the used part of these is pickled.
     _ROW_ARRAYS = ("frame_slots", "oldest_frame", "actions", "rewards", "dones", "timeouts", "marked")
 
-    #: How often `reset` has begun the numbers of frames anew
-    n_resets = 0
+    #: Another one for each sequence of frame numbers: `reset` begins them anew, and so does every other buffer
+    frame_numbers: object
     frames: npt.NDArray[np.uint8]  # [frame_capacity, c, height, width]
     frame_slots: npt.NDArray[np.int32]  # [buffer_size, n_envs, 2 (obs, next_obs), frame_stack], positions in `frames`
     oldest_frame: npt.NDArray[np.int64]  # [buffer_size], running number of the oldest frame that the row needs
@@ -308,7 +308,10 @@ class FrameStackReplayBuffer(_SkipsMarked):
             Path(self.frames_dir).mkdir(exist_ok=True)
             with tempfile.TemporaryFile(dir=self.frames_dir) as file:
                 # Reserved, because writing to a mapped file on a full disk kills the process.
-                os.posix_fallocate(file.fileno(), 0, size)
+                if hasattr(os, "posix_fallocate"):  # not on macOS and Windows
+                    os.posix_fallocate(file.fileno(), 0, size)
+                else:
+                    file.truncate(size)
                 return np.memmap(file, dtype=np.uint8, mode="r+", shape=shape)
         except OSError as error:
             raise ValueError(
@@ -324,7 +327,7 @@ class FrameStackReplayBuffer(_SkipsMarked):
     def reset(self) -> None:
         """Forget all transitions."""
         super().reset()
-        self.n_resets += 1
+        self.frame_numbers = object()
         self._n_valid = 0  # rows that can be sampled: the latest ones before `pos`
         self._n_frames = 0  # frames ever stored; frame number i lies at `frames[i % frame_capacity]`
         # Per environment, the running numbers of the frames of its last `next_obs`; -frame_capacity: none yet

@@ -17,13 +17,14 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_cure import diagnostics
 from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
+from sb3_cure.envs.wrappers import check_frame
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
 from sb3_cure.policies import encoder_of
@@ -211,11 +212,15 @@ def _check_seed(user: str, seed: Any) -> None:
 def _check_spaces(user: str, eval_env: gym.Env, model: BaseAlgorithm) -> None:
     """Else the first evaluation would end the training."""
     observations, actions = eval_env.observation_space, eval_env.action_space
+    shape = observations.shape or ()
     # Of images SB3 may have moved the channels to the front.
-    if actions != model.action_space or sorted(observations.shape or ()) != sorted(model.observation_space.shape or ()):
+    moved = (shape[2], *shape[:2]) if len(shape) == 3 else shape
+    if actions != model.action_space or (model.observation_space.shape or ()) not in (shape, moved):
+        stacked = None if model.env is None else unwrap_vec_wrapper(model.env, VecFrameStack)
+        how = f", in sb3_cure.envs.StackFrames(env, {stacked.stacked_obs.n_stack})" if stacked else ""
         raise ValueError(
             f"{user} got an eval_env with observations {observations} and actions {actions}, but the model was made "
-            f"for {model.observation_space} and {model.action_space}: make eval_env as the training environment."
+            f"for {model.observation_space} and {model.action_space}: make eval_env as the training environment{how}."
         )
 
 
@@ -275,6 +280,8 @@ class PolicyVideoCallback(_PictureCallback):
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
         _check_spaces("PolicyVideoCallback", self.eval_env, self.model)
+        self.eval_env.reset(seed=self.seed)
+        check_frame(self.eval_env.render(), self.eval_env)  # rather than when the first video is due
 
     def on_period(self) -> None:
         """Film an episode of each policy."""

@@ -59,7 +59,8 @@ class CheckpointWriter:
     def __init__(self, path: str | Path):
         self.generations = Generations(path)
         self._segments: list[FrameSegment] = []
-        self._n_resets: int | None = None
+        #: Whose frames the segments hold
+        self._frame_numbers: object = None
 
     def continue_from(self, generation: Generation, model: "CuReSAC") -> None:
         """
@@ -67,7 +68,7 @@ class CheckpointWriter:
         :param model: The model
         """
         self._segments = _frame_segments(generation, model.replay_buffer)
-        self._n_resets = getattr(model.replay_buffer, "n_resets", None)
+        self._frame_numbers = getattr(model.replay_buffer, "frame_numbers", None)
 
     def write(self, model: "CuReSAC", keep: int, environments_may_be_gone: bool = False) -> Generation:
         """
@@ -99,13 +100,13 @@ class CheckpointWriter:
 
         generation = self.generations.write(fill, keep)
         self._segments = segments
-        self._n_resets = getattr(model.replay_buffer, "n_resets", None)
+        self._frame_numbers = getattr(model.replay_buffer, "frame_numbers", None)
         return generation
 
     def _write_frames(self, draft: Draft, buffer: FrameStackReplayBuffer) -> list[FrameSegment]:
         """Only those frames that no segment has; segments that the ring has overwritten are left out."""
         oldest = max(buffer._n_frames - buffer.frame_capacity, 0)
-        known = self._segments if self._n_resets == buffer.n_resets else []
+        known = self._segments if self._frame_numbers is buffer.frame_numbers else []
         segments = [segment for segment in known if segment.last > oldest]
         draft.segments += [segment.entry for segment in segments]
         first = max(segments[-1].last if segments else 0, oldest)
@@ -314,12 +315,29 @@ def _can_be_kept(callback: BaseCallback, name: str, value: Any) -> bool:
 
 
 def _take_back(callback: BaseCallback, changed: dict[str, Any]) -> None:
-    """What was saved of a callback, perhaps by a stranger: values of plain attributes that it has, of their types."""
+    """What was saved of a callback, perhaps by a stranger: values of plain attributes that it has, of their kinds."""
     now = _plain_attributes(callback)
+    lost = []
     for name, value in changed.items():
-        same_type = name in now and (type(now[name]) is type(value) or now[name] is None) and is_plain(value)
-        if same_type and not isinstance(value, str):
+        if name not in now or _equal(now[name], value):
+            continue
+        # A text may be a path, to which the callback writes.
+        if not isinstance(value, str) and is_plain(value) and _is_alike(now[name], value):
             setattr(callback, name, value)
+        else:
+            lost.append(name)
+    if lost:
+        warnings.warn(
+            f"resume does not give {type(callback).__name__} its former {', '.join(lost)}: texts are left as they are, "
+            "as they may be paths, and so is what was of another type (but None, and any number for another).",
+            stacklevel=4,
+        )
+
+
+def _is_alike(now: Any, value: Any) -> bool:
+    """Whether a value may take an attribute's place: a number that of any other number."""
+    numbers = bool | int | float | np.number | np.bool_
+    return now is None or type(now) is type(value) or (isinstance(now, numbers) and isinstance(value, numbers))
 
 
 def _equal(one: Any, other: Any) -> bool:
@@ -383,7 +401,7 @@ def _restore(
     writer = CheckpointWriter(generation.folder.parent)
     if not lost and isinstance(model.replay_buffer, FrameStackReplayBuffer):
         writer.continue_from(generation, model)
-    model._run.writers[generation.folder.parent.absolute()] = writer
+    model._run.writers[generation.folder.parent.resolve()] = writer
     *model._run.calls, _ = *model._run.done, _ = [str(call) for call in state["calls"]]
     if state["environments"] is None:
         assert model.env is not None
@@ -643,7 +661,7 @@ class ExactCheckpoint(BaseCallback):
                 "back without pickle: train with a FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
             )
         run = self.model._run
-        writer = run.writers.get(self.path.absolute())
+        writer = run.writers.get(self.path.resolve())
         if writer is None:
             if self.exists(self.path):
                 raise CheckpointError(
@@ -658,7 +676,7 @@ class ExactCheckpoint(BaseCallback):
             raise CheckpointError(
                 f"ExactCheckpoint cannot write to {self.path} ({error.strerror}): choose another path."
             ) from error
-        self._writer = run.writers[self.path.absolute()] = writer
+        self._writer = run.writers[self.path.resolve()] = writer
         run.leaving.enter_context(self._signals_noted())
         # Before any callback hears of the rollout: when it is resumed, all of them do.
         run.before_rollout.append(self._look)

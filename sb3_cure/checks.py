@@ -21,6 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
+from torch.nn.parameter import is_lazy
 
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.policies import CnnPolicy, CuRePolicy, MlpPolicy
@@ -122,7 +123,7 @@ def _check_device(device: Any) -> None:
 def check_action_space(action_space: spaces.Space) -> None:
     """
     :param action_space: Action space of the environment
-    :raises ValueError: if it is no Box with finite bounds
+    :raises ValueError: if it is no Box of real numbers between finite bounds
     """
     if not isinstance(action_space, spaces.Box):
         raise ValueError(
@@ -134,6 +135,20 @@ def check_action_space(action_space: spaces.Space) -> None:
             f"the action space is {action_space}, but SAC needs finite bounds: give it some that suit the environment, "
             "such as gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(-1, 1, "
             f"{action_space.shape}))."
+        )
+    if not np.issubdtype(action_space.dtype, np.floating):
+        raise ValueError(
+            f"the action space is {action_space} of {action_space.dtype}, but SAC's actions are real, which the "
+            "replay buffer would cut off: round in the environment, such as by gymnasium.wrappers.TransformAction(env, "
+            f"lambda action: action.round().astype('{action_space.dtype}'), gymnasium.spaces.Box("
+            f"{action_space.low.min()}, {action_space.high.max()}, {action_space.shape}))."
+        )
+    if (action_space.low >= action_space.high).any():
+        fixed = tuple(int(place) for place in np.argwhere(action_space.low >= action_space.high)[0])
+        raise ValueError(
+            f"action {', '.join(map(str, fixed))} of the action space {action_space} has nothing between its bounds "
+            f"{action_space.low[fixed]} and {action_space.high[fixed]}: leave it out of the action space, and let the "
+            "environment set it."
         )
 
 
@@ -508,7 +523,8 @@ def check_shared_encoder_space(observation_space: spaces.Space, policy_class: ty
         raise ValueError(
             f"images arrive as {observation_space.dtype} in [{observation_space.low.min()}, "  # type: ignore[attr-defined]
             f"{observation_space.high.max()}], but the encoder and the replay buffer take uint8 in [0, 255]: give "  # type: ignore[attr-defined]
-            "the environment's images as they are rendered, and VecNormalize with norm_obs=False."
+            "the environment's images as they are rendered (scaled ones as (255 * image).astype(numpy.uint8)), and "
+            "VecNormalize with norm_obs=False."
         )
     if issubclass(policy_class, MlpPolicy) and image_like:
         raise ValueError(
@@ -532,10 +548,35 @@ def _reads_one_entry(observation_space: spaces.Dict | spaces.Tuple) -> str:
 
 
 def _reads_images(observation_space: spaces.Space) -> str:
+    shape = observation_space.shape or ()
+    remedy = "use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels"
+    if len(shape) == 2 and min(shape) > 1:
+        remedy = f"add the axis of channels with gymnasium.wrappers.ReshapeObservation(env, {(1, *shape)})"
+    elif len(shape) == 4:
+        remedy = "stack single images with sb3_cure.envs.StackFrames or SB3's VecFrameStack instead"
     return (
         f"'CnnPolicy' got observations of shape {observation_space.shape}, but it reads images (channels, height, "
-        "width): use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels."
+        f"width): {remedy}."
     )
+
+
+def check_srl_head(head: nn.Module) -> None:
+    """
+    :param head: An SRL head, as it was made
+    :raises ValueError: if an archive of it could not be loaded again
+    """
+    name = type(head).__name__
+    if any(is_lazy(parameter) for parameter in [*head.parameters(), *head.buffers()]):
+        raise ValueError(
+            f"{name} has layers that take their sizes from the first batch, without which no archive of it can be "
+            "loaded: give the sizes (encoder.features_dim is at hand in __init__)."
+        )
+    extra = [key for key, value in head.state_dict().items() if not isinstance(value, th.Tensor)]
+    if extra:
+        raise ValueError(
+            f"{name} has {extra[0]} in its state_dict(), which is no tensor, but archives hold tensors only: keep it "
+            "in buffers (register_buffer)."
+        )
 
 
 def check_srl_output(head: nn.Module, output: Any, trains: bool) -> None:

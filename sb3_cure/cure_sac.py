@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -41,10 +42,12 @@ from sb3_cure.checks import (
     check_parts,
     check_shared_encoder_space,
     check_srl_error,
+    check_srl_head,
     check_srl_output,
     explaining_memory,
     make_env,
 )
+from sb3_cure.encoders import explaining_extractor
 from sb3_cure.files import PathOrFile
 from sb3_cure.guards import (
     BadTransitionError,
@@ -55,7 +58,7 @@ from sb3_cure.guards import (
     post_mortem_of_a_step,
     warn_of_dark_images,
 )
-from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip
+from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip, told_frame_stack
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
@@ -308,7 +311,8 @@ class CuReSAC(SAC):
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
             check_parts(self)
-            with explaining_memory(self):
+            extractor = self.policy_kwargs.get("features_extractor_class", sb3_policies.NatureCNN)
+            with explaining_memory(self), explaining_extractor(extractor, self.observation_space):
                 super()._setup_model()
             # SB3's update knows no guard: its optimisers look before they step.
             optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
@@ -335,6 +339,8 @@ class CuReSAC(SAC):
             self.policy.compile_networks()
         if self.verbose >= 1:
             print(sentence)
+        if self.policy.srl is not None:
+            check_srl_head(self.policy.srl)
         self.policy.encoder_optimizer.guard = self._guard
         self._setup_temperatures()
 
@@ -366,7 +372,7 @@ class CuReSAC(SAC):
         """Keep each frame once where the environment says that its observations are stacked frames."""
         # Of ``VecFrameStack`` those slide, whatever the environments in it stack.
         stacked = None if self.env is None else unwrap_vec_wrapper(self.env, VecFrameStack)
-        frame_stack = self._env_attribute("frame_stack") if stacked is None else stacked.stacked_obs.n_stack
+        frame_stack = self._told_frame_stack() if stacked is None else stacked.stacked_obs.n_stack
         if self.env is not None and frame_stack is None and "frames_dir" in self.replay_buffer_kwargs:
             if "frame_stack" not in self.replay_buffer_kwargs:
                 raise ValueError(
@@ -378,6 +384,19 @@ class CuReSAC(SAC):
             if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
                 self.replay_buffer_class = FrameStackReplayBuffer
                 self.replay_buffer_kwargs = {"frame_stack": frame_stack, **self.replay_buffer_kwargs}
+
+    def _told_frame_stack(self) -> int | None:
+        if self.env is None:
+            return None
+        told = told_frame_stack(self.env)
+        if told is None and self.env.has_attr("frame_stack"):
+            warnings.warn(
+                f"the environment's frame_stack is {self.env.get_attr('frame_stack')[0]!r}, but observations of shape "
+                f"{self.observation_space.shape} are not of so many frames: it is passed over, and the replay buffer "
+                "keeps whole observations.",
+                stacklevel=2,
+            )
+        return told
 
     def _read_env_attributes(self) -> None:
         """What logging needs to know; again before each ``learn``, as ``set_env`` may have changed it."""
@@ -1118,7 +1137,7 @@ class CuReSAC(SAC):
         save_buffer(self.replay_buffer, path, super().save_replay_buffer)
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
-        """Load a replay buffer, also one from a stranger.
+        """Load a replay buffer, also one from a stranger. Where it is of another size, ``buffer_size`` becomes that.
 
         :param path: Path with or without its suffix ``.pkl``, or a binary file
         :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
@@ -1135,6 +1154,9 @@ class CuReSAC(SAC):
                 f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
                 "is in a file: if you know where it comes from, load it with trusted=True."
             )
+        rows = self.replay_buffer.buffer_size  # type: ignore[union-attr]
+        if rows != max(self.buffer_size // self.n_envs, 1):
+            self.buffer_size = rows * self.n_envs  # with which checkpoints and archives are loaded again
 
     @classmethod
     def resume(

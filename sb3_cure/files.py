@@ -1,6 +1,7 @@
 """Files that are written whole or not at all, whatever happens meanwhile, and SB3's conventions for their names."""
 
 import contextlib
+import errno
 import io
 import os
 import pathlib
@@ -8,9 +9,14 @@ import platform
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import IO, Any, BinaryIO, TypeAlias
 
 from stable_baselines3.common.save_util import open_path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 PathOrFile: TypeAlias = str | pathlib.Path | io.BufferedIOBase
 
@@ -45,6 +51,19 @@ def flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def lock(file: IO[Any], shared: bool = False) -> None:
+    """Lock a file, which the end of the process unlocks, however it ends.
+
+    :param file: The open file
+    :param shared: Whether others may share the lock
+    :raises BlockingIOError: if another process holds it
+    :raises OSError: where there are no locks
+    """
+    if fcntl is None:
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+    fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,6 @@ The manifest has the size and the SHA-256 of every file; a generation is whole i
 """
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import re
@@ -23,7 +22,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from sb3_cure.files import flush_to_disk
+from sb3_cure.files import flush_to_disk, lock
 from sb3_cure.serialization import ArchiveError
 
 #: Bytes that are read or written at once
@@ -146,13 +145,13 @@ class Generations:
         """
         with (self.path / ".lock").open("w") as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file)
             except BlockingIOError:
                 raise CheckpointError(
                     f"another process writes checkpoints to {self.path}: wait for it, or choose another path."
                 ) from None
             except OSError:
-                pass  # a file system without locks
+                pass  # a system without locks
             yield
 
     def write(self, fill: Callable[["Draft"], dict[str, Any]], keep: int) -> Generation:
@@ -177,7 +176,11 @@ class Generations:
                 for path in (manifest, draft.folder, self.segments):
                     flush_to_disk(path)
                 draft.folder.rename(self.folder(number))
-                flush_to_disk(self.path)
+                try:
+                    flush_to_disk(self.path)
+                except BaseException:
+                    self.folder(number).rename(draft.folder)
+                    raise
             except BaseException:
                 background.shutdown(cancel_futures=True)
                 draft.discard()

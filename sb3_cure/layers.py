@@ -69,7 +69,9 @@ def preprocess(observations: th.Tensor, observation_space: spaces.Space) -> th.T
     device = observations.device.type
     dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else th.float32
     # Reordered while still one byte per value; all of 0-255 is exact in bfloat16.
-    return observations.contiguous(memory_format=th.channels_last).to(dtype).div_(255)
+    images = observations.contiguous(memory_format=th.channels_last).to(dtype)
+    # Floats may still be the caller's own.
+    return images / 255 if observations.is_floating_point() else images.div_(255)
 
 
 def full_precision(tensor: th.Tensor) -> th.autocast:

@@ -9,6 +9,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_cure.policies import CuRePolicy
+from sb3_cure.values import is_integer
 
 
 class Metrics(KVWriter):
@@ -105,5 +106,19 @@ def frame_stack_of(env: VecEnv) -> int:
     :return: Frames per observation, as they and SB3's ``VecFrameStack`` around them tell; 1 where nothing tells
     """
     stacked = unwrap_vec_wrapper(env, VecFrameStack)
-    own = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else 1
+    own = told_frame_stack(env) or 1
     return own if stacked is None else own * stacked.stacked_obs.n_stack
+
+
+def told_frame_stack(env: VecEnv) -> int | None:
+    """
+    :param env: Environments, channels first
+    :return: Frames per observation, as the environments tell in ``frame_stack`` (those of this package do) or
+        ``stack_size`` (Gymnasium's ``FrameStackObservation``); None where neither can be meant
+    """
+    for name in ("frame_stack", "stack_size"):
+        told: Any = env.get_attr(name)[0] if env.has_attr(name) else None
+        shape = env.observation_space.shape or ()
+        if is_integer(told, 1) and (len(shape) != 3 or shape[0] % told == 0):
+            return int(told)
+    return None

@@ -37,7 +37,13 @@ class TrunkActor(Actor):
         """
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation before squashing, [B, action_dim] each
+        :raises ValueError: if it is given observations, as SB3's actors are
         """
+        if obs.ndim != 2:  # type: ignore[union-attr]
+            raise ValueError(
+                f"the actor got {obs.ndim} dimensions, but it reads the shared encoder's features: call the policy, or "  # type: ignore[union-attr]
+                "sb3_cure.deployment.DeterministicActor(model) for actions of observations."
+            )
         latent = self.latent_pi(self.features_extractor(obs))
         with full_precision(latent):
             latent = latent.float()
@@ -216,7 +222,9 @@ class CuRePolicy(SACPolicy):
                 th.default_generator.manual_seed(head_seed)
                 self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
             self.srl.bind_target_encoder(self.encoder_target)
-            parameters = list(self.srl.parameters())
+            # A head may hold the encoder as a part of its own: it is the encoder's optimiser that trains it.
+            shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))
+            parameters = [parameter for parameter in self.srl.parameters() if id(parameter) not in shared]
             # A head without parameters (say, one that scores latents) has nothing to optimise.
             self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None
 

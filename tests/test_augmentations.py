@@ -128,3 +128,9 @@ def test_a_generator_repeats_and_leaves_the_global_one_alone(augment) -> None:
     assert not th.equal(first, augment(images, None))
     th.manual_seed(1)
     assert th.equal(first, augment(images, None))
+
+
+@pytest.mark.parametrize("crop", [center_crop, random_crop])
+def test_crops_are_no_larger_than_images(crop) -> None:
+    with pytest.raises(ValueError, match="size is 36, but the images are 40 x 20 pixels"):
+        crop(th.zeros(1, 3, 40, 20), 36)

@@ -420,24 +420,24 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         images(3, 36, 36, dtype=np.float32, high=1),
         {},
         "images arrive as float32 in [0.0, 1.0], but the encoder and the replay buffer take "
-        "uint8 in [0, 255]: give the environment's images as they are rendered, and "
-        "VecNormalize with norm_obs=False.",
+        "uint8 in [0, 255]: give the environment's images as they are rendered (scaled ones as (255 * "
+        "image).astype(numpy.uint8)), and VecNormalize with norm_obs=False.",
     ),
     "floats in [0, 255]": (
         "CnnPolicy",
         images(3, 36, 36, dtype=np.float32),
         {},
         "images arrive as float32 in [0.0, 255.0], but the encoder and the replay buffer "
-        "take uint8 in [0, 255]: give the environment's images as they are rendered, and "
-        "VecNormalize with norm_obs=False.",
+        "take uint8 in [0, 255]: give the environment's images as they are rendered (scaled ones as (255 * "
+        "image).astype(numpy.uint8)), and VecNormalize with norm_obs=False.",
     ),
     "few grey levels": (
         "CnnPolicy",
         images(3, 36, 36, high=7),
         {},
         "images arrive as uint8 in [0, 7], but the encoder and the replay buffer take uint8 "
-        "in [0, 255]: give the environment's images as they are rendered, and VecNormalize "
-        "with norm_obs=False.",
+        "in [0, 255]: give the environment's images as they are rendered (scaled ones as (255 * "
+        "image).astype(numpy.uint8)), and VecNormalize with norm_obs=False.",
     ),
     "VecNormalize of images that are turned outside of it": (
         "CnnPolicy",
@@ -460,8 +460,8 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         lambda: VecNormalize(DummyVecEnv([FakeEnv])),
         {},
         "images arrive as float32 in [-10.0, 10.0], but the encoder and the replay buffer "
-        "take uint8 in [0, 255]: give the environment's images as they are rendered, and "
-        "VecNormalize with norm_obs=False.",
+        "take uint8 in [0, 255]: give the environment's images as they are rendered (scaled ones as (255 * "
+        "image).astype(numpy.uint8)), and VecNormalize with norm_obs=False.",
     ),
     "dictionary": (
         "MultiInputPolicy",
@@ -503,10 +503,24 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "'CnnPolicy' got observations of shape (3,), but it reads images (channels, height, "
         "width): use 'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels.",
     ),
+    "an image without channels": (
+        "CnnPolicy",
+        FakeEnv(spaces.Box(0, 255, (32, 48), np.uint8)),
+        {},
+        "'CnnPolicy' got observations of shape (32, 48), but it reads images (channels, height, width): add the axis "
+        "of channels with gymnasium.wrappers.ReshapeObservation(env, (1, 32, 48)).",
+    ),
+    "a stack of colour images": (
+        "CnnPolicy",
+        FakeEnv(spaces.Box(0, 255, (3, 32, 48, 3), np.uint8)),
+        {},
+        "'CnnPolicy' got observations of shape (3, 32, 48, 3), but it reads images (channels, height, width): stack "
+        "single images with sb3_cure.envs.StackFrames or SB3's VecFrameStack instead.",
+    ),
     "frames that do not divide the channels": (
         "CnnPolicy",
-        FourFrames(spaces.Box(0, 255, (9, 36, 36), np.uint8)),
-        {},
+        FakeEnv(spaces.Box(0, 255, (9, 36, 36), np.uint8)),
+        {"replay_buffer_class": FrameStackReplayBuffer, "replay_buffer_kwargs": {"frame_stack": 4}},
         "observation_space has 9 channels, which frame_stack=4 does not divide: pass the "
         "number of frames that one observation stacks.",
     ),
@@ -549,6 +563,21 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "the action space is Box(0.0, [ 1. inf], (2,), float32), but SAC needs finite "
         "bounds: give it some that suit the environment, such as gymnasium.wrappers.TransformAction(env, "
         "lambda action: action, gymnasium.spaces.Box(-1, 1, (2,))).",
+    ),
+    "actions that are whole numbers": (
+        "CnnPolicy",
+        actions(spaces.Box(0, 5, (2,), np.int64)),
+        {},
+        "the action space is Box(0, 5, (2,), int64) of int64, but SAC's actions are real, which the replay buffer "
+        "would cut off: round in the environment, such as by gymnasium.wrappers.TransformAction(env, lambda action: "
+        "action.round().astype('int64'), gymnasium.spaces.Box(0, 5, (2,))).",
+    ),
+    "an action that is fixed": (
+        "CnnPolicy",
+        actions(spaces.Box(np.array([-1, 2], np.float32), np.array([1, 2], np.float32))),
+        {},
+        "action 1 of the action space Box([-1.  2.], [1. 2.], (2,), float32) has nothing between its bounds 2.0 and "
+        "2.0: leave it out of the action space, and let the environment set it.",
     ),
     # --- policies
     "SB3's policy class": (
@@ -1022,6 +1051,37 @@ def test_the_ways_out_that_sentences_name_work() -> None:
         CuReSAC("CnnPolicy", env)
     bounded = eval(str(error.value).partition("such as ")[2].rstrip("."), {"gymnasium": gym, "env": env})
     assert CuReSAC("CnnPolicy", bounded, buffer_size=10, policy_kwargs=dict(net_arch=[4])).action_space.shape == (2,)
+    env = actions(spaces.Box(0, 5, (2,), np.int64))
+    with pytest.raises(ValueError) as error:
+        CuReSAC("CnnPolicy", env)
+    rounded = eval(str(error.value).partition("such as by ")[2].rstrip("."), {"gymnasium": gym, "env": env})
+    model = CuReSAC("CnnPolicy", rounded, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+    assert (model.action_space.high == 5).all() and rounded.action(np.float32([1.4, 4.6])).tolist() == [1, 5]
+    env = FakeEnv(spaces.Box(0, 255, (32, 48), np.uint8))
+    with pytest.raises(ValueError) as error:
+        CuReSAC("CnnPolicy", env)
+    shaped = eval(str(error.value).partition(" with ")[2].rstrip("."), {"gymnasium": gym, "env": env})
+    CuReSAC("CnnPolicy", shaped, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+
+
+def test_an_environments_own_frame_stack_is_passed_over() -> None:
+    """It may mean something else by that name."""
+    env = FourFrames(spaces.Box(0, 255, (9, 36, 36), np.uint8))
+    with pytest.warns(UserWarning, match=r"frame_stack is 4, but observations of shape \(9, 36, 36\) are not of so"):
+        model = CuReSAC("CnnPolicy", env, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
+    assert not isinstance(model.replay_buffer, FrameStackReplayBuffer)
+
+
+@pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
+def test_images_that_are_too_small_for_sb3s_encoder(policy: str) -> None:
+    """SB3's own SAC says so in one sentence, of which the last way out works."""
+    space = spaces.Box(0, 255, (3, 20, 20), np.uint8)
+    env = FakeEnv(space if policy == "CnnPolicy" else spaces.Dict(camera=space))
+    kwargs: dict[str, Any] = dict(srl=None, curiosity=None, buffer_size=10)
+    with pytest.raises(ValueError, match=r"NatureCNN cannot read .*: use larger images.*share_encoder=True"):
+        CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4]), **kwargs)
+    if policy == "CnnPolicy":
+        CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4], share_encoder=True), **kwargs)
 
 
 @pytest.mark.parametrize("kwargs", [{}, dict(srl=None, curiosity=None)], ids=["CuRe", "SAC"])

@@ -3,6 +3,7 @@
 import sys
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,6 +32,7 @@ from sb3_cure.callbacks import (
     PolicyVideoCallback,
     ReconstructionCallback,
 )
+from sb3_cure.envs import StackFrames
 from sb3_cure.evaluation import Episode, binned_errors, run_episodes
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.video import annotated_frames
@@ -533,6 +535,45 @@ def test_callbacks_that_do_not_fit_the_model_say_so(
     with pytest.raises(ValueError, match=message):
         model.learn(5, callback=make(Filmed(VectorBox()), tmp_path))
     assert model.num_timesteps == 0
+
+
+class Blind(Filmed):
+    def render(self) -> Any:
+        return None
+
+
+def test_an_environment_that_cannot_be_filmed_is_known_before_training(tmp_path: Path) -> None:
+    model = SAC("MlpPolicy", VectorBox())
+    with pytest.raises(ValueError, match=r"gave a NoneType, but frames are uint8.*let its render\(\) return"):
+        model.learn(5, callback=PolicyVideoCallback(Blind(VectorBox()), tmp_path))
+    assert model.num_timesteps == 0
+
+
+def test_images_of_another_format_are_known_before_training() -> None:
+    """Height and width exchanged: the same numbers in another order."""
+
+    class Wide(PixelBox):
+        def __init__(self, shape: tuple[int, int, int]):
+            super().__init__()
+            self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+
+        def observe(self, first: bool = False) -> np.ndarray:
+            return np.zeros(self.observation_space.shape, np.uint8)
+
+    model = tiny_model("CnnPolicy", Wide((6, 36, 48)))
+    with pytest.raises(ValueError, match="make eval_env as the training environment"):
+        model.learn(5, callback=EvalBothCallback(Wide((6, 48, 36))))
+
+
+def test_stacked_by_sb3_watched_in_one_environment() -> None:
+    """As the sentence says that refuses the unstacked one."""
+    single = partial(PixelBox, frame_stack=1, channels_last=True, tells_frame_stack=False)
+    model = tiny_model("CnnPolicy", VecFrameStack(DummyVecEnv([single]), 3))
+    with pytest.raises(ValueError, match=r"as the training environment, in sb3_cure.envs.StackFrames\(env, 3\)."):
+        model.learn(5, callback=EvalBothCallback(single()))
+    evaluation = EvalBothCallback(StackFrames(single(), 3), eval_freq=10, n_episodes=1, seed=0)
+    model.learn(10, callback=evaluation)
+    assert len(evaluation.history) == 1
 
 
 def test_states_and_observations_must_fit(tmp_path: Path) -> None:

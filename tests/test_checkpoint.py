@@ -36,6 +36,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from benchmarks import faults
 from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
+from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
 from sb3_cure.envs import FaultTolerantSubprocVecEnv
@@ -157,7 +158,7 @@ def outcome(model: CuReSAC, folder: Path) -> dict[str, Any]:
     log = [{key: value for key, value in row.items() if key not in clocks} for row in rows]
     return {
         "networks": state_of(model),
-        "buffer": {name: value for name, value in stored.items() if name not in (*ignored, "n_resets")},
+        "buffer": {name: value for name, value in stored.items() if name not in ignored},
         "log": log,
         "counters": (model.num_timesteps, model._n_updates, model._episode_num),
         "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),
@@ -449,6 +450,54 @@ def test_callbacks_go_on_counting(case: str, kill_at: int, tmp_path: Path) -> No
         train(CASES[case], tmp_path / "killed", False, *killed, KillAt(kill_at))
     train(CASES[case], tmp_path / "killed", True, *resumed)
     assert at_end(whole) == at_end(resumed)
+
+
+def test_numbers_of_callbacks_may_change_their_type(tmp_path: Path) -> None:
+    """As counters become floats of NumPy; texts may be paths, and stay as they are, which is said."""
+
+    class Best(BaseCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.best, self.total, self.found, self.where = -np.inf, 0, False, "nowhere"
+
+        def _on_step(self) -> bool:
+            self.best, self.total = np.float32(self.num_timesteps), self.total + 0.5
+            self.found, self.where = np.bool_(True), f"step {self.num_timesteps}"
+            return True
+
+    env = vectors()
+    tiny_model("MlpPolicy", env).learn(20, callback=[ExactCheckpoint(10, tmp_path), Best()])
+    best = Best()
+    with pytest.warns(UserWarning, match="does not give Best its former where: texts are left as they are"):
+        CuReSAC.resume(tmp_path, env).learn(20, callback=[ExactCheckpoint(10, tmp_path), best])
+    assert (float(best.best), best.total, bool(best.found), best.where) == (20, 10.0, True, "nowhere")
+
+
+def test_a_replay_buffer_that_was_loaded_is_the_one_that_checkpoints_hold(tmp_path: Path) -> None:
+    """Its frames, which no former checkpoint has, and its size."""
+    other = tiny_model("CnnPolicy", PixelBox(), seed=5, buffer_size=70).learn(60)
+    other.save_replay_buffer(tmp_path / "other.pkl")
+    model = tiny_model("CnnPolicy", PixelBox(), buffer_size=500)
+    model.learn(40, callback=ExactCheckpoint(20, tmp_path / "kept"))
+    model.load_replay_buffer(tmp_path / "other.pkl")
+    model.learn(20, callback=ExactCheckpoint(20, tmp_path / "kept"), reset_num_timesteps=False)
+    assert model.buffer_size == 70
+    ours, theirs = model.replay_buffer, CuReSAC.resume(tmp_path / "kept", PixelBox()).replay_buffer
+    assert theirs.buffer_size == 70 and theirs._n_frames == ours._n_frames
+    rows = np.arange(theirs.size())
+    for name in ("observations", "next_observations", "rewards"):
+        kept, read = (getattr(transitions(each, rows, 0 * rows), name) for each in (ours, theirs))
+        assert th.equal(kept, read), name
+
+
+def test_one_folder_under_two_names(tmp_path: Path) -> None:
+    """A link, and a path that goes up and down."""
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "kept")
+    env = vectors()
+    tiny_model("MlpPolicy", env).learn(12, callback=ExactCheckpoint(10, tmp_path / "kept"))
+    for name in ("link", "sub/../kept"):
+        CuReSAC.resume(tmp_path / name, env).learn(12, callback=ExactCheckpoint(10, tmp_path / "kept"))
 
 
 class NoState(gym.Wrapper):

@@ -245,6 +245,7 @@ WRAPPERS: dict[str, Callable[[gym.Env], gym.Env]] = {
     "ClipAction": wrappers.ClipAction,
     "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
     "Drift": Drift,
+    "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 4),
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
     "NormalizeObservation": wrappers.NormalizeObservation,
     "NormalizeReward": wrappers.NormalizeReward,

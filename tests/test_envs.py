@@ -1,5 +1,6 @@
 """The environments: what the agent sees, gets and may do, compared with dm_control itself."""
 
+import copy
 import os
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils import env_checker as gym_checker
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 from sb3_cure.envs import (
     DMC_TASKS,
@@ -288,6 +289,19 @@ def test_checkers_of_gymnasium_and_sb3_find_nothing(through_gymnasium):
     env.close()
 
 
+def test_an_environment_that_has_rendered_can_be_copied(make):
+    """For planning, say: both go on alike, each with a camera of its own."""
+    env = make()
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    twin = copy.deepcopy(env)
+    action = env.action_space.sample()
+    for ours, theirs in zip(env.step(action)[:2], twin.step(action)[:2], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    twin.close()
+    assert env.step(action)[0].any()
+
+
 def test_spec_makes_a_copy(make):
     env = make("ball_in_cup", "catch", seed=2, action_repeat=5)
     copy = env.spec.make()
@@ -346,6 +360,51 @@ def test_any_environment_that_renders_can_be_seen_through_pixels():
     sb3_check_env(env)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_that_an_environment_gets_are_of_its_space(dtype):
+    """Many environments assert it: the dtype, and bounds that a rounding error would cross or that are one alone."""
+    low, high = np.array([-0.1, 0, 2, -np.inf, -np.inf], dtype), np.array([0.7, np.inf, np.inf, 3, np.inf], dtype)
+    painting = Painting(action_space=spaces.Box(low, high, dtype=dtype))
+    env = make_pixel_env(painting, image_size=10, frame_stack=1)
+    env.reset()
+    for value, expected in ((-2, [-0.1, 0, 2, 1, -1]), (0, [0.3, 1, 3, 2, 0]), (1, [0.7, 2, 4, 3, 1])):
+        env.step(np.full(5, value, np.float32))
+        assert painting.action_space.contains(painting.action)
+        np.testing.assert_allclose(painting.action, np.array(expected), atol=1e-7)
+
+
+def test_frames_that_are_none_are_described():
+    """What came, and what to do about it, which is not what was done already."""
+
+    class Unfinished(Painting):
+        frame = None
+
+        def render(self):
+            return self.frame
+
+    env = make_pixel_env(Unfinished(), image_size=10)
+    for frame, given in (
+        (None, "a NoneType"),
+        (np.zeros((4, 4, 4), np.uint8), r"uint8 of shape \(4, 4, 4\)"),
+        (np.zeros((4, 4, 3)), "float64"),
+    ):
+        Unfinished.frame = frame
+        with pytest.raises(ValueError, match=f"gave {given}.*: let its render\\(\\) return such frames"):
+            env.reset()
+
+
+def test_images_with_the_channels_last_are_stacked():
+    """As SB3's VecFrameStack does."""
+    env = StackFrames(gym.wrappers.AddRenderObservation(Painting()), 3)
+    height, width, _ = Painting().canvas.shape
+    assert env.observation_space.shape == (height, width, 9)
+    venv = VecFrameStack(DummyVecEnv([lambda: gym.wrappers.AddRenderObservation(Painting())]), 3)
+    venv.reset(), env.reset()
+    for _ in range(3):
+        ours, theirs = env.step(1)[0], venv.step([1])[0][0]
+    np.testing.assert_array_equal(ours, theirs)
+
+
 def test_frames_of_another_size_are_area_averaged():
     env = make_pixel_env(Painting(), image_size=10, frame_stack=1, grayscale=True)
     assert env.action_space == spaces.Discrete(2)
@@ -397,7 +456,7 @@ def test_bad_input_is_answered_in_one_sentence(kwargs, named):
     ("build", "match"),
     [
         (lambda: make_pixel_env(Painting(render_mode=None)), "render_mode=None.*render_mode='rgb_array'"),
-        (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*render_mode='rgb_array'"),
+        (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*make it with 'rgb_array'"),
         (lambda: make_pixel_env(Painting(), action_repeat=-1), "action_repeat=-1"),
         (lambda: ActionRepeat(Painting(), 0), "action_repeat=0"),
         (lambda: NormalizeActions(Painting()), "Discrete"),

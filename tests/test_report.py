@@ -157,8 +157,9 @@ def test_the_overview_comes_first(results: Path) -> None:
     assert [(row[0].strip("| "), row[1]) for row in rows] == [
         ("curves", "4 of 8"), ("later", "0 of 4"), ("pretraining", "2 of 3"), ("visitation", "3 of 3"),
     ]  # fmt: skip
-    assert rows[0][2].startswith("cure_sac_ae minus sac_ae: area under the curve 75.0") and rows[1][2].startswith("Not run")
-    assert rows[3][2].endswith("more.) |")
+    assert rows[0][2].startswith("cure_sac_ae minus sac_ae: area under the curve 75.0")
+    assert rows[1][2].startswith("Not run")
+    assert rows[3][2].startswith("cure_only on cartpole-swingup, 3 seeds: compared to the random policy")
     page = (results / "report.html").read_text().split("<section>")[0]
     for index, (name, done, *_) in enumerate(rows):
         assert f'<a href="#e{index}">{name.strip("| ")}</a></td><td>{done}</td>' in page
@@ -190,7 +191,7 @@ def test_comparison_with_published_numbers(results: Path) -> None:
     suspected, minus = "suspected bug: below 0.75 x published", "\N{MINUS SIGN}"
     expected = ["100,000", "2", "150 ± 71", "SAC-AE 311 ± 11", f"{minus}161", "0.48", suspected]
     assert by_arm["curves", "sac_ae"] == expected
-    assert by_arm["curves", "cure_sac_ae"][-1] == "adds curiosity: not judged"
+    assert by_arm["curves", "cure_sac_ae"][-1] == "adds curiosity, or changes settings: not judged"
     assert by_arm["pretraining", "vanilla"] == ["100,000", "1", "300", "SAC-AE 311 ± 11", f"{minus}11", "0.96", "ok"]
 
 
@@ -290,6 +291,37 @@ def test_names_are_text_only(tmp_path: Path) -> None:
         rows = [line for line in lines if line.startswith(f"| {TASK} | ") and "not reached" in line]
         assert len(rows) == 2
         assert {len(re.findall(r"(?<!\\)\|", line)) for line in [header, *rows]} == {11}
+
+
+def test_names_of_arms_are_no_verdicts(tmp_path: Path) -> None:
+    """However they begin; and one arm alone is compared with nothing."""
+    write_grid(tmp_path, methods={"better_one": {}}, baseline="better_one")
+    write_cell(tmp_path, TASK, "better_one", 0, curve(0, 1))
+    assert report.main([str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "<td>better_one</td>" in page and "class='good'" not in page
+    assert "One arm: there is nothing to compare it with." in page and "any two arms" not in page
+
+
+def test_a_report_of_results_that_cannot_be_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page elsewhere is whole; that the tables are missing is said."""
+    write_grid(tmp_path / "theirs")
+    write_cell(tmp_path / "theirs", TASK, "sac_ae", 0, curve(0, 1))
+    write_bytes = Path.write_bytes
+
+    def refuse(self: Path, content: bytes) -> int:
+        if "theirs" in self.parts:
+            raise PermissionError(13, "Permission denied")
+        return write_bytes(self, content)
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    assert report.main([str(tmp_path / "theirs"), "--out", str(tmp_path / "mine.html")]) == 0
+    assert "theirs cannot be written to (Permission denied): its tables and plots are in" in capsys.readouterr().out
+    assert "<h1>theirs</h1>" in (tmp_path / "mine.html").read_text()
+    assert report.main([str(tmp_path / "theirs")]) == 1
+    assert "report.html cannot be written (Permission denied): choose another --out." in capsys.readouterr().err
 
 
 def test_which_media(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The SRL heads: losses against straight-line code, errors per sample, shapes, and a fit on real frames."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.augmentations import center_crop
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder
+from sb3_cure.layers import preprocess
 from sb3_cure.srl import CURL, RAE, SRLHead, get_srl_class
 
 
@@ -599,6 +601,60 @@ def test_the_head_does_not_own_the_encoder(srl: str) -> None:
     assert not any("encoder" in key for key in policy.srl.state_dict())
     assert policy.srl.encoder is policy.encoder
     assert policy.srl.target_encoder is policy.encoder_target
+
+
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_a_head_that_holds_the_encoder_trains_it_no_more_than_others(update: str, tmp_path: Path) -> None:
+    """Kept as attributes usually are; the archive can be loaded."""
+
+    class Plain(RAE):
+        pass
+
+    class Holder(RAE):
+        def __init__(self, encoder: Any, observation_space: spaces.Space, **kwargs: Any):
+            super().__init__(encoder, observation_space, **kwargs)
+            self.encoder = encoder
+            self.parts = th.nn.ModuleList([encoder.projection])
+
+    models = [tiny_model("CnnPolicy", PixelBox(), srl=kind, update=update).learn(14) for kind in (Plain, Holder)]
+    ours, theirs = (dict(model.policy.encoder.named_parameters()) for model in models)
+    assert all(th.equal(ours[name], theirs[name]) for name in ours)
+    models[1].save(tmp_path / "model.zip")
+    loaded = CuReSAC.load(tmp_path / "model.zip", custom_objects={"srl": Holder})
+    assert all(th.equal(value, theirs[name]) for name, value in loaded.policy.encoder.named_parameters())
+
+
+class Lazy(RAE):
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.out = th.nn.LazyLinear(3)
+
+
+class Extra(RAE):
+    def get_extra_state(self) -> dict[str, int]:
+        return {"n": 1}
+
+    def set_extra_state(self, state: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [(Lazy, "Lazy has layers that take their sizes from the first batch"), (Extra, "Extra has _extra_state in its")],
+)
+def test_heads_that_no_archive_could_give_back_are_refused(head: type[SRLHead], message: str) -> None:
+    """Before they are trained."""
+    with pytest.raises(ValueError, match=message):
+        tiny_model("CnnPolicy", PixelBox(), srl=head)
+
+
+@pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_preprocessing_leaves_its_input_alone(channels: int, memory_format: th.memory_format) -> None:
+    space = spaces.Box(0, 255, (channels, 20, 20), np.uint8)
+    images = th.full((2, channels, 20, 20), 200.0).contiguous(memory_format=memory_format)
+    scaled = preprocess(images, space)
+    assert (images == 200).all() and scaled.max() == th.tensor(200.0) / 255
 
 
 def test_a_seeds_networks_begin_alike_under_every_head() -> None:

@@ -3,6 +3,7 @@
 import itertools
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy import stats
 
 from sb3_cure.experiments import published, statistics
 from sb3_cure.experiments.results import ResultsError, read_results
-from sb3_cure.experiments.tables import aggregate_table
+from sb3_cure.experiments.tables import aggregate_table, of_tasks
 from sb3_cure.experiments.visit_statistics import (
     GRID_INTERVALS,
     entropy_bits,
@@ -82,7 +83,7 @@ def test_only_what_both_arms_finished_is_paired(results: Path) -> None:
     """An unfinished cell enters nothing, whatever its files hold; with one pair left there is no interval."""
     (results / TASK / "cure_sac_ae" / "seed1" / "DONE").unlink()
     (results / TASK / "cure_sac_ae" / "seed1" / "eval.csv").write_text("half a li")
-    write_cell(results, TASK, "cure_sac_ae", 7, curve(0, 900))  # a seed that the baseline has not
+    write_cell(results, TASK, "cure_sac_ae", 7, curve(0, 900), arguments=CURE)  # a seed that the baseline has not
     (experiment,) = read_results(results.parent)
     statuses = {(method, seed): cell.status for (_, method, seed), cell in experiment.cells.items()}
     assert statuses["cure_sac_ae", 1] == "unfinished"
@@ -118,6 +119,19 @@ def test_several_tasks_count_alike(tmp_path: Path) -> None:
     assert (pooled.same_starts, rows[0].same_starts, rows[1].same_starts) == (1, 1, 0)
     assert pooled.t.low is not None and pooled.t.high is not None
     assert pooled.t.low < pooled.percentile.low and pooled.t.high > pooled.percentile.high  # type: ignore[operator]
+
+
+def test_a_task_with_a_single_pair_is_left_out_of_all_counts(tmp_path: Path) -> None:
+    """And named: what is counted is what the interval rests on, as in a grid that is half run."""
+    write_grid(tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0", "dmc_pixels/finger-spin-v0"], seeds=3)
+    for task, seeds, difference in ((TASK, 3, 40), ("finger-spin", 1, -150)):
+        for seed in range(seeds):
+            write_cell(tmp_path, task, "sac_ae", seed, curve(200, 200))
+            write_cell(tmp_path, task, "cure_sac_ae", seed, curve(200, 200 + 2 * difference + seed))
+    pooled, cartpole, finger = statistics.paired_differences(read_results(tmp_path)[0])
+    assert (pooled.pairs, pooled.wins, pooled.same_starts) == (3, 3, 3) and pooled.left_out == ("finger-spin",)
+    assert (pooled.t, cartpole.left_out, finger.pairs) == (cartpole.t, (), 1)
+    assert of_tasks(pooled) == "1 task (left out, with a single pair: finger-spin)"
 
 
 def test_t_interval_covers_what_it_says_with_three_seeds_and_percentiles_do_not() -> None:
@@ -420,7 +434,22 @@ def test_the_papers_tables() -> None:
         ("eval.csv", "environment_steps,return_mean\n0,1\n50000,\n100000,2\n", r"no return_mean in line 3"),
         ("eval.csv", "environment_steps,return_mean\n0,1\n50000,nan\n100000,2\n", r"no return_mean in line 3"),
         ("run.json", "", r"run\.json is no JSON .*: remove the cell's folder and run the grid again\."),
-        ("config.json", '{"method": "other", "seed": 0}', r"config\.json is of method 'other'"),
+        (
+            "config.json",
+            '{"method": "other", "seed": 0}',
+            r"config\.json is of task .*, method 'other' and seed 0",
+        ),
+        (
+            "config.json",
+            '{"task": "a/other-v0"}',
+            r"config\.json is of task 'other', .* its folder is not: put",
+        ),
+        (
+            "config.json",
+            '{"arguments": {"gamma": 1}}',
+            r"seed1 was run with arguments .*seed0 with {'gamma': 1}",
+        ),
+        ("eval.csv", "environment_steps,return_mean\n0,\n100000,nan\n", r"no return_mean in line 2"),
     ],
 )
 def test_damaged_files_are_named_in_one_sentence(results: Path, name: str, content: str | bytes, sentence: str) -> None:
@@ -448,6 +477,15 @@ def test_no_row_of_a_finished_curve_may_be_lost(tmp_path: Path) -> None:
             read_results(tmp_path)
     (path / "eval.csv").unlink()
     with pytest.raises(ResultsError, match=r"seed0 is marked as DONE, but has no eval\.csv: remove the cell's folder"):
+        read_results(tmp_path)
+
+
+def test_arms_that_were_evaluated_otherwise_are_not_compared(tmp_path: Path) -> None:
+    """As after folders of two grids were copied into one."""
+    write_grid(tmp_path)
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1), eval_every=100_000, eval_episodes=10)
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, curve(0, 1), eval_every=100_000, eval_episodes=3)
+    with pytest.raises(ResultsError, match=r"seed0 was run with eval_episodes 3, but .*seed0 with 10, so that they"):
         read_results(tmp_path)
 
 
@@ -499,9 +537,45 @@ def test_other_pixels_are_not_judged_by_published_numbers(tmp_path: Path) -> Non
         ("fast", {"srl": "rae"}, {"renderer": "fast"}, False),
         ("crops", crops, {"image_size": 100}, True),
         ("whole", {"srl": "curl"}, {"image_size": 100}, False),
+        ("shifts", {"srl": "curl"}, {}, True),
     ):
         folder = tmp_path / name
         write_grid(folder)
-        write_cell(folder, TASK, "sac_ae", 0, curve(0, 50, 100), arguments=arguments, env_kwargs=env_kwargs)
+        write_cell(
+            folder,
+            TASK,
+            "sac_ae",
+            0,
+            curve(0, 50, 100),
+            arguments={**arguments, "curiosity": None},
+            env_kwargs=env_kwargs,
+        )
         (experiment,) = read_results(str(folder))
-        assert bool(published.compare_with_published([experiment])) == compared, name
+        rows = published.compare_with_published([experiment])
+        assert bool(rows) == compared, name
+        assert all(row.same_method == (name != "shifts") for row in rows), "shifts are DrQ's"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "same"),
+    [
+        ({"gamma": 0.99, "policy_kwargs": {"net_arch": [1024, 1024]}, "buffer_size": 100}, True),
+        ({"gamma": 0.98}, False),
+        ({"learning_rate": 1e-6}, False),
+        ({"policy_kwargs": {"net_arch": [8]}}, False),
+    ],
+)
+def test_other_settings_are_not_the_published_method(tmp_path: Path, arguments: dict[str, Any], same: bool) -> None:
+    """Such an arm is no evidence of a bug."""
+    write_grid(tmp_path)
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1), arguments={**RAE, **arguments})
+    (row,) = published.compare_with_published(read_results(tmp_path))
+    assert (row.same_method, row.suspect) == (same, same)
+
+
+def test_tasks_of_others_have_no_published_numbers(tmp_path: Path) -> None:
+    """Even if they have the same short name."""
+    write_grid(tmp_path, tasks=["mine/cartpole-swingup-v0"])
+    config = write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1)) / "config.json"
+    config.write_text(config.read_text().replace("dmc_pixels/", "mine/"))
+    assert published.compare_with_published(read_results(tmp_path)) == []

@@ -54,7 +54,7 @@ class DMCPixels(PixelObservation):
         self._physics = env.get_wrapper_attr("physics")
         self._camera: Any = None
         model = self._physics.model
-        if isinstance(camera_id, bool) or not isinstance(camera_id, int) or not -1 <= camera_id < model.ncam:
+        if not (is_integer(camera_id, -1) and camera_id < model.ncam):
             raise ValueError(
                 f"camera_id={camera_id!r} is not one of this model's cameras; use 0 to {model.ncam - 1}, or -1 for the "
                 "free camera."
@@ -71,6 +71,10 @@ class DMCPixels(PixelObservation):
             # The same pixels as `physics.render`, which builds such a camera, and frees it, for every frame.
             self._camera = Camera(self._physics, self.image_size, self.image_size, self.camera_id)
         return self._camera.render(render_flag_overrides=RENDER_FLAGS[self.renderer])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies make a camera of their own with their first frame."""
+        return {**self.__dict__, "_camera": None}
 
     def close(self) -> None:
         self._camera = None

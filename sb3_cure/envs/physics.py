@@ -33,7 +33,7 @@ def _physics(env: gym.Env) -> Any:
     if not hasattr(getattr(physics, "model", None), "jnt_type"):
         raise ValueError(
             f"{env} has no physics of dm_control, so its true state is unknown: use an environment of make_dmc_env, or "
-            "give a function of the state of your own where one can be given."
+            "give state=lambda env: ... and names=[...] where there are such arguments."
         )
     return physics
 

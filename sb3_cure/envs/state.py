@@ -59,7 +59,6 @@ _STATELESS: tuple[type, ...] = (
     wrappers.FilterObservation,
     wrappers.FlattenObservation,
     wrappers.GrayscaleObservation,
-    wrappers.MaxAndSkipObservation,
     wrappers.ObstructView,
     wrappers.PassiveEnvChecker,
     wrappers.RepeatAction,
@@ -87,6 +86,8 @@ ATTRIBUTES: dict[type, tuple[str, ...]] = {
     StackFrames: ("_frames",),
     wrappers.DelayObservation: ("observation_queue",),
     wrappers.FrameStackObservation: ("obs_queue",),
+    # Where an episode ends within a skip, what is left of the one before counts, too.
+    wrappers.MaxAndSkipObservation: ("_obs_buffer",),
     wrappers.NormalizeObservation: ("obs_rms",),
     wrappers.NormalizeReward: ("return_rms", "discounted_reward"),
     wrappers.OrderEnforcing: ("_has_reset",),

@@ -39,12 +39,29 @@ def check_flag(name: str, value: Any) -> None:
         raise ValueError(f"{name}={value!r} is neither True nor False; use {name}=False, for example.")
 
 
+def check_frame(frame: Any, env: gym.Env) -> None:
+    """
+    :param frame: What an environment's ``render()`` returned
+    :param env: The environment
+    :raises ValueError: If it is no uint8 frame of shape (height, width, 3)
+    """
+    if isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3:
+        return
+    given = f"{frame.dtype} of shape {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
+    fix = "let its render() return such frames" if env.render_mode == "rgb_array" else "make it with 'rgb_array'"
+    raise ValueError(
+        f"Rendering {env} with render_mode={env.render_mode!r} gave {given}, but frames are uint8 of shape (height, "
+        f"width, 3): {fix}."
+    )
+
+
 class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
     """
     Takes float32 actions in [-1, 1], clips them to that range and scales them to the bounds of the environment.
 
-    Actions without bounds are clipped and not scaled. Unlike :class:`gymnasium.wrappers.RescaleAction`, this accepts
-    them, does not keep the float64 of the environment's space, and clips.
+    Actions without bounds are clipped and not scaled; with one bound, they are what lies within 2 of it. Unlike
+    :class:`gymnasium.wrappers.RescaleAction`, this accepts them, does not take the float64 of the environment's space
+    for its own, and clips. What the environment gets is of its space: of its dtype and within its bounds.
 
     :param env: An environment whose actions are floats in a ``Box``
     """
@@ -58,14 +75,18 @@ class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordCon
                 f"The actions {bounds} cannot be scaled: expected floats in a Box; leave out NormalizeActions."
             )
         low, high = bounds.low.astype(np.float64), bounds.high.astype(np.float64)
-        bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
-        low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        has_low, has_high = low > -UNBOUNDED, high < UNBOUNDED
+        low = np.where(has_low, low, np.where(has_high, high - 2.0, -1.0))
+        high = np.where(has_high, high, low + 2.0)
         # As centre and half width, symmetric bounds of 1 leave each action bit-equal.
         self._center, self._half_width = (high + low) / 2, (high - low) / 2
         self.action_space = spaces.Box(-1.0, 1.0, bounds.shape, np.float32)
 
     def action(self, action: np.ndarray) -> np.ndarray:
-        return self._center + self._half_width * np.clip(action, -1.0, 1.0)
+        bounds: Any = self.env.action_space
+        scaled = self._center + self._half_width * np.clip(action, -1.0, 1.0)
+        # The sum, or another dtype, may be beyond a bound by a rounding error.
+        return np.clip(scaled.astype(bounds.dtype), bounds.low, bounds.high)
 
 
 class ActionRepeat(RepeatAction):
@@ -114,11 +135,7 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
 
     def observation(self, observation: Any) -> np.ndarray:
         frame = self.frame()
-        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[-1] != 3:
-            raise ValueError(
-                f"Rendering with render_mode={self.env.render_mode!r} gave no uint8 frame of shape (height, width, 3); "
-                "make the environment with render_mode='rgb_array'."
-            )
+        check_frame(frame, self.env)
         if self.grayscale or frame.shape[:2] != (self.image_size, self.image_size):
             image = Image.fromarray(frame)
             if self.grayscale:
@@ -132,7 +149,9 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
     """
     Joins the last observations along their first axis, oldest first; the first one of an episode is repeated.
 
-    :param env: An environment whose observations are arrays, such as channels-first images
+    Images with the channels last (their smallest dimension, as SB3 tells them) are joined along the last axis.
+
+    :param env: An environment whose observations are arrays, such as images
     :param frame_stack: Number of observations in a stack
     :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows
     """
@@ -146,10 +165,13 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
             raise ValueError(
                 f"Observations of {box} cannot be stacked: expected a Box; wrap in PixelObservation first."
             )
-        low, high = (np.concatenate([bound] * self.frame_stack) for bound in (box.low, box.high))
-        if low.ndim == 3 and len(low) > min(low.shape[1:]):
+        shape = box.shape
+        self._axis = 2 if len(shape) == 3 and shape[2] < min(shape[:2]) else 0
+        low, high = (np.concatenate([bound] * self.frame_stack, self._axis) for bound in (box.low, box.high))
+        channels = low.shape[self._axis] if low.ndim == 3 else 0
+        if channels > min(low.shape):
             raise ValueError(
-                f"frame_stack={self.frame_stack} images of shape {box.shape} have {len(low)} channels in all, but SB3 "
+                f"frame_stack={self.frame_stack} images of shape {shape} have {channels} channels in all, but SB3 "
                 "takes the smallest dimension for the channels: choose larger images (image_size) or fewer frames."
             )
         self.observation_space = spaces.Box(low, high, dtype=box.dtype.type)
@@ -159,13 +181,13 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         frame, info = self.env.reset(seed=seed, options=options)
-        self._frames.extend([frame] * self.frame_stack)
-        return np.concatenate(self._frames), info
+        self._frames.extend([np.array(frame)] * self.frame_stack)  # an environment may write the next one into it
+        return np.concatenate(self._frames, self._axis), info
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
         frame, reward, terminated, truncated, info = self.env.step(action)
-        self._frames.append(frame)
-        return np.concatenate(self._frames), reward, terminated, truncated, info
+        self._frames.append(np.array(frame))
+        return np.concatenate(self._frames, self._axis), reward, terminated, truncated, info
 
 
 def make_pixel_env(

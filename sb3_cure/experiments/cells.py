@@ -1,6 +1,5 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
-import fcntl
 import itertools
 import json
 import math
@@ -26,6 +25,7 @@ from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json,
 from sb3_cure.experiments.grid import DONE, Cell, GridError
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
+from sb3_cure.files import lock
 
 #: Evaluations start from the same states in all cells
 EVAL_SEED = 10_000
@@ -349,7 +349,7 @@ def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
         deadline = math.inf if wait else time.monotonic() + 1
         while True:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(file)
                 break
             except BlockingIOError:
                 if time.monotonic() > deadline:
@@ -370,7 +370,7 @@ def is_held(folder: Path) -> bool:
     """
     try:
         with (folder / ".lock").open() as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lock(file, shared=True)
     except BlockingIOError:
         return True
     except OSError:

@@ -345,7 +345,7 @@ def _draw_curves(
     for lines in curves.values():
         for (arm, _), (_, values) in lines.items():
             seeds.setdefault(arm, set()).add(len(values))
-    labels = {arm: "–".join(map(str, sorted({min(each), max(each)}))) for arm, each in seeds.items()}
+    labels = {arm: " to ".join(map(str, sorted({min(each), max(each)}))) for arm, each in seeds.items()}
     handles = {
         f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})": Line2D([], [], color=colors[arm], linewidth=1.8)
         for arm, n in labels.items()

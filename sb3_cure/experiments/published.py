@@ -181,14 +181,31 @@ def task_key(task: str) -> str:
     return task.replace("-", "_")
 
 
+#: What makes a method, beside its head: the published settings
+SETTINGS = {
+    "batch_size": 128,
+    "gamma": 0.99,
+    "learning_rate": 1e-3,
+    "tau": 0.01,
+    "encoder_tau": 0.05,
+    "target_update_interval": 2,
+    "actor_update_interval": 2,
+    "ent_coef": "auto_0.1",
+    "policy_kwargs": {"net_arch": [1024, 1024]},
+}
+
+
 def published_method(arguments: dict) -> tuple[str | None, bool]:
     """Which published method an arm is.
 
     :param arguments: CuReSAC's arguments, as ``config.json`` keeps them
-    :return: Its name, or None for a head without published numbers; and whether the arm adds curiosity to it
+    :return: The method that it is or builds upon, None for a head without published numbers; and whether it is that
+        method, in its settings and without curiosity
     """
     base = {"rae": "SAC-AE", "curl": "CURL"}.get(str(arguments.get("srl", "rae")))
-    return base, arguments.get("curiosity", "separate") is not None
+    shifts = base == "CURL" and arguments.get("srl_kwargs", {}).get("augmentation") != "crop"
+    is_usual = all(arguments.get(key, value) == value for key, value in SETTINGS.items()) and not shifts
+    return base, is_usual and arguments.get("curiosity", "separate") is None
 
 
 @dataclass(frozen=True)
@@ -197,7 +214,7 @@ class Comparison:
 
     :param theirs: The published value of the method that the arm is, or builds upon; None if there is none
     :param published_as: Name of that method
-    :param same_method: Whether the arm is that method, rather than adding curiosity to it
+    :param same_method: Whether the arm is that method, rather than adding curiosity to it or changing its settings
     :param ours: Mean return of the seeds at that step
     :param std: Standard deviation over seeds; nan with one
     """
@@ -231,7 +248,7 @@ def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison
                 cells = [cell for cell in experiment.done(task, method).values() if len(cell.curve()[0]) > 1]
                 if not cells or experiment.kind == "visitation" or cells[0].config.get("pretrain"):
                     continue
-                base, curious = published_method(cells[0].config.get("arguments", {}))
+                base, same_method = published_method(cells[0].config.get("arguments", {}))
                 if base is None or not all(cell.sees_published_pixels for cell in cells):
                     continue
                 steps, stacked = stack_curves(cells)
@@ -253,7 +270,7 @@ def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison
                             std,
                             theirs,
                             base,
-                            not curious,
+                            same_method,
                         )
                     )
     return rows

@@ -297,6 +297,8 @@ def _curves(
     if not differences:
         headlines.append(
             f"No arm has a seed in common with the baseline {experiment.baseline}: nothing to compare yet."
+            if len(experiment.methods) > 1
+            else "One arm: there is nothing to compare it with."
         )
     if experiment.kind == "pretraining":
         parts.insert(0, tables.pretraining_table(experiment))
@@ -306,8 +308,9 @@ def _curves(
         parts.append(tables.difference_table(experiment, differences))
         finals = statistics.paired_differences(experiment, "finals")
         parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
-    if 2 < len(experiment.methods) <= PAIRS_UP_TO:
-        parts.append(tables.pairs_table(list(_all_pairs(experiment))))
+    pairs = list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []
+    if pairs:
+        parts.append(tables.pairs_table(pairs))
     try:
         found = statistics.aggregate(experiment)
     except ResultsError as error:
@@ -495,7 +498,7 @@ def _overview(sections: Sequence[Section]) -> list[tuple[str, str, str]]:
     rows = []
     for section in sections:
         more = len(section.headlines) - 1
-        says = (section.headlines or ["–"])[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
+        says = (section.headlines or [tables.NONE])[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
         rows.append((section.experiment.name, _progress(section.experiment), says))
     return rows
 
@@ -508,7 +511,8 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
     :param title: Name of the folder
     :return: The page
     """
-    rows = "".join(
+    rows = "<tr><th>experiment</th><th>cells done</th><th>in short</th></tr>"
+    rows += "".join(
         f'<tr><td><a href="#e{index}">{escape(name)}</a></td><td>{done}</td><td class="says">{escape(says)}</td></tr>'
         for index, (name, done, says) in enumerate(_overview(sections))
     )
@@ -541,7 +545,7 @@ def render_html(sections: Sequence[Section], comparisons: Table | None, media: s
 <header><div><h1>{escape(title)}</h1>
 <p>{plural(len(sections), "experiment")}, sb3_cure {escape(sb3_cure.__version__)}, written {now}</p></div></header>
 <main>
-<nav aria-label="Experiments"><table><tr><th>experiment</th><th>cells done</th><th>in short</th></tr>{rows}</table></nav>
+<nav aria-label="Experiments"><table>{rows}</table></nav>
 {"".join(body)}<footer>Intervals are 95 %. The arms of an experiment are compared seed by seed.</footer>
 </main>
 </body>
@@ -600,13 +604,19 @@ def write_report(
         for part in section.parts:
             if isinstance(part, Figure):
                 files[section.experiment.folder / f"{part.name}.png"] = part.png
+    written = []
     for path, content in files.items():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
         except OSError as error:
-            raise ResultsError(f"{path} cannot be written ({error.strerror}): choose another --out.") from None
-    return list(files)
+            if path == out:
+                raise ResultsError(f"{path} cannot be written ({error.strerror}): choose another --out.") from None
+            # Others' results may be read-only.
+            print(f"{path.parent} cannot be written to ({error.strerror}): its tables and plots are in {out} alone.")
+            break
+        written.append(path)
+    return written
 
 
 def main(argv: Sequence[str] | None = None) -> int:

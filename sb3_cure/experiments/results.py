@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,8 @@ class CellResult:
     def sees_published_pixels(self) -> bool:
         """Whether its images are those of the published results: only then numbers compare."""
         arguments = self.config.get("arguments", {})
+        if not str(self.config.get("task", "")).startswith("dmc_pixels/"):
+            return False
         crops = arguments.get("srl_kwargs", {}).get("augmentation") == "crop"
         usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
         return {**usual, **self.config.get("env_kwargs", {})} == usual
@@ -235,9 +237,27 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     cells = {
         key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"], grid["kind"]) for key in keys
     }
+    _check_alike(cells.values())
     order = {task: index for index, task in reversed(list(enumerate(task for task, _, _ in cells)))}
     in_order = dict(sorted(cells.items(), key=lambda item: order[item[0][0]]))
     return Experiment(name or grid["experiment"], root, grid, in_order)
+
+
+def _check_alike(cells: Iterable[CellResult]) -> None:
+    """Whether the seeds of an arm were run with the same settings, and all arms of a task evaluated alike."""
+    first: dict[tuple[str, ...], CellResult] = {}
+    for cell in cells:
+        if not cell.done:
+            continue
+        keys = (cell.config.keys() | {"arguments"}) - {"seed", "method"}
+        for arm, compared in (((cell.task, cell.method), keys), ((cell.task,), {"eval_every", "eval_episodes"})):
+            other = first.setdefault(arm, cell)
+            for key in sorted(compared & other.config.keys()):
+                if cell.config.get(key) != other.config[key]:
+                    raise ResultsError(
+                        f"{cell.folder} was run with {key} {cell.config.get(key)!r}, but {other.folder} with "
+                        f"{other.config[key]!r}, so that they cannot be compared: put one of them into another folder."
+                    )
 
 
 def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kind: str) -> CellResult:
@@ -246,10 +266,11 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
     if not (folder / "DONE").exists():
         return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
     config, run = _read_json(folder / "config.json"), _read_json(folder / "run.json")
-    if (config.get("method", method), config.get("seed", seed)) != (method, seed):
+    own = (short_name(str(config.get("task", task))), config.get("method", method), config.get("seed", seed))
+    if own != (task, method, seed):
         raise ResultsError(
-            f"{folder / 'config.json'} is of method {config.get('method')!r} and seed {config.get('seed')!r}, "
-            "which its folder is not: put it back."
+            f"{folder / 'config.json'} is of task {own[0]!r}, method {own[1]!r} and seed {own[2]!r}, which its folder "
+            "is not: put it back."
         )
     own_budget = config.get("budget", budget)
     if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
@@ -269,7 +290,8 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
 
 
 def _check_whole(path: Path, evaluations: dict[str, np.ndarray], budget: int, config: dict[str, Any]) -> None:
-    """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return or none has."""
+    """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return (but those of a
+    curious agent alone)."""
     steps, returns = evaluations["environment_steps"], evaluations["return_mean"]
     # Evaluations are due at multiples of `eval_every`, and are made before the next rollout.
     every, train_freq = config.get("eval_every", np.inf), config.get("arguments", {}).get("train_freq", 1)
@@ -283,7 +305,7 @@ def _check_whole(path: Path, evaluations: dict[str, np.ndarray], budget: int, co
         reason = f"has evaluations of {found} environment steps, but the cell was trained for {budget}"
     elif len(gaps):
         reason = f"has no evaluation between {steps[gaps[0]]:.0f} and {steps[gaps[0] + 1]:.0f} environment steps"
-    elif known.any() and not known.all():
+    elif not known.all() and (known.any() or config.get("arguments", {}).get("task", True)):
         reason = f"has no return_mean in line {np.flatnonzero(~known)[0] + 2}"
     else:
         return

@@ -216,6 +216,7 @@ class PairedDifference:
     :param t: Mean difference with the t interval
     :param percentile: Mean difference with the percentile interval
     :param same_starts: In how many pairs both arms earn the same before training, as they do from equal weights
+    :param left_out: Tasks that do not count where others have more than one pair, as theirs tells no spread
     """
 
     method: str
@@ -225,6 +226,7 @@ class PairedDifference:
     t: Estimate
     percentile: Estimate
     same_starts: int
+    left_out: tuple[str, ...] = ()
 
     @property
     def wins(self) -> int:
@@ -267,12 +269,15 @@ def paired_differences(
                 )
                 same[task] = int((starts == 0).sum())
         rows = [{task: values} for task, values in by_task.items()]
-        for row in [by_task, *rows] if len(rows) > 1 else rows:
+        # As t_interval does, so that what is counted is what the interval rests on
+        judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
+        for row in [judged, *rows] if len(rows) > 1 else rows:
             groups = list(row.values())
-            name = None if row is by_task else next(iter(row))
+            name = None if row is judged else next(iter(row))
+            left_out = tuple(task for task in by_task if name is None and task not in judged)
             starts_alike = sum(same[task] for task in row)
             intervals = t_interval(groups), percentile_interval(groups)
-            found.append(PairedDifference(method, other, name, row, *intervals, starts_alike))
+            found.append(PairedDifference(method, other, name, row, *intervals, starts_alike, left_out))
     return found
 
 

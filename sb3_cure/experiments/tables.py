@@ -53,10 +53,7 @@ class Table:
         kinds = [' class="number"' if column.startswith(">") else "" for column in self.columns]
         names = [escape(column.removeprefix(">")) for column in self.columns]
         head = "".join(f'<th scope="col"{kind}>{name}</th>' for kind, name in zip(kinds, names, strict=True))
-        body = "".join(
-            "<tr>" + "".join(_table_cell(kind, text) for kind, text in zip(kinds, row, strict=True)) + "</tr>\n"
-            for row in self.rows
-        )
+        body = "".join(f"<tr>{''.join(map(_table_cell, self.columns, kinds, row))}</tr>\n" for row in self.rows)
         note = f'<p class="note">{escape(self.note)}</p>' if self.note else ""
         return (
             f"<h3>{escape(self.title)}</h3>\n<div class='wide'><table>\n<thead><tr>{head}</tr></thead>\n"
@@ -76,10 +73,11 @@ def markdown_text(text: str) -> str:
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
-def _table_cell(kind: str, text: str) -> str:
+def _table_cell(column: str, kind: str, text: str) -> str:
     marks = {"suspected bug": "bad", "worse": "bad", "better": "good"}
     marks |= {FAILED: "bad", NOT_RUN: "absent", UNFINISHED: "absent"}
-    mark = next((name for word, name in marks.items() if text.startswith(word)), "")
+    names = column in ("arm", "arms", "task", "experiment")
+    mark = "" if names else next((name for word, name in marks.items() if text.startswith(word)), "")
     content = escape(text)
     return f"<td{kind}>{f'<span class={mark!r}>{content}</span>' if mark else content}</td>"
 
@@ -254,8 +252,8 @@ def of_tasks(row: statistics.PairedDifference) -> str:
     """
     if row.task is not None:
         return row.task
-    # Tasks with a single pair do not count where others have more (statistics.t_interval).
-    return plural(sum(len(values) > 1 for values in row.differences.values()) or len(row.differences), "task")
+    left_out = f" (left out, with a single pair: {', '.join(row.left_out)})" if row.left_out else ""
+    return plural(len(row.differences), "task") + left_out
 
 
 def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Table:
@@ -414,7 +412,7 @@ def published_table(comparisons: Sequence[published.Comparison]) -> Table:
         if row.theirs is not None:
             theirs = f"{row.published_as} {_published(row.theirs)}"
             difference, ratio = number_text(row.ours - row.theirs.mean), f"{row.ours / row.theirs.mean:.2f}"
-            judgement = "ok" if row.same_method else "adds curiosity: not judged"
+            judgement = "ok" if row.same_method else "adds curiosity, or changes settings: not judged"
         if row.suspect:
             judgement = f"suspected bug: below {published.SUSPECT_BELOW} x published"
         run = [row.experiment, row.task, row.method, number_text(row.steps), str(row.seeds), ours]

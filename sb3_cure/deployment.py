@@ -1,0 +1,53 @@
+"""A trained policy as a plain module, for ONNX, TorchScript and what else runs on a robot."""
+
+from typing import TYPE_CHECKING
+
+import torch as th
+from torch import nn
+
+from sb3_cure.policies import CuRePolicy
+
+if TYPE_CHECKING:
+    from sb3_cure.cure_sac import CuReSAC
+
+
+class DeterministicActor(nn.Module):
+    """What ``predict(observation, deterministic=True)`` computes, from a batch of observations to actions of the
+    environment, without random numbers and branches, so that ``torch.onnx.export``, ``torch.export`` and
+    ``torch.jit.trace`` can follow it. The networks are the model's own: train on, and it changes with them.
+
+    :param model: A trained model
+    :param actor: ``"task"`` or ``"curious"``
+    :raises ValueError: if the model has no such policy
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, model: "CuReSAC", actor: str = "task"):
+        super().__init__()
+        names = {"task": "actor", "curious": "curious_actor"}
+        trained = [name for name, attribute in names.items() if getattr(model.policy, attribute, None) is not None]
+        if actor not in trained:
+            raise ValueError(
+                f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}: choose one of them."
+            )
+        self.policy = model.policy
+        self._actor = names[actor]
+        space = model.action_space
+        self.register_buffer("low", th.as_tensor(space.low, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
+        self.register_buffer("high", th.as_tensor(space.high, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
+        self.train(False)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: As the agent sees them, [B, *shape]: images uint8, channels first
+        :return: Actions within the environment's bounds, [B, *action shape]
+        """
+        actor = getattr(self.policy, self._actor)
+        inputs = observations
+        if isinstance(self.policy, CuRePolicy):
+            inputs = self.policy.encoder.trunk(self.policy.center(observations))
+        mean, _, _ = actor.get_action_dist_params(inputs)
+        scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)
+        return self.low + scaled * (self.high - self.low)

@@ -1,0 +1,48 @@
+"""A policy as a plain module: the actions of ``predict``, also when it was traced or exported."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+
+from sb3_cure.deployment import DeterministicActor
+
+MODELS: dict[str, Any] = {
+    "rae": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0)),
+    "curl": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl="curl"),
+    "vectors": lambda: tiny_model("MlpPolicy", VectorBox()),
+    "SB3's SAC": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl=None, curiosity=None),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_actions_are_those_of_predict(name: str) -> None:
+    """In the environment's units, for both policies, whichever tool has followed the computation."""
+    model = MODELS[name]().learn(14)
+    observations = np.stack([model.observation_space.sample() for _ in range(3)])
+    batch = th.as_tensor(observations)
+    policies = {"task": model.predict}
+    if model.curiosity is not None:
+        policies["curious"] = model.predict_curious
+    for actor, predict in policies.items():
+        expected, _ = predict(observations, deterministic=True)
+        module = DeterministicActor(model, actor)
+        traced = th.jit.trace(module, batch)
+        exported = th.export.export(module, (batch,)).module()
+        for follow in (module, traced, exported):
+            with th.no_grad():
+                np.testing.assert_allclose(follow(batch).numpy(), expected, atol=1e-5)
+
+
+def test_a_policy_that_is_not_there() -> None:
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
+    with pytest.raises(ValueError, match="actor is 'curious', but this model has 'task': choose one of them"):
+        DeterministicActor(model, "curious")
+
+
+def test_actors_are_not_asked_as_sb3s_are() -> None:
+    model = tiny_model("CnnPolicy", PixelBox())
+    with pytest.raises(ValueError, match="it reads the shared encoder's features: call the policy, or"):
+        model.actor(th.zeros(1, 6, 36, 36, dtype=th.uint8), deterministic=True)
