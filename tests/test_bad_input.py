@@ -381,8 +381,9 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         {"policy_kwargs": {"features_extractor_class": NatureCNN}},
         "NatureCNN cannot read observations of shape (3, 24, 24) (Calculated padded input "
         "size per channel: (1 x 1). Kernel size: (3 x 3). Kernel size can't be greater than "
-        "actual input size): use a larger image_size, or another "
-        "policy_kwargs=dict(features_extractor_class=...).",
+        "actual input size): use a larger image_size, another "
+        "policy_kwargs=dict(features_extractor_class=...), or this package's encoder (with srl=None "
+        "and curiosity=None through policy_kwargs=dict(share_encoder=True)).",
     ),
     "buffer_size": (
         "CnnPolicy",
@@ -1078,7 +1079,7 @@ def test_images_that_are_too_small_for_sb3s_encoder(policy: str) -> None:
     space = spaces.Box(0, 255, (3, 20, 20), np.uint8)
     env = FakeEnv(space if policy == "CnnPolicy" else spaces.Dict(camera=space))
     kwargs: dict[str, Any] = dict(srl=None, curiosity=None, buffer_size=10)
-    with pytest.raises(ValueError, match=r"NatureCNN cannot read .*: use larger images.*share_encoder=True"):
+    with pytest.raises(ValueError, match=r"NatureCNN cannot read .*: use a larger image_size.*share_encoder=True"):
         CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4]), **kwargs)
     if policy == "CnnPolicy":
         CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4], share_encoder=True), **kwargs)
