@@ -1,6 +1,7 @@
 """The command line: training, replaying, filming and tuning from a YAML file, and the doctor."""
 
 import os
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -203,6 +204,18 @@ def test_an_environment_of_ones_own(folder: Path) -> None:
         kept = yaml.unsafe_load((runs / f"Camera-v0_{number}" / "Camera-v0" / "args.yml").read_text())
         assert (kept["env"], kept["gym_packages"]) == ("Camera-v0", ["camera_of_mine"])
     (video,) = runs.glob("Camera-v0_2/videos/*.mp4")
+    assert video.stat().st_size > 1000
+
+
+def test_an_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
+    """As the README's example does; what was trained so can be filmed."""
+    readme = (Path(__file__).parent.parent / "README.md").read_text()
+    example = next(block for block in re.findall(r"```yaml\n(.*?)```", readme, re.S) if "env_wrapper" in block)
+    settings = {**SETTINGS["default"], **yaml.safe_load(example)["default"]}
+    (folder / "tiny.yml").write_text(yaml.safe_dump({"Pendulum-v1": settings}))
+    finish(start([script(), "train", "--env", "Pendulum-v1", "--conf-file", "tiny.yml", "-n", "14"]))
+    finish(start([script(), "record", "--env", "Pendulum-v1", "-n", "5"]))
+    (video,) = folder.glob("logs/cure_sac/Pendulum-v1_1/videos/*.mp4")
     assert video.stat().st_size > 1000
 
 

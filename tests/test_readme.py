@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
+import torch as th
 from envs_for_tests import PixelBox, tiny_model
 
 from sb3_cure import CuReSAC
@@ -38,6 +40,31 @@ def test_readmes_own_head_trains_saves_and_loads(tmp_path: Path) -> None:
         )
     drawn = loaded.policy.srl.reconstruct(loaded.policy.encode(batch.observations))
     assert drawn.shape == batch.observations.shape and drawn.dtype == batch.observations.dtype
+
+
+def test_a_policy_leaves_for_the_robot_as_the_readme_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file that its lines write gives the actions of ``predict``."""
+    block = next(block for block in re.findall(r"```python\n(.*?)```", README, re.S) if "DeterministicActor" in block)
+    monkeypatch.chdir(tmp_path)
+    model = tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0))
+    names: dict = {"model": model}
+    exec(compile(block, "README.md", "exec"), names)
+    actions, _ = model.predict(names["images"].numpy(), deterministic=True)
+    for given in (names["actions"], th.export.load("policy.pt2").module()(names["images"])):
+        np.testing.assert_allclose(given.detach(), actions, atol=1e-5)
+
+
+def test_links_lead_somewhere() -> None:
+    """Headings of the page, files of the repository."""
+    for page in (ROOT / "README.md", ROOT / "results" / "README.md"):
+        text = page.read_text()
+        headings = re.findall(r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
+        anchors = {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+        for target in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", text, flags=re.S)):
+            if target.startswith("#"):
+                assert target[1:] in anchors, (page.name, target)
+            elif not target.startswith("http"):
+                assert (page.parent / target.partition("#")[0]).exists(), (page.name, target)
 
 
 def test_table_of_arguments_gives_the_constructors_defaults() -> None:
