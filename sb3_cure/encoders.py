@@ -138,8 +138,8 @@ def explaining_extractor(extractor_class: type, observation_space: spaces.Space)
         reason = " ".join(str(error).split())
         raise ValueError(
             f"{extractor_class.__name__} cannot read observations of shape {observation_space.shape} ({reason}): use a "
-            "larger image_size, another policy_kwargs=dict(features_extractor_class=...), or this package's encoder (with "
-            "srl=None and curiosity=None through policy_kwargs=dict(share_encoder=True))."
+            "larger image_size, another policy_kwargs=dict(features_extractor_class=...), or this package's encoder "
+            "(with srl=None and curiosity=None through policy_kwargs=dict(share_encoder=True))."
         ) from error
 
 
