@@ -369,17 +369,19 @@ class CuReSAC(SAC):
         return self.curiosity == "bonus" or self._has_curious_agent
 
     def _choose_replay_buffer(self) -> None:
-        """Keep each frame once where the environment says that its observations are stacked frames."""
+        """Keep each frame once where the user or the environment says that observations are stacked frames."""
         # Of ``VecFrameStack`` those slide, whatever the environments in it stack.
         stacked = None if self.env is None else unwrap_vec_wrapper(self.env, VecFrameStack)
-        frame_stack = self._told_frame_stack() if stacked is None else stacked.stacked_obs.n_stack
+        if "frame_stack" in self.replay_buffer_kwargs:
+            frame_stack = self.replay_buffer_kwargs["frame_stack"]
+        else:
+            frame_stack = self._told_frame_stack() if stacked is None else stacked.stacked_obs.n_stack
         if self.env is not None and frame_stack is None and "frames_dir" in self.replay_buffer_kwargs:
-            if "frame_stack" not in self.replay_buffer_kwargs:
-                raise ValueError(
-                    f"replay_buffer_kwargs got frames_dir={str(self.replay_buffer_kwargs['frames_dir'])!r}, but the "
-                    "environment does not tell its frame_stack, without which frames cannot be told apart: use "
-                    "make_dmc_env or make_pixel_env, or add replay_buffer_class=FrameStackReplayBuffer and frame_stack."
-                )
+            raise ValueError(
+                f"replay_buffer_kwargs got frames_dir={str(self.replay_buffer_kwargs['frames_dir'])!r}, but the "
+                "environment does not tell its frame_stack, without which frames cannot be told apart: use "
+                "make_dmc_env or make_pixel_env, or add frame_stack."
+            )
         if self.replay_buffer_class is None and self.n_steps == 1 and frame_stack is not None:
             if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
                 self.replay_buffer_class = FrameStackReplayBuffer

@@ -358,7 +358,7 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         {"replay_buffer_kwargs": {"frames_dir": "."}},
         "replay_buffer_kwargs got frames_dir='.', but the environment does not tell its "
         "frame_stack, without which frames cannot be told apart: use make_dmc_env or "
-        "make_pixel_env, or add replay_buffer_class=FrameStackReplayBuffer and frame_stack.",
+        "make_pixel_env, or add frame_stack.",
     ),
     "ent_coef in words": (
         "CnnPolicy",
@@ -1071,6 +1071,15 @@ def test_an_environments_own_frame_stack_is_passed_over() -> None:
     with pytest.warns(UserWarning, match=r"frame_stack is 4, but observations of shape \(9, 36, 36\) are not of so"):
         model = CuReSAC("CnnPolicy", env, buffer_size=10, policy_kwargs=dict(net_arch=[4]))
     assert not isinstance(model.replay_buffer, FrameStackReplayBuffer)
+
+
+def test_frames_that_the_user_or_gymnasium_tells_are_kept_once() -> None:
+    space = spaces.Box(0, 255, (4, 36, 36), np.uint8)
+    model = CuReSAC("CnnPolicy", FakeEnv(space), buffer_size=10, replay_buffer_kwargs=dict(frame_stack=2))
+    assert isinstance(model.replay_buffer, FrameStackReplayBuffer) and model.replay_buffer.frame_stack == 2
+    grey = gym.wrappers.FrameStackObservation(FakeEnv(spaces.Box(0, 255, (36, 36), np.uint8)), 4)
+    model = CuReSAC("CnnPolicy", grey, buffer_size=10)
+    assert isinstance(model.replay_buffer, FrameStackReplayBuffer) and model.replay_buffer.frame_stack == 4
 
 
 @pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
