@@ -32,8 +32,10 @@ class DeterministicActor(nn.Module):
             raise ValueError(
                 f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}: choose one of them."
             )
-        self.policy = model.policy
-        self._actor = names[actor]
+        self.actor = getattr(model.policy, names[actor])
+        # In a tuple, so that critics and decoder are no part of what is exported.
+        self._policy = (model.policy,)
+        self.trunk = model.policy.encoder.trunk if isinstance(model.policy, CuRePolicy) else None
         space = model.action_space
         self.register_buffer("low", th.as_tensor(space.low, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
         self.register_buffer("high", th.as_tensor(space.high, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
@@ -44,10 +46,8 @@ class DeterministicActor(nn.Module):
         :param observations: As the agent sees them, [B, *shape]: images uint8, channels first
         :return: Actions within the environment's bounds, [B, *action shape]
         """
-        actor = getattr(self.policy, self._actor)
-        inputs = observations
-        if isinstance(self.policy, CuRePolicy):
-            inputs = self.policy.encoder.trunk(self.policy.center(observations))
-        mean, _, _ = actor.get_action_dist_params(inputs)
+        (policy,) = self._policy
+        inputs = observations if self.trunk is None else self.trunk(policy.center(observations))
+        mean, _, _ = self.actor.get_action_dist_params(inputs)
         scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)
         return self.low + scaled * (self.high - self.low)

@@ -36,6 +36,16 @@ def test_actions_are_those_of_predict(name: str) -> None:
                 np.testing.assert_allclose(follow(batch).numpy(), expected, atol=1e-5)
 
 
+def test_what_acts_is_all_that_leaves() -> None:
+    """No critics, decoder or target networks; and the networks stay the model's own."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    module = DeterministicActor(model)
+    parts = [*model.policy.encoder.trunk.parameters(), *model.policy.actor.parameters()]
+    assert {id(parameter) for parameter in module.parameters()} == {id(parameter) for parameter in parts}
+    exported = th.export.export(module, (th.zeros(1, *model.observation_space.shape, dtype=th.uint8),))
+    assert sum(value.numel() for value in exported.state_dict.values()) == sum(map(th.numel, parts)) + 4  # two bounds
+
+
 def test_a_policy_that_is_not_there() -> None:
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
     with pytest.raises(ValueError, match="actor is 'curious', but this model has 'task': choose one of them"):
