@@ -434,7 +434,7 @@ COMMANDS: dict[str, str] = {
     ),
     "experiment grid.yml --seeds 0": (
         "sb3-cure experiment: error: --seeds is 0, but it must be how many (1 or more) or "
-        "which, each from 0 to 2**32 - 1: change it."
+        "which, each from 0 to 2**31 - 1: change it."
     ),
     "experiment grid.yml --retries 1": "sb3-cure experiment: error: --retries is of Ray: add --engine ray.",
     "experiment grid.yml --engine ray --cpus-per-cell -1": (
@@ -451,7 +451,16 @@ COMMANDS: dict[str, str] = {
         "required to perform a relative import for '.cameras'): name one of the working directory or an installed one."
     ),
     "experiment grid.yml --out grid.yml": (
-        "sb3-cure experiment: error: --out is grid.yml, which is a file: give a folder."
+        "sb3-cure experiment: error: --out is '{folder}/grid.yml', but {folder}/grid.yml is a file: name a folder, or "
+        "remove the file."
+    ),
+    "experiment grid.yml --dry-run --out grid.yml/results": (
+        "sb3-cure experiment: error: --out is 'grid.yml/results', but {folder}/grid.yml is a file: name a folder, or "
+        "remove the file."
+    ),
+    "experiment grid.yml --engine ray --gpus-per-cell 1.5": (
+        "sb3-cure experiment: error: --gpus-per-cell is 1.5, but Ray shares one card only: give 1 or less, or a whole "
+        "number."
     ),
     "experiment grid.yml --out grid.yml/results": (
         "sb3-cure experiment: error: --out is '{folder}/grid.yml/results', but "
@@ -731,17 +740,17 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
     "no seeds": (
         {"seeds": 0},
         "sb3-cure experiment: error: seeds in grid.yml is 0, but it must be how many (1 or more) or "
-        "which, each from 0 to 2**32 - 1: change it.",
+        "which, each from 0 to 2**31 - 1: change it.",
     ),
     "a negative seed": (
         {"seeds": [1, -2]},
         "sb3-cure experiment: error: seeds in grid.yml is [1, -2], but it must be how many "
-        "(1 or more) or which, each from 0 to 2**32 - 1: change it.",
+        "(1 or more) or which, each from 0 to 2**31 - 1: change it.",
     ),
     "a seed that is too large": (
-        {"seeds": [2**32]},
-        "sb3-cure experiment: error: seeds in grid.yml is [4294967296], but it must be how "
-        "many (1 or more) or which, each from 0 to 2**32 - 1: change it.",
+        {"seeds": [2**31]},
+        "sb3-cure experiment: error: seeds in grid.yml is [2147483648], but it must be how "
+        "many (1 or more) or which, each from 0 to 2**31 - 1: change it.",
     ),
     "no list of tasks": (
         {"tasks": "all"},
@@ -756,6 +765,11 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
     "a list of methods": (
         {"methods": ["a"]},
         "sb3-cure experiment: error: methods in grid.yml is ['a'], but it must be a mapping (key: value): change it.",
+    ),
+    "two tasks of one name": (
+        {"tasks": ["CartPole-v0", "CartPole-v1"]},
+        "sb3-cure experiment: error: tasks in grid.yml has both 'CartPole-v0' and 'CartPole-v1', whose results would "
+        "share the folder 'CartPole': write a grid for each, with another name of the experiment.",
     ),
     "no methods": (
         {"methods": {}},
@@ -803,6 +817,43 @@ GRIDS: dict[str, tuple[dict[str, Any], str]] = {
         arm(overrides={"policy": "MlpPolicy"}),
         "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: 'MlpPolicy' got "
         "images of shape (6, 36, 36), but it reads vectors: use 'CnnPolicy'.",
+    ),
+    "more layers than the images have pixels for": (
+        arm(overrides={"policy_kwargs": {"features_extractor_kwargs": {"n_layers": 12, "n_filters": 2}}}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: observations of 36x36 pixels are too "
+        "small for 12 convolutions of 3x3 (the first with stride 2), which need at least 47x47: use a larger "
+        "image_size, or fewer layers through policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=...)).",
+    ),
+    "a crop that is larger than the images": (
+        arm(overrides={"srl": "curl", "srl_kwargs": {"augmentation": "crop", "crop_size": 84}}),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: srl_kwargs got augmentation='crop' "
+        "with crop_size=84 for observations of 36 pixels, but crops must have at least 1 pixel and be smaller than the "
+        "observation: render larger (CURL: image_size=100), set another crop_size, or use augmentation='shift'.",
+    ),
+    "neither training nor pretraining": (
+        arm(train=False),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: it neither trains nor pretrains: add "
+        "pretrain, or give a budget of at least 1 without train: false.",
+    ),
+    "pretraining without a head": (
+        arm(
+            pretrain={"collector": "random", "budget": 8},
+            overrides={"srl": None, "curiosity": None, "warmup_updates": None},
+        ),
+        "sb3-cure experiment: error: method 'a' on tests/PixelBox-v0 cannot work: it pretrains the representation, but "
+        "srl is None: choose srl: rae, curl or a head of your own, or remove pretrain.",
+    ),
+    "observations that common heads cannot judge alike": (
+        {
+            "kind": "visitation",
+            "methods": {
+                name: {"config": "settings.yml", "overrides": {"env_kwargs": {"frame_stack": frames}}}
+                for name, frames in (("a", 2), ("b", 3))
+            },
+        },
+        "sb3-cure experiment: error: methods 'a' and 'b' see tests/PixelBox-v0 in observations of shape (6, 36, 36) "
+        "and (9, 36, 36), but common heads judge all methods alike: give them the same env_kwargs, or write a grid "
+        "for each.",
     ),
     "an unknown head": (
         arm(overrides={"srl": "vae"}),

@@ -261,6 +261,79 @@ def test_a_dry_run_refuses_what_a_run_would(tmp_path: Path, capsys: pytest.Captu
     assert "--checkpoint-minutes is -1.0, but it must be" in capsys.readouterr().err
 
 
+def test_an_edited_grid_is_refused_whatever_arms_it_has_left(tmp_path: Path) -> None:
+    """Results of another budget, evaluation or kind do not compare, though no arm is in both; further arms go in."""
+    methods = {name: {"config": "zoo.yml"} for name in "abc"}
+    first = {"a": methods["a"]}
+    out = tmp_path / "out"
+    assert run.run_grid(load_grid(write_grid(tmp_path, budget=80, methods=first)), out, pictures=False) == []
+    described = out / "tiny" / "grid.json"
+    for other in (
+        dict(budget=40),
+        dict(budget=80, evaluation=dict(every=40, episodes=2)),
+        dict(budget=80, kind="visitation"),
+    ):
+        grid = load_grid(write_grid(tmp_path, **{**other, "methods": {"c": methods["c"]}}))
+        kept = described.read_text()
+        for where in ("tiny was run", "seed0 was run"):
+            with pytest.raises(GridError, match=f"{where} with other settings: (budget|eval.*|kind) is .* there and"):
+                run.check_grid(grid, out)
+            described.unlink(missing_ok=True)
+        described.write_text(kept)
+    more = load_grid(write_grid(tmp_path, budget=80, methods={"b": methods["b"]}, seeds=2), seeds=1)
+    assert run.run_grid(more, out, pictures=False) == []
+    assert json.loads(described.read_text())["methods"].keys() == {"a", "b"}
+    alone = {"d": {**methods["a"], "pretrain": {"collector": "random", "budget": 80}, "train": False}}
+    assert run.run_grid(load_grid(write_grid(tmp_path, budget=80, methods=alone)), out, pictures=False) == []
+    described.unlink()
+    run.check_grid(load_grid(write_grid(tmp_path, budget=80, methods=methods)), out)
+
+
+def test_a_number_of_seeds_is_of_those_that_the_grid_lists(tmp_path: Path) -> None:
+    listed = write_grid(tmp_path, seeds=[5, 3, 4])
+    assert [cell.seed for cell in load_grid(listed, seeds=2).cells] == [3, 5]
+    assert [cell.seed for cell in load_grid(listed, seeds=[0]).cells] == [0]
+    with pytest.raises(GridError, match=r"--seeds asks for 4, but seeds in .* lists 3: ask for fewer, or say which"):
+        load_grid(listed, seeds=4)
+    assert [cell.seed for cell in load_grid(write_grid(tmp_path, seeds=2), seeds=3).cells] == [0, 1, 2]
+
+
+def test_what_an_environment_raises_is_told_before_the_first_cell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def no_display(self: PixelBox, **_: Any) -> None:
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(PixelBox, "__init__", no_display)
+    assert run.main([str(write_grid(tmp_path)), "--out", str(tmp_path / "out"), "--dry-run"]) == 2
+    assert "'cure' on tests/PixelBox-v0 cannot work: RuntimeError: no display" in capsys.readouterr().err
+
+
+def test_of_unknown_time_limits_it_is_said_that_episodes_must_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Else the first evaluation would hang without a word; environments of dm_control and of Gymnasium tell theirs."""
+    sentence = f"{TASK} tells no time limit: if its episodes do not end by themselves, its first evaluation never ends"
+    gym.register("tests/LimitedBox-v0", PixelBox, max_episode_steps=7)
+    try:
+        path = write_grid(tmp_path, tasks=["dmc_pixels/cartpole-swingup-v0", "tests/LimitedBox-v0", TASK])
+        run.check_grid(load_grid(path), tmp_path / "out")
+    finally:
+        del gym.registry["tests/LimitedBox-v0"]
+    (told,) = capsys.readouterr().out.splitlines()
+    assert told.startswith(sentence)
+
+
+def test_checking_arms_leaves_random_numbers_alone(tmp_path: Path) -> None:
+    """Their networks are built, without the replay buffer."""
+    overrides = {"buffer_size": 10**12}
+    grid = load_grid(write_grid(tmp_path, methods={"a": {"config": "zoo.yml", "overrides": overrides}}))
+    before = th.get_rng_state(), np.random.get_state()[1].tolist(), random.getstate()
+    run.check_grid(grid, tmp_path / "out")
+    assert th.equal(th.get_rng_state(), before[0])
+    assert (np.random.get_state()[1].tolist(), random.getstate()) == before[1:]
+
+
 # ----------------------------------------------------------------------- cells
 
 
@@ -702,6 +775,50 @@ def test_a_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out == "2 of 2 cells done\n"
     assert run.main([str(path), "--out", str(out), "--dry-run"]) == 0
     assert capsys.readouterr().out.count(": done") == 2
+
+
+def test_a_cell_that_cannot_be_written_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Not even its error can be kept: it is printed. What only tells how far a cell is may be missing."""
+    path, out = write_grid(tmp_path, seeds=2, budget=40), tmp_path / "out"
+    folder = out / "tiny" / "PixelBox" / "cure"
+    folder.mkdir(parents=True)
+    (folder / "seed0").write_text("in its place")
+    write = cells.write_json
+
+    def disk_is_full(path: Path, content: Any) -> None:
+        if path.name == "progress.json":
+            raise OSError("No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(cells, "write_json", disk_is_full)
+    assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 1
+    told = capsys.readouterr().out
+    assert "error.txt cannot be written (" in told and "it would tell: FileExistsError" in told
+    assert "seed0 failed: there is no file any more that tells why" in told
+    assert (folder / "seed1" / "DONE").exists()
+
+
+def test_damaged_files_of_results_are_named(tmp_path: Path, visits: Path) -> None:
+    """In one sentence, with what to do; how far a cell was, is not worth one."""
+    grid, out = load_grid(visits, seeds=2), tmp_path / "out"
+    assert run.run_grid(grid, out, pictures=False) == []
+    cell = out / grid.cells[0].folder
+    head = out / heads.common_heads(grid, out)[0].folder
+    for path in (cell / "config.json", cell / "run.json", head / "common_head.json", out / "tiny" / "grid.json"):
+        whole = path.read_text()
+        for damaged in ("", "[]", "{", "{}"):
+            if path.name in ("config.json", "grid.json") and damaged == "{}":
+                continue  # refused as other settings
+            path.write_text(damaged)
+            with pytest.raises(GridError, match=f"{path} is damaged: put it back, or remove .*, which is then made"):
+                run.run_grid(grid, out, pictures=False)
+        path.write_text(whole)
+    (cell / "DONE").unlink()
+    for damaged in ("", "{}", "[1]", '{"seconds": 1}'):
+        (cell / "progress.json").write_text(damaged)
+        assert run.read_progress(grid.cells[0], out) == ("waiting", {})
 
 
 def test_logs_tell_how_far_everything_is(

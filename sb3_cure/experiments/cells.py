@@ -7,7 +7,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import DONE, Cell, GridError
+from sb3_cure.experiments.grid import DONE, Cell, GridError, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.files import lock
 
-#: Evaluations start from the same states in all cells
+#: Evaluations start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
 #: The file that tells why a cell failed, until it is begun again
 ERROR = "error.txt"
@@ -67,16 +67,17 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     return folder
 
 
-def check_settings(folder: Path, config: dict[str, Any]) -> None:
+def check_settings(folder: Path, config: dict[str, Any], name: str = "config.json") -> None:
     """
     :param folder: Of what is to be run, or has been run
-    :param config: Its settings
+    :param config: Its settings, or some of them
+    :param name: The file that tells those that it was run with
     :raises GridError: if the folder holds results of other settings
     """
-    path = folder / "config.json"
+    path = folder / name
     if not path.exists():
         return
-    begun, now = json.loads(path.read_text()), _plain(config)
+    begun, now = read_kept(path), _plain(config)
     for key in now:
         if begun.get(key) != now[key]:
             raise GridError(
@@ -379,12 +380,13 @@ def is_held(folder: Path) -> bool:
 
 
 def write_progress(folder: Path, **progress: Any) -> None:
-    """Tell a display, which may be another process or machine, how far this is.
+    """Tell a display, which may be another process or machine, how far this is, if it can be told.
 
     :param folder: Of the cell
     :param progress: What to tell, besides when and where
     """
-    write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
+    with suppress(OSError):
+        write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
 
 
 def _keep_config(cell: Cell, folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
+import json
 import math
 import pkgutil
 import re
@@ -10,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import torch as th
 import yaml
 
 from sb3_cure.buffer_files import can_be_kept
-from sb3_cure.checks import check_arguments, check_parts, check_shared_encoder_space
+from sb3_cure.checks import check_arguments, check_curious_agent, check_parts, check_shared_encoder_space
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.values import arguments_of, entry_for, import_environments, is_integer
@@ -138,6 +140,23 @@ class Grid:
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
 
 
+def read_kept(path: Path, *keys: str) -> dict[str, Any]:
+    """
+    :param path: A JSON file in the folder of results
+    :param keys: What it must have
+    :return: Its content
+    :raises GridError: if it is damaged
+    """
+    try:
+        content = json.loads(path.read_text())
+        if not isinstance(content, dict) or not all(key in content for key in keys):
+            raise ValueError
+    except (OSError, ValueError):
+        remove = path if path.name == "grid.json" else path.parent
+        raise GridError(f"{path} is damaged: put it back, or remove {remove}, which is then made anew.") from None
+    return content
+
+
 def short_name(task: str) -> str:
     """
     :param task: Gymnasium id
@@ -169,7 +188,7 @@ def load_grid(
     so that one can be asked for only where no method pretrains.
 
     :param path: YAML file
-    :param seeds: Instead of the file's: how many (from 0), or which
+    :param seeds: Instead of the file's: how many (the first of those that it lists, else from 0), or which
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
     :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
@@ -190,6 +209,13 @@ def load_grid(
     episodes = _whole_number("evaluation.episodes", evaluation.get("episodes", 10), path, least=1)
     all_seeds = _seeds(content.get("seeds", 1), f"seeds in {path}")
     chosen_seeds = all_seeds if seeds is None else _seeds(seeds, "--seeds")
+    if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
+        if seeds > len(all_seeds):
+            raise GridError(
+                f"--seeds asks for {seeds}, but seeds in {path} lists {len(all_seeds)}: ask for fewer, or say which "
+                "(0,3,4)."
+            )
+        chosen_seeds = all_seeds[:seeds]
     all_tasks = _tasks(content["tasks"], path)
     chosen_tasks = _choose(tasks, all_tasks, "task", path)
     arms = _mapping("methods", content["methods"], path)
@@ -255,16 +281,18 @@ def load_grid(
 
 
 def check_arms(cells: Iterable[Cell]) -> None:
-    """Whether environments and arguments of the arms exist, before the first of them is trained.
+    """Whether environments and arguments of the arms can work, before the first of them is trained.
 
-    :param cells: Cells that are to be run
+    :param cells: Cells that are to be run; of a grid of kind ``"visitation"`` all that common heads are made of
     :raises GridError: for the first that cannot be
     """
-    envs: dict[str, gym.Env] = {}
+    envs: dict[tuple[str, str], gym.Env] = {}
+    first: dict[str, tuple[str, Any]] = {}
+    built: set[str] = set()
     try:
         for task, arm, cell in {(cell.task, cell.method): (cell.task, cell.method, cell) for cell in cells}.values():
             try:
-                key = f"{task} {cell.env_kwargs}"
+                key = task, str(cell.env_kwargs)
                 if key not in envs:
                     envs[key] = _make(task, cell.env_kwargs)
                 model = CuReSAC(env=envs[key], _init_setup_model=False, **cell.build_arguments())
@@ -273,21 +301,64 @@ def check_arms(cells: Iterable[Cell]) -> None:
                     check_shared_encoder_space(model.observation_space, model.policy_class)
                     model._choose_replay_buffer()
                 check_parts(model)
-                buffer = model.replay_buffer_class
-                if buffer is not None and not can_be_kept(buffer):
-                    raise ValueError(
-                        f"replay_buffer_class is {buffer.__name__}, which checkpoints of cells cannot hold without "
-                        "pickle: leave it out, or name FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
-                    )
+                _check_cell(cell, model)
+                networks = f"{model.observation_space} {cell.arguments}"
+                if networks not in built:
+                    _build_networks(model)
+                    built.add(networks)
             except GLUnavailableError:  # with Ray other machines may have what this one has not
                 return
             except GridError:
                 raise
-            except (ValueError, TypeError, gym.error.Error) as error:
-                raise GridError(f"method {arm!r} on {task} cannot work: {' '.join(str(error).split())}") from error
+            except Exception as error:
+                known = isinstance(error, ValueError | TypeError | gym.error.Error)
+                reason = f"{'' if known else type(error).__name__ + ': '}{' '.join(str(error).split())}"
+                raise GridError(f"method {arm!r} on {task} cannot work: {reason}") from error
+            shape = model.observation_space.shape
+            other, others = first.setdefault(task, (arm, shape))
+            if cell.kind == "visitation" and shape != others:
+                raise GridError(
+                    f"methods {other!r} and {arm!r} see {task} in observations of shape {others} and {shape}, but "
+                    "common heads judge all methods alike: give them the same env_kwargs, or write a grid for each."
+                )
+        limits = ("_max_episode_steps", "max_episode_steps", "physics")  # those of dm_control end by themselves
+        unlimited = [task for (task, _), env in envs.items() if not any(map(env.has_wrapper_attr, limits))]
+        for task in dict.fromkeys(unlimited):
+            print(
+                f"{task} tells no time limit: if its episodes do not end by themselves, its first evaluation never "
+                "ends; then register it with max_episode_steps=1000, for example."
+            )
     finally:
         for env in envs.values():
             env.close()
+
+
+def _build_networks(model: CuReSAC) -> None:
+    """On the CPU, as the cells may run on another machine, and without a replay buffer, which may fill the memory."""
+    model.device, model.compile = th.device("cpu"), False
+    model.replay_buffer = object()  # type: ignore[assignment]  # else SB3 would make one
+    with th.random.fork_rng(devices=[]):
+        model._setup_model()
+
+
+def _check_cell(cell: Cell, model: CuReSAC) -> None:
+    buffer = model.replay_buffer_class
+    if buffer is not None and not can_be_kept(buffer):
+        raise ValueError(
+            f"replay_buffer_class is {buffer.__name__}, which checkpoints of cells cannot hold without pickle: leave "
+            "it out, or name FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
+        )
+    if cell.pretrain is None and cell.budget == 0:
+        raise ValueError(
+            "it neither trains nor pretrains: add pretrain, or give a budget of at least 1 without train: false."
+        )
+    if cell.pretrain is not None and model.srl is None:
+        raise ValueError(
+            "it pretrains the representation, but srl is None: choose srl: rae, curl or a head of your own, or remove "
+            "pretrain."
+        )
+    if cell.pretrain is not None and cell.pretrain.collector == "curious":
+        check_curious_agent(model)
 
 
 def _make(task: str, env_kwargs: dict[str, Any]) -> gym.Env:
@@ -406,9 +477,9 @@ def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
 def _seeds(value: Any, name: str) -> list[int]:
     numbers = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
     valid = isinstance(numbers, Sequence) and not isinstance(numbers, str) and len(numbers) > 0
-    if not valid or not all(is_integer(number, 0) and number < 2**32 for number in numbers):
+    if not valid or not all(is_integer(number, 0) and number < 2**31 for number in numbers):
         raise GridError(
-            f"{name} is {value!r}, but it must be how many (1 or more) or which, each from 0 to 2**32 - 1: change it."
+            f"{name} is {value!r}, but it must be how many (1 or more) or which, each from 0 to 2**31 - 1: change it."
         )
     return list(dict.fromkeys(numbers))
 
@@ -429,7 +500,15 @@ def _tasks(value: Any, path: Path) -> dict[str, str]:
                 f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
                 "dmc_pixels/<domain>-<task>-v0; one of your own is my_module:My-v0, with the module that registers it)."
             )
-    return {**{short_name(task): task for task in value}, **{task: task for task in value}}
+    by_name: dict[str, str] = {}
+    for task in value:
+        other = by_name.setdefault(short_name(task), task)
+        if other != task:
+            raise GridError(
+                f"tasks in {path} has both {other!r} and {task!r}, whose results would share the folder "
+                f"{short_name(task)!r}: write a grid for each, with another name of the experiment."
+            )
+    return {**by_name, **{task: task for task in value}}
 
 
 def _choose(names: Sequence[str] | None, known: dict[str, str], what: str, path: Path) -> list[str]:

@@ -22,7 +22,7 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, check_settings, write_progress
 from sb3_cure.experiments.files import describe_run, read_rows, write_csv, write_json
-from sb3_cure.experiments.grid import DONE, Cell, Grid, GridError, short_name
+from sb3_cure.experiments.grid import DONE, Cell, Grid, GridError, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 from sb3_cure.files import replacing
 
@@ -89,7 +89,7 @@ class CommonHead:
         path = results / self.folder / RECORD
         if not path.exists():
             return False
-        made_of = json.loads(path.read_text())["cells"]
+        made_of = read_kept(path, "cells")["cells"]
         if made_of == self.finished:
             return True
         of_more = self.finished.items() <= made_of.items()
@@ -146,7 +146,7 @@ def _finished_at(folder: Path) -> str | None:
     """When the cell was finished; None if it is not."""
     if not all((folder / name).exists() for name in (DONE, "run.json")):
         return None
-    return str(json.loads((folder / "run.json").read_text())["finished"])
+    return str(read_kept(folder / "run.json", "finished")["finished"])
 
 
 def _lacks_model(cell: Cell, results: Path) -> bool:
@@ -176,7 +176,7 @@ def run_head(head: CommonHead, results: Path) -> None:
         for cell in head.cells_of(head.seed):
             _add_rows(judge, cell, results)
         write_json(folder / RECORD, {"cells": head.finished, **describe_run()})
-        (folder / "progress.json").unlink()
+        (folder / "progress.json").unlink(missing_ok=True)
     if all(replace(head, seed=seed).is_done(results) for seed in head.seeds):
         for seed in head.seeds:
             shutil.rmtree(_mix_folder(head, seed, results), ignore_errors=True)

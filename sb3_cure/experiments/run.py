@@ -1,7 +1,6 @@
 """Run a grid: in this process, or on Ray (this machine or a cluster)."""
 
 import argparse
-import json
 import os
 import platform
 import re
@@ -22,7 +21,7 @@ from rich.table import Table
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
 from sb3_cure.experiments.files import write_json, write_text
-from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid
+from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid, read_kept, seed_of
 from sb3_cure.experiments.heads import CommonHead, Unit, common_heads, run_head, without_model
 from sb3_cure.values import check_folder, is_integer, is_number
 
@@ -59,7 +58,7 @@ def run_grid(
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
         only where no machine has a GPU: Ray would start a cell per core, all on the first card
     :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
-    :return: The cells and common heads that failed; each has its traceback in ``error.txt``
+    :return: The cells and common heads that failed; each has its traceback in ``error.txt``, if it can be written
     :raises GridError: with one sentence, before anything is written, for what cannot be run
     """
     results = Path(results).resolve()
@@ -70,13 +69,10 @@ def run_grid(
     resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
     with _ray(address, resources) if engine == "ray" else nullcontext() as ray:
         try:
-            check_folder("--out", results)
             _keep_grid(grid, results / grid.experiment)
         except OSError as error:
             reason = f"which cannot be written to ({error.strerror})"
             raise GridError(f"--out is {results}, {reason}: give another.") from error
-        except ValueError as error:
-            raise error if isinstance(error, GridError) else GridError(str(error)) from error
         with _live_progress(lambda: [*grid.cells, *common_heads(grid, results, left)], results):
             if ray is None:
                 failed = _run_here(left, ready, settings)
@@ -99,13 +95,28 @@ def check_grid(grid: Grid, results: Path) -> None:
     """
     :param grid: A grid
     :param results: Folder of all results, whether it exists or not
-    :raises GridError: with one sentence, if an arm cannot work, or the folder holds cells of other settings: also of
-        other seeds, as they are to be compared with those that are run now
+    :raises GridError: with one sentence, if an arm cannot work, the folder cannot be written to, or it holds cells of
+        other settings: also of other seeds and arms, as they are to be compared with those that are run now
     """
+    folder = results / grid.experiment
+    try:
+        check_folder("--out", results)
+        check_folder(f"the folder of {grid.experiment} in --out", folder)
+    except ValueError as error:
+        raise GridError(str(error)) from error
     every: list[Unit] = [*grid.with_seeds_in(results), *common_heads(grid, results, grid.complete)]
     for unit in every:
         check_settings(results / unit.folder, unit.config())
-    check_arms(cell for cell in grid.cells if not cell.is_done(results))
+    shared = {key: grid.description[key] for key in ("kind", "budget", "evaluation")}
+    check_settings(folder, shared, "grid.json")
+    evaluation = {f"eval_{key}": value for key, value in shared["evaluation"].items()}
+    for path in sorted(folder.glob("*/*/seed*/config.json")):  # of arms that are not in the file, too
+        if seed_of(path.parent) is not None:
+            budget = shared["budget"] if read_kept(path, "budget")["budget"] else 0  # 0 of those that only pretrain
+            check_settings(path.parent, {"kind": grid.kind, "budget": budget, **evaluation})
+    left = [cell for cell in grid.cells if not cell.is_done(results)]
+    tasks = {cell.task for cell in left}
+    check_arms([cell for cell in grid.complete if cell.task in tasks] if grid.kind == "visitation" else left)
 
 
 def _heads_when_ready(grid: Grid, results: Path) -> Ready:
@@ -143,6 +154,10 @@ def _check_run(
     for name, value in numbers.items():
         if not is_number(value, low=0):
             raise GridError(f"--{name} is {value!r}, but it must be a number of at least 0: change it.")
+    if gpus_per_cell is not None and gpus_per_cell > 1 and gpus_per_cell % 1:
+        raise GridError(
+            f"--gpus-per-cell is {gpus_per_cell:g}, but Ray shares one card only: give 1 or less, or a whole number."
+        )
     if not is_integer(retries, -1):
         raise GridError(f"--retries is {retries!r}, but it must be at least 0, or -1 for no limit: change it.")
 
@@ -172,8 +187,11 @@ def _run_on_worker(unit: Unit, results: Path, checkpoint_minutes: float, picture
 
 def _keep_error(unit: Unit, results: Path, text: str) -> None:
     path = results / unit.folder / ERROR
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, text)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, text)
+    except OSError as error:
+        print(f"{path} cannot be written ({error.strerror}); it would tell: {text.strip().splitlines()[-1]}")
 
 
 @contextmanager
@@ -255,19 +273,10 @@ def _keep_grid(grid: Grid, folder: Path) -> None:
     path = folder / "grid.json"
     description = dict(grid.description)
     if path.exists():
-        try:
-            before = json.loads(path.read_text())
-            before["seeds"], before["tasks"], before["methods"], before["kind"]
-        except (ValueError, KeyError, TypeError):
-            raise GridError(f"{path} is damaged: remove it; the next call writes it anew.") from None
+        before = read_kept(path, "seeds", "tasks", "methods")
         description["seeds"] = sorted({*before["seeds"], *description["seeds"]})
         description["tasks"] = list(dict.fromkeys([*before["tasks"], *description["tasks"]]))
         description["methods"] = {**before["methods"], **description["methods"]}
-        if before["kind"] != grid.kind:
-            raise GridError(
-                f"{path} is of kind {before['kind']!r}, but this grid is of kind {grid.kind!r}: choose another --out, "
-                "or another name of the experiment."
-            )
     folder.mkdir(parents=True, exist_ok=True)
     write_json(path, description)
 
@@ -442,8 +451,8 @@ def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
     """
     folder = results / unit.folder
     try:
-        progress = json.loads((folder / "progress.json").read_text())
-    except (OSError, ValueError):
+        progress = read_kept(folder / "progress.json", "time")
+    except GridError:  # or there is none
         progress = {}
     if unit.is_done(results):
         return "done", progress
@@ -502,7 +511,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("grid", type=Path, help="YAML file, for example zoo_configs/experiments/curves.yml")
     parser.add_argument("--out", type=Path, default=Path("results"), help="folder of results (default: results)")
-    parser.add_argument("--seeds", type=_seed_choice, help="how many (5), or which (0,3,4; one alone: 3,)")
+    parser.add_argument(
+        "--seeds",
+        type=_seed_choice,
+        help="how many (5: the first ones, where the grid lists its seeds), or which (0,3,4; one alone: 3,)",
+    )
     parser.add_argument("--tasks", type=_names, help="some of the grid's tasks: cartpole-swingup,finger-spin")
     parser.add_argument("--methods", type=_names, help="some of the grid's methods")
     parser.add_argument(
@@ -531,8 +544,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given = [name for name in of_ray if getattr(options, name) != parser.get_default(name)]
         if options.engine == "local" and given:
             raise GridError(f"--{given[0].replace('_', '-')} is of Ray: add --engine ray.")
-        if options.out.exists() and not options.out.is_dir():
-            raise GridError(f"--out is {options.out}, which is a file: give a folder.")
         checked = ("engine", "checkpoint_minutes", "cpus_per_cell", "gpus_per_cell", "retries")
         how = {name: getattr(options, name) for name in checked}
         if options.dry_run:
@@ -562,7 +573,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _failures(failed: Iterable[Unit], results: Path) -> Iterator[str]:
     for unit in failed:
         path = Path(results) / unit.folder / ERROR
-        yield f"{unit.folder} failed: {path.read_text().strip().splitlines()[-1]} ({path})"
+        try:
+            reason = path.read_text().strip().splitlines()[-1]
+        except (OSError, IndexError):  # begun anew by another process meanwhile, or never written
+            reason = "there is no file any more that tells why"
+        yield f"{unit.folder} failed: {reason} ({path})"
 
 
 if __name__ == "__main__":
