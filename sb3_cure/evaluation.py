@@ -154,7 +154,8 @@ def run_episodes(
     :param n_episodes: How many episodes
     :param actor: Whose actions: ``"task"``, ``"curious"`` or ``"random"`` (uniform)
     :param deterministic: Whether policies act by their mean
-    :param seed: Seed of the first reset and of random actions
+    :param seed: Seed of the first reset and of random actions. Later episodes start as the environment's random numbers
+        go on: alike for all policies where ``step`` draws none, as in DeepMind Control; else the first one only
     :param render: Whether to keep ``env.render()`` of each step
     :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
         (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]

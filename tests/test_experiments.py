@@ -1006,6 +1006,49 @@ def test_pictures_show_every_policy_and_name_the_actions(tmp_path: Path, monkeyp
     assert (tmp_path / "map.png").exists()
 
 
+@pytest.mark.parametrize(
+    ("channels", "wraps", "shown"), [(2, False, 1), (3, False, 3), (4, True, 1), (4, False, 1), (9, False, 1)]
+)
+def test_pictures_are_drawn_of_any_number_of_channels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, wraps: bool, shown: int
+) -> None:
+    """Whether or not an environment tells its frames: four channels are not a picture with transparency."""
+
+    class Channels(PixelBox):
+        def __init__(self) -> None:
+            super().__init__(frame_stack=3, tells_frame_stack=False)
+            self.observation_space = gym.spaces.Box(0, 255, (36, 36) if wraps else (channels, 36, 36), np.uint8)
+
+        def observe(self, first: bool = False) -> np.ndarray:
+            seen = super().observe(first)
+            return seen[0] if wraps else seen[:channels]
+
+    def make() -> gym.Env:
+        return gym.wrappers.FrameStackObservation(Channels(), channels) if wraps else Channels()
+
+    gym.registry[TASK] = gym.envs.registration.EnvSpec(TASK, make)
+    drawn: list[int] = []
+    draw = plots._picture
+    monkeypatch.setattr(plots, "_picture", lambda image: (drawn.append(image.shape[-1]), draw(image))[1])
+    (cell,) = load_grid(write_grid(tmp_path, budget=160)).cells
+    folder = run_cell(cell, tmp_path / "out")
+    assert (folder / "uncomfortable.png").is_file() and (folder / "DONE").is_file()
+    assert set(drawn) == {shown}
+
+
+def test_pictures_that_cannot_be_drawn_cost_no_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("no\nfont")
+
+    monkeypatch.setattr(plots, "uncomfortable_frames", fail)
+    (cell,) = load_grid(write_grid(tmp_path, budget=80)).cells
+    folder = run_cell(cell, tmp_path / "out")
+    assert cell.is_done(tmp_path / "out") and (folder / "run.json").is_file()
+    assert f"{folder} is without some of its pictures: RuntimeError: no font\n" in capsys.readouterr().out
+
+
 @pytest.fixture
 def visits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A grid of three seeds on the tiny task, with common heads that are soon fitted."""

@@ -123,7 +123,11 @@ class _CellRun:
         if cell.kind == "visitation":
             measure_visits(self.model, cell, self.folder)
         if self.pictures:
-            draw_cell(self.model, cell, self.folder)
+            try:
+                draw_cell(self.model, cell, self.folder)
+            except Exception as error:  # the results are there without them
+                reason = " ".join(str(error).split())
+                print(f"{self.folder} is without some of its pictures: {type(error).__name__}: {reason}")
         record.write_tables()
         record.report(self.model, force=True)
         write_json(self.folder / "run.json", record.conditions(self.model))
@@ -244,7 +248,7 @@ class _Record(BaseCallback):
         self._tick()
 
     def evaluate(self) -> None:
-        """Evaluate each policy over episodes that start from the same states in all cells."""
+        """Evaluate each policy over episodes that start alike in all cells, see ``run_episodes``."""
         model: Any = self.model
         steps = model.num_timesteps
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")

@@ -15,6 +15,7 @@ from sb3_cure.experiments import plots
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.video import write_video
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
+from sb3_cure.metrics import frame_stack_of
 
 #: Films and reconstructed observations are the same in all cells of a task, as far as the policies let them
 FILM_SEED = 30_000
@@ -68,7 +69,6 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     name = f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
     env = gym.make(cell.task, **cell.env_kwargs)
     can_film = "rgb_array" in env.metadata.get("render_modes", [])
-    frame_stack = env.get_wrapper_attr("frame_stack") if env.has_wrapper_attr("frame_stack") else 1
     repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
     if env.has_wrapper_attr("physics") and visiting_actors(model, cell) != ["random"]:
         visits = _measured_visits(model, cell, env, folder)
@@ -99,10 +99,16 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     plots.uncomfortable_frames(
         folder / "uncomfortable.png",
         found,
-        frame_stack,
+        _frames_per_observation(model),
         f"What the agent finds uncomfortable: {name}",
         None if drawn is None else drawn.cpu().numpy(),
     )
+
+
+def _frames_per_observation(model: CuReSAC) -> int:
+    """As the environments tell, if frames then are grey or in colour; else each channel counts as a frame."""
+    told, (channels, *_) = frame_stack_of(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
+    return told if channels in (told, 3 * told) else channels
 
 
 def _measured_visits(
