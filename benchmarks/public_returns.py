@@ -138,14 +138,15 @@ def run_public(checkout: Path, cell: Cell, results: Path) -> None:
     """
     tune_allocator()
     folder = results / cell.folder
-    check_settings(folder, cell.config())
+    config = {key: value for key, value in cell.config().items() if key != "defaults"}  # those of ours
+    check_settings(folder, config)
     folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
         if (folder / DONE).exists():
             return
         commit = checkout_commit(checkout)  # of what runs: later the checkout may have moved on
         run = _PublicRun(checkout, cell)
-        write_json(folder / "config.json", {**cell.config(), "action_repeat": run.action_repeat})
+        write_json(folder / "config.json", {**config, "action_repeat": run.action_repeat})
         write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
         conditions = {
             "device": "cpu",

@@ -247,6 +247,22 @@ def test_wrong_command_lines_are_one_sentence(tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "out").exists()
 
 
+def test_a_default_that_has_changed_is_another_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Of a newer version: its seeds are not mixed with those of before, unless what they had was not kept."""
+    arguments = [str(write_grid(tmp_path)), "--out", str(tmp_path / "out"), "--dry-run"]
+    folder = run_cell(load_grid(write_grid(tmp_path)).cells[0], tmp_path / "out", pictures=False)
+    config = json.loads((folder / "config.json").read_text())
+    assert config["defaults"]["update"] == "joint" and not config["defaults"].keys() & config["arguments"].keys()
+    monkeypatch.setitem(CuReSAC.__init__.__kwdefaults__, "update", "sequential")
+    assert run.main(arguments) == 2
+    sentence = "was run with other settings: defaults is {'update': 'joint'} there and {'update': 'sequential'} now."
+    assert sentence in capsys.readouterr().err
+    (folder / "config.json").write_text(json.dumps({key: config[key] for key in config if key != "defaults"}))
+    assert run.main(arguments) == 0
+
+
 def test_a_dry_run_refuses_what_a_run_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Settings that cannot work, and cells of other settings, which are not done for this grid."""
     out = ["--out", str(tmp_path / "out"), "--dry-run"]

@@ -79,10 +79,14 @@ def check_settings(folder: Path, config: dict[str, Any], name: str = "config.jso
         return
     begun, now = read_kept(path), _plain(config)
     for key in now:
-        if begun.get(key) != now[key]:
+        if begun.get(key) != now[key] and (key in begun or key != "defaults"):  # once they were not kept
+            there, here = begun.get(key), now[key]
+            if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ
+                names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
+                there, here = ({name: each[name] for name in names if name in each} for each in (there, here))
             raise GridError(
-                f"{folder} was run with other settings: {key} is {begun.get(key)!r} there and {now[key]!r} now. "
-                "Choose another --out, or remove that folder."
+                f"{folder} was run with other settings: {key} is {there!r} there and {here!r} now. Choose another "
+                "--out, or remove that folder."
             )
 
 

@@ -1,6 +1,7 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
+import inspect
 import json
 import math
 import pkgutil
@@ -106,8 +107,13 @@ class Cell:
         return (results / self.folder / DONE).exists()
 
     def config(self) -> dict[str, Any]:
-        """What its ``config.json`` holds."""
-        return asdict(self)
+        """What its ``config.json`` holds: with the values of the arguments that are not given, which may change."""
+        parameters = inspect.signature(CuReSAC.__init__).parameters.values()
+        names = _ARGUMENTS - self.arguments.keys()
+        defaults = {
+            each.name: each.default for each in parameters if each.name in names and each.default is not each.empty
+        }
+        return {**asdict(self), "defaults": defaults}
 
 
 @dataclass(frozen=True)
