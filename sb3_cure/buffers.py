@@ -153,6 +153,24 @@ class SkippingReplayBuffer(_SkipsMarked):
         return transitions(self, *self.last_sampled, env)
 
 
+def why_not_skipping(buffer: ReplayBuffer) -> str | None:
+    """
+    :param buffer: A replay buffer
+    :return: Why it cannot leave transitions out, and what to do, as the end of a sentence; None if it can
+    """
+    if isinstance(buffer, _SkipsMarked):
+        return None
+    if type(buffer) is not ReplayBuffer:
+        kind = type(buffer).__name__
+        return f"which a {kind} cannot do: train with SB3's ReplayBuffer or a FrameStackReplayBuffer."
+    if buffer.optimize_memory_usage:
+        return (
+            "which it cannot do with optimize_memory_usage=True, as its observation is the next one of another: leave "
+            "it False."
+        )
+    return None
+
+
 def skip_marked(buffer: ReplayBuffer, infos: list[dict[str, Any]]) -> None:
     """
     Before a row is added: see to it that a replay buffer never samples what is marked in it.
@@ -165,11 +183,9 @@ def skip_marked(buffer: ReplayBuffer, infos: list[dict[str, Any]]) -> None:
     """
     if isinstance(buffer, _SkipsMarked) or not any(is_marked(info) for info in infos):
         return
-    if type(buffer) is not ReplayBuffer:
-        raise ValueError(
-            f"A transition is to be left out of the replay buffer ({next(_told(infos))}), which a "
-            f"{type(buffer).__name__} cannot do: train with SB3's ReplayBuffer or a FrameStackReplayBuffer."
-        )
+    reason = why_not_skipping(buffer)
+    if reason is not None:
+        raise ValueError(f"A transition is to be left out of the replay buffer ({next(_told(infos))}), {reason}")
     # In place, as a rollout under way holds this very object.
     buffer.__class__ = SkippingReplayBuffer
     buffer._start_marking()  # type: ignore[attr-defined]

@@ -406,6 +406,8 @@ class ReconstructionCallback(_PictureCallback):
             if not self._has_seen_any():
                 return
             self.observations = self._spread(self.columns)
+            if self.observations is None:
+                return
         observed = th.as_tensor(self.observations, device=model.device)
         head = getattr(model.policy, "srl", None)
         with th.no_grad():
@@ -445,8 +447,9 @@ class ReconstructionCallback(_PictureCallback):
         chosen = np.random.randint(len(self._latest), size=n)
         return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
 
-    def _spread(self, n: int) -> np.ndarray:
-        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape]."""
+    def _spread(self, n: int) -> np.ndarray | None:
+        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape]; None if
+        none of them was good."""
         if self._buffer is not None:
             return _spread_over(self._buffer, n)
         chosen = np.linspace(0, len(self._latest) - 1, n).round().astype(int)
@@ -464,12 +467,16 @@ class ReconstructionCallback(_PictureCallback):
             )
 
 
-def _spread_over(buffer: ReplayBuffer, n: int) -> np.ndarray:
-    """Observations of the replay buffer, spread over the time that it spans, oldest first, [n, *shape]."""
-    rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
-    rows = rows[unmarked(buffer, rows, np.zeros(len(rows), int))]
-    rows = rows[np.linspace(len(rows) - 1, 0, n).round().astype(int)]
-    return transitions(buffer, rows, np.zeros(n, int)).observations.cpu().numpy()
+def _spread_over(buffer: ReplayBuffer, n: int) -> np.ndarray | None:
+    """Observations of the first environment with good ones in the replay buffer, spread over the time that they
+    span, oldest first, [n, *shape]; None where there is none."""
+    latest = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
+    for env in range(buffer.n_envs):
+        rows = latest[unmarked(buffer, latest, np.full(len(latest), env))]
+        if len(rows):
+            rows = rows[np.linspace(len(rows) - 1, 0, n).round().astype(int)]
+            return transitions(buffer, rows, np.full(n, env)).observations.cpu().numpy()
+    return None
 
 
 class CuriosityMapCallback(_PictureCallback):

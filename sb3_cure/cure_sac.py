@@ -32,7 +32,7 @@ from torch.nn import functional as F
 
 from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
 from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
-from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked
+from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked, why_not_skipping
 from sb3_cure.checkpoint import Run, resume, watch
 from sb3_cure.checks import (
     check_arguments,
@@ -66,6 +66,7 @@ from sb3_cure.precision import autocast_context, resolve_compile, resolve_precis
 from sb3_cure.serialization import ArchiveError
 from sb3_cure.settings import NEVER_SAVED, plain_arguments
 from sb3_cure.srl import SRLHead, get_srl_class
+from sb3_cure.values import is_integer
 from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
@@ -402,7 +403,8 @@ class CuReSAC(SAC):
 
     def _read_env_attributes(self) -> None:
         """What logging needs to know; again before each ``learn``, as ``set_env`` may have changed it."""
-        self._action_repeat = self._env_attribute("action_repeat") or 1
+        told = self._env_attribute("action_repeat")
+        self._action_repeat = int(told) if is_integer(told, 1) else 1
         self._frame_stack = 1 if self.env is None else frame_stack_of(self.env)
 
     def _env_attribute(self, name: str) -> Any:
@@ -475,10 +477,23 @@ class CuReSAC(SAC):
         )
         self._metrics.attach(self.logger)
         self._read_env_attributes()
+        self._check_skipping()
         self._run.watched = watch(callback)
         if resumed is not None:
             resumed.set_up(self)
         return total, callback
+
+    def _check_skipping(self) -> None:
+        """Whether transitions can be left out, if that may be asked for in the middle of the training."""
+        reason = why_not_skipping(self.replay_buffer)  # type: ignore[arg-type]
+        self._transition_guard.can_skip = reason is None and self._vec_normalize_env is None
+        if reason is not None and self.on_bad_transition == "skip":
+            raise ValueError(f"on_bad_transition='skip' leaves transitions out of the replay buffer, {reason}")
+        if reason is not None and getattr(self.env.unwrapped, "on_env_fault", None) == "restart":  # type: ignore[union-attr]
+            warnings.warn(
+                f"on_env_fault='restart' leaves transitions out of the replay buffer at the first fault, {reason}",
+                stacklevel=2,
+            )
 
     def set_logger(self, logger: Logger) -> None:
         """
@@ -580,7 +595,8 @@ class CuReSAC(SAC):
         try:
             with post_mortem_of_a_step(self, **seen):
                 check_actions(buffer_action, self.num_timesteps)
-                if self._vec_normalize_env is not None:
+                is_normalized = self._vec_normalize_env is not None
+                if is_normalized:
                     self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
                 new_obs, reward, infos = self._transition_guard.admit(
                     self._last_obs,  # type: ignore[arg-type]
@@ -589,6 +605,7 @@ class CuReSAC(SAC):
                     dones,
                     infos,
                     self.num_timesteps,
+                    is_normalized,
                 )
         except BadTransitionError:
             # The environments have gone on: another `learn` starts with a reset.
@@ -626,9 +643,23 @@ class CuReSAC(SAC):
             run.resumed = None
         for look in run.before_rollout:
             look()
-        rollout = super().collect_rollouts(
-            self._overlapped or env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
-        )
+        try:
+            rollout = super().collect_rollouts(
+                self._overlapped or env,
+                callback,
+                train_freq,
+                replay_buffer,
+                action_noise,
+                learning_starts,
+                log_interval,
+            )
+        except BaseException:
+            if self._overlapped is not None:
+                # The environments may have gone on without us: another `learn` starts with a reset.
+                self._last_obs = None
+            raise
+        if not rollout.continue_training and not self.is_plain_sac:
+            self._last_obs = None  # so they have, where a callback stops training: the step was not stored
         if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
             self._warmed_up = True
             warn_of_dark_images(self.observation_space, replay_buffer)
@@ -1043,6 +1074,27 @@ class CuReSAC(SAC):
         strip = reconstruction_strip(self.policy, batch, self._frame_stack) if writes_images else None
         if strip is not None:
             self.logger.record("srl/reconstructions", Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """
+        :param seed: Of all random streams, that of p_c among them; None changes nothing
+        """
+        super().set_random_seed(seed)
+        # A model that is being set up makes the mixer itself, or has loaded one.
+        if seed is not None and self._mixer is not None and getattr(self, "policy", None) is not None:
+            self._mixer.rng = np.random.default_rng(seed)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        """Without episodes whose return is not finite, of which ``on_bad_transition="skip"`` leaves transitions out:
+        one would make the mean of the next 99 so, too."""
+        if self.on_bad_transition == "skip":
+            infos = [
+                info
+                if np.isfinite(info.get("episode", {}).get("r", 0))
+                else {key: value for key, value in info.items() if key != "episode"}
+                for info in infos
+            ]
+        super()._update_info_buffer(infos, dones)
 
     def dump_logs(self) -> None:
         """Write the logs: SB3's, and environment steps beside agent steps."""

@@ -129,7 +129,7 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
     :return: None without images, or with fewer than ``MIN_ALIKE`` observations of each environment
     """
     buffer = model.replay_buffer
-    rows = min(buffer.size(), -(-RECENT // buffer.n_envs))
+    rows = min(buffer.size(), max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
     if not is_image_space(model.observation_space) or rows < MIN_ALIKE:
         return None
     chosen = np.linspace(0, rows - 1, min(rows, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
@@ -253,9 +253,10 @@ def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding |
 
     :param model: The model
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
-    :return: None without curiosity, without entropy term, or before the first update since the log was written
+    :return: None without curiosity, without entropy term, or before the first update
     """
-    deviation = model.logger.name_to_value.get("train/curious_reward_std")
+    metrics = getattr(model, "_metrics", None)
+    deviation = None if metrics is None else metrics.latest.get("train/curious_reward_std")
     if deviation is None or not temperatures or temperatures[-1].value == 0:
         return None
     deviation, entropy = float(deviation), float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())

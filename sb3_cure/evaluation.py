@@ -257,6 +257,8 @@ def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int
     ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
     rows = (buffer.pos - 1 - ages) % buffer.buffer_size
     ages, env_inds, rows = (each[unmarked(buffer, rows, env_inds)] for each in (ages, env_inds, rows))
+    if len(rows) == 0:
+        raise ValueError("all transitions in the replay buffer are marked as faulty: mend the environments.")
 
     errors = np.zeros(len(rows), np.float32)
     for start in range(0, len(rows), chunk):

@@ -439,6 +439,9 @@ class TransitionGuard:
 
     def __init__(self, skip: bool):
         self.skip = skip
+        #: Whether that could be asked for
+        self.can_skip = True
+        self._normalized = False
         #: How many transitions were left out
         self.n_bad = 0
         self._warned: set[str] = set()
@@ -499,6 +502,7 @@ class TransitionGuard:
         dones: np.ndarray,
         infos: list[dict[str, Any]],
         timestep: int,
+        normalized: bool = False,
     ) -> tuple[Observations, np.ndarray, list[dict[str, Any]]]:
         """
         :param last_obs: Observations on which the agent acted, [n_envs, ...]
@@ -507,14 +511,18 @@ class TransitionGuard:
         :param dones: Whether the episode ended, [n_envs]
         :param infos: One dictionary per environment
         :param timestep: Agent steps so far, for the message
+        :param normalized: Whether ``VecNormalize`` has made them of others that are finite
         :return: New observations, rewards and infos that are fit to be stored
         :raises BadTransitionError: if something is not finite and must not be skipped
         """
         ends = {int(i): infos[i].get("terminal_observation") for i in np.flatnonzero(dones)}
+        if rewards.dtype == object:  # of worker processes, one of which returned None
+            rewards = rewards.astype(np.float32)
         bad_rewards, bad_obs = _not_finite(rewards), _not_finite(new_obs)
         bad_ends = [i for i, end in ends.items() if end is not None and _first_bad(end) is not None]
         stand_ins = self._stand_ins if last_obs is self._seen else np.zeros(len(dones), dtype=bool)
         self._seen, self._stand_ins = new_obs, bad_obs
+        self._normalized = normalized
         if not (bad_ends or (bad_rewards | bad_obs | stand_ins).any()):
             return new_obs, rewards, infos
 
@@ -540,9 +548,14 @@ class TransitionGuard:
     def _complain(self, kind: str, env: int, value: Any, timestep: int) -> str:
         """Raise, or warn of the first of a kind, and return what is wrong."""
         what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
-        reason = f"environment {env} returned {what} at agent step {timestep}, but {kind}s must be finite in float32"
+        source = "VecNormalize made" if self._normalized else f"environment {env} returned"
+        reason = f"{source} {what} at agent step {timestep}, but {kind}s must be finite in float32"
         if not self.skip:
-            fix = "fix the environment, or leave such transitions out with on_bad_transition='skip'"
+            fix = "fix the environment"
+            if self._normalized:
+                fix = "make a new VecNormalize, or load one: its statistics have taken a value that was not finite"
+            elif self.can_skip:
+                fix += ", or leave such transitions out with on_bad_transition='skip'"
             raise BadTransitionError(reason, "it was not stored", fix)
         if kind not in self._warned:
             self._warned.add(kind)

@@ -20,6 +20,8 @@ class Metrics(KVWriter):
     """
 
     def __init__(self) -> None:
+        #: The last value of each, which the logger forgets when it is written
+        self.latest: dict[str, th.Tensor] = {}
         self._sums: dict[str, th.Tensor] = {}
         self._counts: dict[str, int] = {}
 
@@ -38,7 +40,7 @@ class Metrics(KVWriter):
         :param values: Scalars by key, detached
         """
         for key, value in values.items():
-            value = value.detach()
+            self.latest[key] = value = value.detach()
             self._sums[key] = self._sums[key] + value if key in self._sums else value
             self._counts[key] = self._counts.get(key, 0) + 1
             logger.record(key, value)

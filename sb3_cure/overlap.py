@@ -1,5 +1,6 @@
 """Update the networks while worker processes step and render the environments."""
 
+import contextlib
 from collections.abc import Callable
 
 import numpy as np
@@ -50,8 +51,10 @@ class OverlappedVecEnv(VecEnvWrapper):
         try:
             self.finish()
         except BaseException:
-            # Ctrl-C, say: the results under way must not be taken for those of a later step.
-            self.venv.step_wait()
+            # Ctrl-C, say: the results under way must not be taken for those of a later step. Where they do not come, as
+            # it has ended the workers, too, that is not what is to be told.
+            with contextlib.suppress(Exception):
+                self.venv.step_wait()
             raise
 
     def step_wait(self) -> VecEnvStepReturn:

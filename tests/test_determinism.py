@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, differences, state_of, tiny_model
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -118,3 +118,13 @@ def test_another_seed_is_another_run(twice: tuple[Path, Path], tmp_path: Path) -
     assert rows_of(tmp_path) != rows_of(twice[0] / name)
     found = differences(*(th.load(folder / "final.pt", weights_only=False) for folder in (tmp_path, twice[0] / name)))
     assert {".buffer.frames", ".buffer.actions", ".state.policy.actor.mu.weight"} <= set(found)
+
+
+def test_a_seed_that_is_set_later_holds_for_the_mixer_too() -> None:
+    """A model without a seed, and ``set_random_seed``: two runs choose the same actors."""
+    shares = []
+    for _ in range(2):
+        model = tiny_model("MlpPolicy", VectorBox(), seed=None, curiosity_prob=0.5)
+        model.set_random_seed(5)
+        shares.append([model._mixer.choose(4, 1.0).tolist() for _ in range(20)])
+    assert shares[0] == shares[1]

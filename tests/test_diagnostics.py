@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure import CuReSAC, diagnostics, doctor, make_dmc_env
-from sb3_cure.callbacks import DiagnosticsCallback
+from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
 from sb3_cure.srl import SRLHead, SRLOutput
 
 
@@ -383,3 +383,19 @@ def test_rl_zoo_makes_it_from_yaml() -> None:
     model = box(PixelBox())
     callbacks: list[BaseCallback] = [plain, other]
     assert model.learn(20, callbacks).num_timesteps == 20
+
+
+def test_what_other_callbacks_write_hides_nothing() -> None:
+    """The logger forgets what it has written, as it is when an evaluation comes first."""
+    model = tiny_model("CnnPolicy", PixelBox(), normalize_curiosity=False, ent_coef=1.0)
+    looking = DiagnosticsCallback(50, 16, min_updates=20)
+    with pytest.warns(UserWarning, match="curious reward varies"):
+        model.learn(100, callback=[EvalBothCallback(PixelBox(), 50, 1), looking])
+    assert "curious_reward" in looking.warned
+
+
+def test_a_constant_image_of_many_environments() -> None:
+    """However few rows they need for the number of observations that is looked at."""
+    venv = DummyVecEnv([Still] * 40)
+    model = tiny_model("CnnPolicy", venv, buffer_size=4000, gradient_steps=1).learn(40 * 35)
+    assert diagnostics.constant_image(model, 64).problem is not None

@@ -866,6 +866,12 @@ def test_pictures_and_measurements_leave_out_what_is_marked() -> None:
     _spread_over(buffer, 10)
     most_uncomfortable(model, k=40)
     assert len(looked_at) > 1 and not np.concatenate(looked_at).any()
+    buffer.marked[:, 0] = True
+    assert len(_spread_over(buffer, 10)) == 10 and not looked_at[-1].any(), "those of the other environment"
+    buffer.marked[:] = True
+    assert _spread_over(buffer, 10) is None
+    with pytest.raises(ValueError, match="all transitions in the replay buffer are marked as faulty"):
+        most_uncomfortable(model, k=40)
 
 
 def test_a_restart_is_told_with_the_traceback_of_the_worker() -> None:
@@ -878,3 +884,36 @@ def test_a_restart_is_told_with_the_traceback_of_the_worker() -> None:
     env.close()
     (told,) = [str(warning.message) for warning in caught if warning.category is RuntimeWarning]
     assert re.match(r"Environment 0 raised RuntimeError\('lens broken'\).* This is restart 1.\nTraceback", told)
+
+
+class OtherShape(VectorBox):
+    """Its twelfth observation has three numbers."""
+
+    frame_stack, action_repeat = "of three", None  # names that may mean something else
+    n_all = 0
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, *rest = super().step(action)
+        self.n_all += 1
+        return np.zeros(3, np.float32) if self.n_all == 12 else observation, *rest
+
+
+def test_an_observation_of_another_shape_is_a_fault() -> None:
+    """As of a camera that changes its resolution; attributes of the environment are taken for what they are."""
+    venv = FaultTolerantSubprocVecEnv([OtherShape] * 2, on_env_fault="restart")
+    try:
+        with pytest.warns(RuntimeWarning, match=r"observation of shape \(3,\), but its space is of shape \(2,\)"):
+            tiny_model("MlpPolicy", venv).learn(40)
+        assert sum(venv.restarts) >= 2
+    finally:
+        venv.close()
+
+
+def test_a_buffer_that_cannot_leave_out_what_a_fault_spoils_is_warned_of() -> None:
+    """When training begins, not at the first fault."""
+    venv = FaultTolerantSubprocVecEnv([VectorBox], on_env_fault="restart")
+    try:
+        with pytest.warns(UserWarning, match=r"on_env_fault='restart' leaves .*NStepReplayBuffer cannot"):
+            tiny_model("MlpPolicy", venv, curiosity=None, n_steps=3).learn(2)
+    finally:
+        venv.close()

@@ -20,8 +20,9 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions
@@ -755,3 +756,81 @@ def test_guarded_models_save_and_load(extras: dict[str, Any], tmp_path: Path) ->
     loaded = CuReSAC.load(tmp_path / "model", env=VectorBox())
     assert loaded.on_bad_transition == "skip" and loaded._transition_guard.skip
     loaded.learn(12)
+
+
+class NoReward(VectorBox):
+    """Its fifteenth reward is None."""
+
+    n_all = 0
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, *rest = super().step(action)
+        self.n_all += 1
+        return observation, None if self.n_all == 15 else reward, *rest
+
+
+def test_a_reward_that_worker_processes_do_not_give(tmp_path: Path) -> None:
+    """Rewards then arrive as objects."""
+    venv = SubprocVecEnv([NoReward] * 2)
+    try:
+        with pytest.warns(UserWarning, match="returned the reward nan at agent step 30"):
+            model = tiny_model("MlpPolicy", venv, on_bad_transition="skip").learn(60)
+        assert np.isfinite(model.replay_buffer.rewards).all() and model._transition_guard.n_bad == 2
+    finally:
+        venv.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (dict(curiosity=None, n_steps=3), "which a NStepReplayBuffer cannot do: train with SB3's ReplayBuffer"),
+        (
+            dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+            "which it cannot do with optimize_memory_usage=True",
+        ),
+    ],
+)
+def test_what_cannot_be_skipped_is_known_before_training(arguments: dict[str, Any], sentence: str) -> None:
+    """Rather than at the first bad transition; nor is it advised, nor asked of environments that are begun anew."""
+    model = tiny_model("MlpPolicy", VectorBox(), on_bad_transition="skip", **arguments)
+    with pytest.raises(ValueError, match=rf"^on_bad_transition='skip' leaves transitions out .*, {sentence}"):
+        model.learn(5)
+    assert model.num_timesteps == 0
+    with pytest.raises(BadTransitionError) as caught:
+        tiny_model("MlpPolicy", NanAtTheEnd(), **arguments).learn(60)
+    assert "fix the environment" in str(caught.value) and "skip" not in str(caught.value)
+
+
+class NanAtTheEnd(VectorBox):
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, NAN if truncated else reward, terminated, truncated, info
+
+
+def test_statistics_that_a_bad_value_has_spoilt_are_not_the_environments_fault() -> None:
+    venv = VecNormalize(DummyVecEnv([NanAtTheEnd]), norm_obs=False)
+    model = tiny_model("MlpPolicy", venv)
+    with pytest.raises(BadTransitionError, match="environment 0 returned the reward nan"):
+        model.learn(60)
+    venv.venv.envs[0].unwrapped.episode_length = 10_000  # mended
+    with pytest.raises(
+        BadTransitionError, match=r"VecNormalize made the reward nan .*make a new VecNormalize, or load"
+    ):
+        model.learn(5)
+
+
+def test_one_skipped_reward_does_not_hide_the_returns_of_others() -> None:
+    class Sometimes(NanAtTheEnd):
+        n_episodes = 0
+
+        def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+            self.n_episodes += 1
+            return super().reset(**kwargs)
+
+        def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            return (super() if self.n_episodes == 2 else super(NanAtTheEnd, self)).step(action)
+
+    model = tiny_model("MlpPolicy", DummyVecEnv([lambda: Monitor(Sometimes())]), on_bad_transition="skip")
+    with pytest.warns(UserWarning, match="returned the reward nan"):
+        model.learn(80)
+    assert len(model.ep_info_buffer) == 3 and np.isfinite([each["r"] for each in model.ep_info_buffer]).all()

@@ -4,9 +4,12 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 from envs_for_tests import PixelBox, gradients_of_an_update, tiny_model
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -80,6 +83,68 @@ def test_interrupted_overlap_leaves_usable_environments() -> None:
         assert model._n_updates == 20 and not venv.waiting
     finally:
         venv.close()
+
+
+class Counting(gym.Env):
+    """Observes how many steps it has made."""
+
+    observation_space = spaces.Box(-1e6, 1e6, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+        super().reset(seed=kwargs.get("seed"))
+        self.steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.steps += 1
+        return np.full(1, self.steps, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("ends", ["an interrupt while workers step", "a callback"])
+def test_no_transition_spans_the_end_of_a_training(ends: str) -> None:
+    """The environments have made a step that was not stored: the next `learn` begins an episode."""
+    overlaps = ends != "a callback"
+    venv = SubprocVecEnv([Counting]) if overlaps else DummyVecEnv([Counting])
+    try:
+        model = tiny_model("MlpPolicy", venv, overlap=overlaps)
+        step = model._gradient_step
+
+        def interrupted(batch: Any) -> None:
+            if model.num_timesteps == 20:
+                raise KeyboardInterrupt
+            step(batch)
+
+        if overlaps:
+            model._gradient_step = interrupted
+            with pytest.raises(KeyboardInterrupt):
+                model.learn(40)
+            model._gradient_step = step
+        else:
+            model.learn(40, callback=lambda local, _: local["self"].num_timesteps < 20)
+        model.learn(20, reset_num_timesteps=False)
+        buffer = model.replay_buffer
+        stored = np.s_[: buffer.size()]
+        assert (buffer.next_observations[stored] - buffer.observations[stored] == 1).all()
+    finally:
+        venv.close()
+
+
+def test_an_interrupt_is_told_although_it_has_ended_the_workers() -> None:
+    """As Ctrl-C in a terminal does to those of SB3."""
+    venv = SubprocVecEnv([PixelBox])
+    model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0)
+
+    def interrupted(batch: Any) -> None:
+        for process in venv.processes:
+            process.kill()
+            process.join()
+        raise KeyboardInterrupt
+
+    model._gradient_step = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(20)
+    venv.remotes[0].close()
 
 
 def test_callbacks_at_the_end_see_all_updates() -> None:

@@ -29,6 +29,8 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
+from sb3_cure.values import is_integer
+
 # Seconds that a worker is given to leave by itself when the environments are closed or the parent is gone, and after
 # SIGKILL.
 CLOSE_SECONDS = 10.0
@@ -78,9 +80,12 @@ class _FrameWatcher:
         self.env, self.watch = env, watch
         space = env.observation_space
         self.sees_images = isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
-        self.frame_stack = _attribute(env, "frame_stack", 1)
+        # Others may mean something else by these names.
+        frame_stack, action_repeat = (_attribute(env, name, 1) for name in ("frame_stack", "action_repeat"))
+        self.frame_stack = frame_stack if is_integer(frame_stack, 1) else 1
+        repeat = action_repeat if is_integer(action_repeat, 1) else 1
         # Agent steps
-        self.patience = None if watch.frozen_steps is None else watch.frozen_steps / _attribute(env, "action_repeat", 1)
+        self.patience = None if watch.frozen_steps is None else watch.frozen_steps / repeat
         self.state = watch.state
         if self.state is None and hasattr(getattr(_attribute(env, "physics", None), "data", None), "qpos"):
             self.state = _joint_positions
@@ -109,8 +114,13 @@ class _FrameWatcher:
         """
         :param observation: What the environment returned
         :param of_step: Whether that was of a step, and not of a reset
-        :raises _FrameFault: If its newest frame is black, or does not show that the physics moves
+        :raises _FrameFault: If it is of another shape than its space, or its newest frame is black, or does not show
+            that the physics moves
         """
+        space = self.env.observation_space
+        if isinstance(space, spaces.Box) and np.shape(observation) != space.shape:
+            shape = np.shape(observation)
+            raise _FrameFault(f"returned an observation of shape {shape}, but its space is of shape {space.shape}")
         if not self.sees_images:
             return
         # As in SB3, the smallest of the three dimensions tells where the channels are.

@@ -50,7 +50,7 @@ def load_gl() -> None:
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
-    if "MUJOCO_GL" not in os.environ and not _glfw_has_a_display():
+    if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
         os.environ["MUJOCO_GL"] = "egl"
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
