@@ -521,6 +521,7 @@ class FrameStackReplayBuffer(_SkipsMarked):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the full size of every array."""
         self.__dict__.update(state)
+        self.frame_numbers = object()
         state.setdefault("marked", np.zeros((0, self.n_envs), dtype=bool))  # saved before there were marks
         for name in self._ROW_ARRAYS:
             setattr(self, name, _grown(state[name], self.buffer_size))

@@ -16,10 +16,12 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import GymEnv, TrainFreq
 from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.sac import policies as sb3_policies
 from torch import nn
 from torch.nn.parameter import is_lazy
 
@@ -558,6 +560,27 @@ def _reads_images(observation_space: spaces.Space) -> str:
         f"'CnnPolicy' got observations of shape {observation_space.shape}, but it reads images (channels, height, "
         f"width): {remedy}."
     )
+
+
+def check_sb3s_images(policy_class: type, observation_space: spaces.Space, policy_kwargs: Mapping[str, Any]) -> None:
+    """What SB3's encoder says in the words of a convolution.
+
+    :param policy_class: SB3's policy
+    :param observation_space: Observation space of the environment, images with the channels first
+    :param policy_kwargs: Arguments of SB3's policy
+    :raises ValueError: if there are images that its NatureCNN cannot read
+    """
+    reads_images = issubclass(policy_class, sb3_policies.CnnPolicy | sb3_policies.MultiInputPolicy)
+    if not reads_images or policy_kwargs.get("features_extractor_class", NatureCNN) is not NatureCNN:
+        return
+    parts = observation_space.values() if isinstance(observation_space, spaces.Dict) else [observation_space]
+    for part in parts:
+        if is_image_space(part) and min(part.shape[1:]) < 36:  # type: ignore[index]
+            raise ValueError(
+                f"NatureCNN, SB3's encoder of images, cannot read those of shape {part.shape}, as it needs 36 x 36 "
+                "pixels: use a larger image_size, another policy_kwargs=dict(features_extractor_class=...), or for a "
+                "single image this package's encoder, policy_kwargs=dict(share_encoder=True)."
+            )
 
 
 def check_srl_head(head: nn.Module) -> None:

@@ -15,6 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     MaybeCallback,
@@ -40,6 +41,7 @@ from sb3_cure.checks import (
     check_curious_agent,
     check_learning,
     check_parts,
+    check_sb3s_images,
     check_shared_encoder_space,
     check_srl_error,
     check_srl_head,
@@ -47,7 +49,6 @@ from sb3_cure.checks import (
     explaining_memory,
     make_env,
 )
-from sb3_cure.encoders import explaining_extractor
 from sb3_cure.files import PathOrFile
 from sb3_cure.guards import (
     BadTransitionError,
@@ -312,8 +313,8 @@ class CuReSAC(SAC):
             own = {CnnPolicy: sb3_policies.CnnPolicy, MlpPolicy: sb3_policies.MlpPolicy}
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
             check_parts(self)
-            extractor = self.policy_kwargs.get("features_extractor_class", sb3_policies.NatureCNN)
-            with explaining_memory(self), explaining_extractor(extractor, self.observation_space):
+            check_sb3s_images(self.policy_class, self.observation_space, self.policy_kwargs)
+            with explaining_memory(self):
                 super()._setup_model()
             # SB3's update knows no guard: its optimisers look before they step.
             optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
@@ -392,9 +393,10 @@ class CuReSAC(SAC):
         if self.env is None:
             return None
         told = told_frame_stack(self.env)
-        if told is None and self.env.has_attr("frame_stack"):
+        meant = self._env_attribute("frame_stack")
+        if told is None and is_integer(meant, 2) and is_image_space(self.observation_space):
             warnings.warn(
-                f"the environment's frame_stack is {self.env.get_attr('frame_stack')[0]!r}, but observations of shape "
+                f"the environment's frame_stack is {meant!r}, but observations of shape "
                 f"{self.observation_space.shape} are not of so many frames: it is passed over, and the replay buffer "
                 "keeps whole observations.",
                 stacklevel=2,
@@ -658,8 +660,6 @@ class CuReSAC(SAC):
                 # The environments may have gone on without us: another `learn` starts with a reset.
                 self._last_obs = None
             raise
-        if not rollout.continue_training and not self.is_plain_sac:
-            self._last_obs = None  # so they have, where a callback stops training: the step was not stored
         if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
             self._warmed_up = True
             warn_of_dark_images(self.observation_space, replay_buffer)
@@ -1090,7 +1090,7 @@ class CuReSAC(SAC):
         if self.on_bad_transition == "skip":
             infos = [
                 info
-                if np.isfinite(info.get("episode", {}).get("r", 0))
+                if np.isfinite((info.get("episode") or {}).get("r", 0))
                 else {key: value for key, value in info.items() if key != "episode"}
                 for info in infos
             ]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import torch as th
 from torch import nn
 
+from sb3_cure.evaluation import trained_actors
 from sb3_cure.policies import CuRePolicy
 
 if TYPE_CHECKING:
@@ -17,17 +18,18 @@ class DeterministicActor(nn.Module):
     ``torch.jit.trace`` can follow it. The networks are the model's own: train on, and it changes with them.
 
     :param model: A trained model
-    :param actor: ``"task"`` or ``"curious"``
+    :param actor: ``"task"`` or ``"curious"``; by default that of ``predict``
     :raises ValueError: if the model has no such policy
     """
 
     low: th.Tensor
     high: th.Tensor
 
-    def __init__(self, model: "CuReSAC", actor: str = "task"):
+    def __init__(self, model: "CuReSAC", actor: str | None = None):
         super().__init__()
         names = {"task": "actor", "curious": "curious_actor"}
-        trained = [name for name, attribute in names.items() if getattr(model.policy, attribute, None) is not None]
+        trained = trained_actors(model)
+        actor = trained[0] if actor is None else actor
         if actor not in trained:
             raise ValueError(
                 f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}: choose one of them."

@@ -255,8 +255,9 @@ def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding |
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
     :return: None without curiosity, without entropy term, or before the first update
     """
-    metrics = getattr(model, "_metrics", None)
-    deviation = None if metrics is None else metrics.latest.get("train/curious_reward_std")
+    if not getattr(model, "_uses_curious_reward", False):
+        return None
+    deviation = model._metrics.latest.get("train/curious_reward_std")
     if deviation is None or not temperatures or temperatures[-1].value == 0:
         return None
     deviation, entropy = float(deviation), float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())

@@ -3,9 +3,6 @@
 Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), which the CuRe paper uses (appendix A).
 """
 
-import contextlib
-from collections.abc import Iterator
-
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
@@ -124,25 +121,6 @@ class ExtractorEncoder(Encoder):
         self.projection = nn.Identity()
 
 
-@contextlib.contextmanager
-def explaining_extractor(extractor_class: type, observation_space: spaces.Space) -> Iterator[None]:
-    """Say in one sentence what torch and SB3's extractors say in another way.
-
-    :param extractor_class: What is being built
-    :param observation_space: What it is to read
-    :raises ValueError: if it cannot
-    """
-    try:
-        yield
-    except (RuntimeError, AssertionError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"{extractor_class.__name__} cannot read observations of shape {observation_space.shape} ({reason}): use a "
-            "larger image_size, another policy_kwargs=dict(features_extractor_class=...), or this package's encoder "
-            "(with srl=None and curiosity=None through policy_kwargs=dict(share_encoder=True))."
-        ) from error
-
-
 def make_encoder(
     extractor_class: type[BaseFeaturesExtractor], observation_space: spaces.Space, **kwargs: object
 ) -> Encoder:
@@ -154,6 +132,12 @@ def make_encoder(
     :return: The encoder
     :raises ValueError: if the class cannot read such observations
     """
-    with explaining_extractor(extractor_class, observation_space):
+    try:
         extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
+    except (RuntimeError, AssertionError) as error:  # how torch and SB3's extractors say it
+        reason = " ".join(str(error).split())
+        raise ValueError(
+            f"{extractor_class.__name__} cannot read observations of shape {observation_space.shape} ({reason}): use a "
+            "larger image_size, or another policy_kwargs=dict(features_extractor_class=...)."
+        ) from error
     return extractor if isinstance(extractor, Encoder) else ExtractorEncoder(extractor)

@@ -115,12 +115,9 @@ def frame_stack_of(env: VecEnv) -> int:
 def told_frame_stack(env: VecEnv) -> int | None:
     """
     :param env: Environments, channels first
-    :return: Frames per observation, as the environments tell in ``frame_stack`` (those of this package do) or
-        ``stack_size`` (Gymnasium's ``FrameStackObservation``); None where neither can be meant
+    :return: Frames per observation, as the environments tell in ``frame_stack`` (those of this package do); None where
+        that cannot be meant
     """
-    for name in ("frame_stack", "stack_size"):
-        told: Any = env.get_attr(name)[0] if env.has_attr(name) else None
-        shape = env.observation_space.shape or ()
-        if is_integer(told, 1) and (len(shape) != 3 or shape[0] % told == 0):
-            return int(told)
-    return None
+    told: Any = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else None
+    shape = env.observation_space.shape or ()
+    return int(told) if is_integer(told, 1) and (len(shape) != 3 or shape[0] % told == 0) else None

@@ -381,9 +381,8 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         {"policy_kwargs": {"features_extractor_class": NatureCNN}},
         "NatureCNN cannot read observations of shape (3, 24, 24) (Calculated padded input "
         "size per channel: (1 x 1). Kernel size: (3 x 3). Kernel size can't be greater than "
-        "actual input size): use a larger image_size, another "
-        "policy_kwargs=dict(features_extractor_class=...), or this package's encoder (with srl=None "
-        "and curiosity=None through policy_kwargs=dict(share_encoder=True)).",
+        "actual input size): use a larger image_size, or another "
+        "policy_kwargs=dict(features_extractor_class=...).",
     ),
     "buffer_size": (
         "CnnPolicy",
@@ -1073,13 +1072,10 @@ def test_an_environments_own_frame_stack_is_passed_over() -> None:
     assert not isinstance(model.replay_buffer, FrameStackReplayBuffer)
 
 
-def test_frames_that_the_user_or_gymnasium_tells_are_kept_once() -> None:
+def test_frames_that_the_user_tells_are_kept_once() -> None:
     space = spaces.Box(0, 255, (4, 36, 36), np.uint8)
     model = CuReSAC("CnnPolicy", FakeEnv(space), buffer_size=10, replay_buffer_kwargs=dict(frame_stack=2))
     assert isinstance(model.replay_buffer, FrameStackReplayBuffer) and model.replay_buffer.frame_stack == 2
-    grey = gym.wrappers.FrameStackObservation(FakeEnv(spaces.Box(0, 255, (36, 36), np.uint8)), 4)
-    model = CuReSAC("CnnPolicy", grey, buffer_size=10)
-    assert isinstance(model.replay_buffer, FrameStackReplayBuffer) and model.replay_buffer.frame_stack == 4
 
 
 @pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
@@ -1088,10 +1084,11 @@ def test_images_that_are_too_small_for_sb3s_encoder(policy: str) -> None:
     space = spaces.Box(0, 255, (3, 20, 20), np.uint8)
     env = FakeEnv(space if policy == "CnnPolicy" else spaces.Dict(camera=space))
     kwargs: dict[str, Any] = dict(srl=None, curiosity=None, buffer_size=10)
-    with pytest.raises(ValueError, match=r"NatureCNN cannot read .*: use a larger image_size.*share_encoder=True"):
+    with pytest.raises(ValueError, match=r"NatureCNN, .* cannot read those of shape \(3, 20, 20\).*share_encoder=True"):
         CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4]), **kwargs)
     if policy == "CnnPolicy":
         CuReSAC(policy, env, policy_kwargs=dict(net_arch=[4], share_encoder=True), **kwargs)
+        CuReSAC("MlpPolicy", env, policy_kwargs=dict(net_arch=[4]), **kwargs)  # which flattens them
 
 
 @pytest.mark.parametrize("kwargs", [{}, dict(srl=None, curiosity=None)], ids=["CuRe", "SAC"])

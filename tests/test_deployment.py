@@ -13,6 +13,7 @@ MODELS: dict[str, Any] = {
     "rae": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0)),
     "curl": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl="curl"),
     "vectors": lambda: tiny_model("MlpPolicy", VectorBox()),
+    "curious alone": lambda: tiny_model("CnnPolicy", PixelBox(), task=False),
     "SB3's SAC": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl=None, curiosity=None),
 }
 
@@ -23,7 +24,7 @@ def test_actions_are_those_of_predict(name: str) -> None:
     model = MODELS[name]().learn(14)
     observations = np.stack([model.observation_space.sample() for _ in range(3)])
     batch = th.as_tensor(observations)
-    policies = {"task": model.predict}
+    policies: dict[str | None, Any] = {None: model.predict}
     if model.curiosity is not None:
         policies["curious"] = model.predict_curious
     for actor, predict in policies.items():

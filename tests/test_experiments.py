@@ -255,6 +255,8 @@ def test_a_default_that_has_changed_is_another_setting(
     folder = run_cell(load_grid(write_grid(tmp_path)).cells[0], tmp_path / "out", pictures=False)
     config = json.loads((folder / "config.json").read_text())
     assert config["defaults"]["update"] == "joint" and not config["defaults"].keys() & config["arguments"].keys()
+    (folder / "config.json").write_text(json.dumps({**config, "defaults": {"update": "joint", "gone": 1}}))
+    assert run.main(arguments) == 0, "what arguments there are is no setting"
     monkeypatch.setitem(CuReSAC.__init__.__kwdefaults__, "update", "sequential")
     assert run.main(arguments) == 2
     sentence = "was run with other settings: defaults is {'update': 'joint'} there and {'update': 'sequential'} now."

@@ -833,4 +833,5 @@ def test_one_skipped_reward_does_not_hide_the_returns_of_others() -> None:
     model = tiny_model("MlpPolicy", DummyVecEnv([lambda: Monitor(Sometimes())]), on_bad_transition="skip")
     with pytest.warns(UserWarning, match="returned the reward nan"):
         model.learn(80)
+    model._update_info_buffer([{"episode": None}])
     assert len(model.ep_info_buffer) == 3 and np.isfinite([each["r"] for each in model.ep_info_buffer]).all()

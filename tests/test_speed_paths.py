@@ -101,13 +101,11 @@ class Counting(gym.Env):
         return np.full(1, self.steps, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.parametrize("ends", ["an interrupt while workers step", "a callback"])
-def test_no_transition_spans_the_end_of_a_training(ends: str) -> None:
+def test_no_transition_spans_an_interrupt_while_workers_step() -> None:
     """The environments have made a step that was not stored: the next `learn` begins an episode."""
-    overlaps = ends != "a callback"
-    venv = SubprocVecEnv([Counting]) if overlaps else DummyVecEnv([Counting])
+    venv = SubprocVecEnv([Counting])
     try:
-        model = tiny_model("MlpPolicy", venv, overlap=overlaps)
+        model = tiny_model("MlpPolicy", venv, overlap=True)
         step = model._gradient_step
 
         def interrupted(batch: Any) -> None:
@@ -115,13 +113,10 @@ def test_no_transition_spans_the_end_of_a_training(ends: str) -> None:
                 raise KeyboardInterrupt
             step(batch)
 
-        if overlaps:
-            model._gradient_step = interrupted
-            with pytest.raises(KeyboardInterrupt):
-                model.learn(40)
-            model._gradient_step = step
-        else:
-            model.learn(40, callback=lambda local, _: local["self"].num_timesteps < 20)
+        model._gradient_step = interrupted
+        with pytest.raises(KeyboardInterrupt):
+            model.learn(40)
+        model._gradient_step = step
         model.learn(20, reset_num_timesteps=False)
         buffer = model.replay_buffer
         stored = np.s_[: buffer.size()]

@@ -563,6 +563,8 @@ def test_other_pixels_are_not_judged_by_published_numbers(tmp_path: Path) -> Non
         ({"gamma": 0.98}, False),
         ({"learning_rate": 1e-6}, False),
         ({"policy_kwargs": {"net_arch": [8]}}, False),
+        ({"srl_kwargs": {"augmentation": "shift"}}, False),
+        ({"train_freq": 4}, False),
     ],
 )
 def test_other_settings_are_not_the_published_method(tmp_path: Path, arguments: dict[str, Any], same: bool) -> None:

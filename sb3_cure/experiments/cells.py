@@ -22,7 +22,7 @@ from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import DONE, Cell, GridError, read_kept
+from sb3_cure.experiments.grid import DONE, Cell, GridError, common_part, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.files import lock
@@ -79,8 +79,10 @@ def check_settings(folder: Path, config: dict[str, Any], name: str = "config.jso
         return
     begun, now = read_kept(path), _plain(config)
     for key in now:
-        if begun.get(key) != now[key] and (key in begun or key != "defaults"):  # once they were not kept
-            there, here = begun.get(key), now[key]
+        there, here = begun.get(key), now[key]
+        if key == "defaults":  # versions may differ in what arguments there are, and once they were not kept
+            there, here = common_part(there or {}, here), common_part(here, there or {})
+        if there != here:
             if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ
                 names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
                 there, here = ({name: each[name] for name in names if name in each} for each in (there, here))

@@ -146,6 +146,13 @@ class Grid:
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
 
 
+def common_part(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """
+    :return: What of the one dictionary has a name that is also in the other
+    """
+    return {name: value for name, value in one.items() if name in other}
+
+
 def read_kept(path: Path, *keys: str) -> dict[str, Any]:
     """
     :param path: A JSON file in the folder of results

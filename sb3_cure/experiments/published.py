@@ -191,6 +191,9 @@ SETTINGS = {
     "target_update_interval": 2,
     "actor_update_interval": 2,
     "ent_coef": "auto_0.1",
+    "train_freq": 1,
+    "gradient_steps": -1,
+    "srl_schedule": "simultaneous",
     "policy_kwargs": {"net_arch": [1024, 1024]},
 }
 
@@ -203,8 +206,9 @@ def published_method(arguments: dict) -> tuple[str | None, bool]:
         method, in its settings and without curiosity
     """
     base = {"rae": "SAC-AE", "curl": "CURL"}.get(str(arguments.get("srl", "rae")))
-    shifts = base == "CURL" and arguments.get("srl_kwargs", {}).get("augmentation") != "crop"
-    is_usual = all(arguments.get(key, value) == value for key, value in SETTINGS.items()) and not shifts
+    augmentation = arguments.get("srl_kwargs", {}).get("augmentation", "none")
+    is_usual = augmentation == ("crop" if base == "CURL" else "none")
+    is_usual &= all(arguments.get(key, value) == value for key, value in SETTINGS.items())
     return base, is_usual and arguments.get("curiosity", "separate") is None
 
 
