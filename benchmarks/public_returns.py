@@ -22,9 +22,9 @@ import torch as th
 
 from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
 from sb3_cure.allocator import tune_allocator
+from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.experiments.cells import (
     EVAL_SEED,
-    action_repeat_of,
     alone_in,
     check_settings,
     is_evaluation_due,

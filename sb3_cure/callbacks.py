@@ -24,7 +24,7 @@ from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
-from sb3_cure.envs.wrappers import check_frame
+from sb3_cure.envs.wrappers import action_repeat_of, check_frame
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
 from sb3_cure.policies import encoder_of
@@ -287,7 +287,7 @@ class PolicyVideoCallback(_PictureCallback):
         """Film an episode of each policy."""
         video = self._import_room("video")
         env, steps = self.eval_env, self.num_timesteps
-        repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
+        repeat = action_repeat_of(env)
         for actor in self._check_actors(self.actors):
             (episode,) = run_episodes(
                 self.model,  # type: ignore[arg-type]

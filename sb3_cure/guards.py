@@ -441,7 +441,6 @@ class TransitionGuard:
         self.skip = skip
         #: Whether that could be asked for
         self.can_skip = True
-        self._normalized = False
         #: How many transitions were left out
         self.n_bad = 0
         self._warned: set[str] = set()
@@ -522,7 +521,6 @@ class TransitionGuard:
         bad_ends = [i for i, end in ends.items() if end is not None and _first_bad(end) is not None]
         stand_ins = self._stand_ins if last_obs is self._seen else np.zeros(len(dones), dtype=bool)
         self._seen, self._stand_ins = new_obs, bad_obs
-        self._normalized = normalized
         if not (bad_ends or (bad_rewards | bad_obs | stand_ins).any()):
             return new_obs, rewards, infos
 
@@ -531,13 +529,13 @@ class TransitionGuard:
             if stand_ins[i]:
                 reasons[i] = f"environment {i} returned no finite observation before agent step {timestep}"
             if bad_rewards[i]:
-                reasons[i] = self._complain("reward", i, rewards[i], timestep)
+                reasons[i] = self._complain("reward", i, rewards[i], timestep, normalized)
             if bad_obs[i]:
-                reason = self._complain("observation", i, _row(new_obs, i), timestep)
+                reason = self._complain("observation", i, _row(new_obs, i), timestep, normalized)
                 if ends.get(i) is None:
                     reasons[i] = reason
             if i in bad_ends:
-                reasons[i] = self._complain("terminal observation", i, ends[i], timestep)
+                reasons[i] = self._complain("terminal observation", i, ends[i], timestep, normalized)
         self.n_bad += len(reasons)
         infos = [{**info, "bad_transition": reasons[i]} if i in reasons else info for i, info in enumerate(infos)]
         for i in bad_ends:
@@ -545,14 +543,14 @@ class TransitionGuard:
         self._seen = _replaced(new_obs, bad_obs, last_obs)
         return self._seen, np.where(bad_rewards, 0, rewards).astype(rewards.dtype), infos
 
-    def _complain(self, kind: str, env: int, value: Any, timestep: int) -> str:
+    def _complain(self, kind: str, env: int, value: Any, timestep: int, normalized: bool = False) -> str:
         """Raise, or warn of the first of a kind, and return what is wrong."""
         what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
-        source = "VecNormalize made" if self._normalized else f"environment {env} returned"
+        source = "VecNormalize made" if normalized else f"environment {env} returned"
         reason = f"{source} {what} at agent step {timestep}, but {kind}s must be finite in float32"
         if not self.skip:
             fix = "fix the environment"
-            if self._normalized:
+            if normalized:
                 fix = "make a new VecNormalize, or load one: its statistics have taken a value that was not finite"
             elif self.can_skip:
                 fix += ", or leave such transitions out with on_bad_transition='skip'"

@@ -29,6 +29,7 @@ from stable_baselines3.common.vec_env.base_vec_env import (
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 
+from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.values import is_integer
 
 # Seconds that a worker is given to leave by itself when the environments are closed or the parent is gone, and after
@@ -80,12 +81,10 @@ class _FrameWatcher:
         self.env, self.watch = env, watch
         space = env.observation_space
         self.sees_images = isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
-        # Others may mean something else by these names.
-        frame_stack, action_repeat = (_attribute(env, name, 1) for name in ("frame_stack", "action_repeat"))
-        self.frame_stack = frame_stack if is_integer(frame_stack, 1) else 1
-        repeat = action_repeat if is_integer(action_repeat, 1) else 1
+        frame_stack = _attribute(env, "frame_stack", 1)
+        self.frame_stack = frame_stack if is_integer(frame_stack, 1) else 1  # others may mean something else by it
         # Agent steps
-        self.patience = None if watch.frozen_steps is None else watch.frozen_steps / repeat
+        self.patience = None if watch.frozen_steps is None else watch.frozen_steps / action_repeat_of(env)
         self.state = watch.state
         if self.state is None and hasattr(getattr(_attribute(env, "physics", None), "data", None), "qpos"):
             self.state = _joint_positions

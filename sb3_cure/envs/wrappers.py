@@ -107,6 +107,15 @@ class ActionRepeat(RepeatAction):
             self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / self.action_repeat}
 
 
+def action_repeat_of(env: gym.Env) -> int:
+    """
+    :param env: Any environment
+    :return: Environment steps per agent step: what it tells, else 1, also where it means something else by that name
+    """
+    told = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
+    return int(told) if is_integer(told, 1) else 1
+
+
 class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConstructorArgs):
     """
     Replaces observations by rendered frames: uint8 of shape (channels, image_size, image_size), one render per step.

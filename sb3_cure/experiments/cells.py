@@ -20,9 +20,10 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import DONE, Cell, GridError, common_part, read_kept
+from sb3_cure.experiments.grid import DONE, Cell, GridError, comparable, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.files import lock
@@ -79,9 +80,7 @@ def check_settings(folder: Path, config: dict[str, Any], name: str = "config.jso
         return
     begun, now = read_kept(path), _plain(config)
     for key in now:
-        there, here = begun.get(key), now[key]
-        if key == "defaults":  # versions may differ in what arguments there are, and once they were not kept
-            there, here = common_part(there or {}, here), common_part(here, there or {})
+        there, here = comparable(key, begun.get(key), now[key])
         if there != here:
             if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ
                 names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
@@ -333,14 +332,6 @@ def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finish
         return True
     last = evaluations[-1]["environment_steps"]
     return steps > last and (finished or steps // every > last // every)
-
-
-def action_repeat_of(env: gym.Env) -> int:
-    """
-    :param env: Any environment
-    :return: Environment steps per agent step: what it tells, else 1
-    """
-    return int(env.get_wrapper_attr("action_repeat")) if env.has_wrapper_attr("action_repeat") else 1
 
 
 class CellIsRunning(GridError):

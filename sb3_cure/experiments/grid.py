@@ -146,11 +146,18 @@ class Grid:
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
 
 
-def common_part(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+def comparable(key: str, one: Any, other: Any) -> tuple[Any, Any]:
     """
-    :return: What of the one dictionary has a name that is also in the other
+    :param key: A key of ``config.json``
+    :param one: Its value in one file, None if it has none
+    :param other: Its value in another
+    :return: Both, as they are to be compared: of defaults those that both name, as versions differ in what arguments
+        there are, and once kept none
     """
-    return {name: value for name, value in one.items() if name in other}
+    if key != "defaults":
+        return one, other
+    shared = [name for name in one or {} if name in (other or {})]
+    return {name: one[name] for name in shared}, {name: other[name] for name in shared}
 
 
 def read_kept(path: Path, *keys: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_cure.callbacks import ReconstructionCallback
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
+from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, trained_actors
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.grid import Cell
@@ -69,7 +70,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     name = f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
     env = gym.make(cell.task, **cell.env_kwargs)
     can_film = "rgb_array" in env.metadata.get("render_modes", [])
-    repeat = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
+    repeat = action_repeat_of(env)
     if env.has_wrapper_attr("physics") and visiting_actors(model, cell) != ["random"]:
         visits = _measured_visits(model, cell, env, folder)
         title = f"Where policies go with sampled actions: {name}"

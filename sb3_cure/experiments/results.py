@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_cure.experiments.files import Row, read_rows
-from sb3_cure.experiments.grid import common_part, seed_of, short_name
+from sb3_cure.experiments.grid import comparable, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
 _AGAIN = "remove the cell's folder and run the grid again"
@@ -253,9 +253,7 @@ def _check_alike(cells: Iterable[CellResult]) -> None:
         for arm, compared in (((cell.task, cell.method), keys), ((cell.task,), {"eval_every", "eval_episodes"})):
             other = first.setdefault(arm, cell)
             for key in sorted(compared & other.config.keys()):
-                here, there = cell.config.get(key), other.config[key]
-                if key == "defaults":  # versions may differ in what arguments there are
-                    here, there = common_part(here or {}, there), common_part(there, here or {})
+                here, there = comparable(key, cell.config.get(key), other.config[key])
                 if here != there:
                     raise ResultsError(
                         f"{cell.folder} was run with {key} {here!r}, but {other.folder} with {there!r}, so that they "
