@@ -106,10 +106,17 @@ class Projection(nn.Module):
     :param in_dim: Size of the trunk's features
     :param out_dim: Size of the latent state
     :param tanh: Whether latents are squashed into (-1, 1) (SAC-AE, DrQ); CURL's code leaves it out
+    :raises ValueError: if there are too few latents to be normalised
     """
 
     def __init__(self, in_dim: int, out_dim: int, tanh: bool = True):
         super().__init__()
+        if out_dim < 3:
+            raise ValueError(
+                f"features_dim is {out_dim}, but LayerNorm leaves of one number a constant and of two only which of "
+                "them is larger, so that nothing is learned: use a features_dim of at least 3, or another "
+                "features_extractor_class."
+            )
         self.linear = nn.Linear(in_dim, out_dim)
         self.norm = nn.LayerNorm(out_dim)
         self.tanh = tanh

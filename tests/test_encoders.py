@@ -140,6 +140,14 @@ def test_sizes_below_one_are_refused(argument: str) -> None:
         PixelEncoder(image_space(), **{argument: 0})
 
 
+@pytest.mark.parametrize("features_dim", [1, 2])
+def test_too_few_latents_are_refused(features_dim: int) -> None:
+    """LayerNorm makes 0 of one number, and of two their order: no observation would be told from another."""
+    for make in (lambda **k: PixelEncoder(image_space(), **k), lambda **k: VectorEncoder(spaces.Box(-1, 1, (7,)), **k)):
+        with pytest.raises(ValueError, match=rf"features_dim is {features_dim}, .* use a features_dim of at least 3"):
+            make(features_dim=features_dim)
+
+
 def test_pixel_encoder_refuses_vectors() -> None:
     with pytest.raises(ValueError, match=r"shape \(7,\), but needs images .*: use 'MlpPolicy' for vectors"):
         PixelEncoder(spaces.Box(-1, 1, (7,)))

@@ -232,7 +232,7 @@ def test_decoder_draws_what_the_encoder_sees(height: int, width: int, frames: in
 def test_decoder_shapes(n_layers: int, extra_height: int, extra_width: int, channels: int) -> None:
     """From the smallest image that the encoder takes."""
     space = image_space(channels, 4 * n_layers - 1 + extra_height, 4 * n_layers - 1 + extra_width)
-    encoder = PixelEncoder(space, features_dim=2, n_filters=2, n_layers=n_layers)
+    encoder = PixelEncoder(space, features_dim=3, n_filters=2, n_layers=n_layers)
     latents = encoder(th.rand(1, *space.shape))
     assert RAE(encoder, space).decoder(latents).shape == (1, *space.shape)
 
