@@ -418,7 +418,8 @@ def warn_of_dark_images(observation_space: spaces.Space, replay_buffer: ReplayBu
     stored = getattr(replay_buffer, "frames", getattr(replay_buffer, "observations", None))
     if not is_image_space(observation_space) or not isinstance(stored, np.ndarray):
         return
-    brightest = int(stored[: min(replay_buffer.size(), 1000)].max())
+    # What is not written yet is zero. (A row needs several frames, of which the first may be VecFrameStack's zeros.)
+    brightest = int(stored[:1000].max())
     if brightest <= 1:
         warnings.warn(
             f"no pixel of the images so far is brighter than {brightest} of 255, so that the policy sees black: if the "

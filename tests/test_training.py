@@ -855,3 +855,11 @@ def test_images_of_zeros_and_ones_are_warned_of(scale: int, warns: bool, stacks:
     assert len(said) == warns and all(
         "no pixel of the images so far is brighter than 1 of 255" in each for each in said
     )
+
+
+def test_images_that_begin_with_vec_frame_stacks_zeros_are_not_dark() -> None:
+    """The first frame that is stored is of no camera."""
+    env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=1, tells_frame_stack=False)]), 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tiny_model("CnnPolicy", env, learning_starts=0).learn(3)
