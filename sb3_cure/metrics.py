@@ -30,7 +30,9 @@ class Metrics(KVWriter):
         :param logger: SB3's logger; a new one starts with empty averages, attaching twice changes nothing
         """
         if self not in logger.output_formats:
-            logger.output_formats.insert(0, self)
+            # In the place of another model's, which would write averages of its own under the same names.
+            others = [output for output in logger.output_formats if not isinstance(output, Metrics)]
+            logger.output_formats[:] = [self, *others]
             self._sums.clear()
             self._counts.clear()
 

@@ -660,6 +660,22 @@ def test_metrics_are_means_between_dumps(monkeypatch: pytest.MonkeyPatch) -> Non
             assert dump[key] == pytest.approx(value, rel=1e-5), key
 
 
+def test_metrics_of_models_that_share_a_logger() -> None:
+    """A model that goes on with the logger of another writes its own averages, without what the other has left."""
+    dumps = Dumps()
+    logger = Logger(None, [dumps])
+    for seed in (0, 1):
+        model = tiny_model("MlpPolicy", VectorBox(), seed=seed)
+        model.set_logger(logger)
+        recorded = []
+        write = model._log
+        model._log = lambda values, recorded=recorded, write=write: (recorded.append(values), write(values))
+        model.learn(35, log_interval=1)  # the last 15 updates are not written
+    losses = [float(values["train/srl_loss"].detach()) for values in recorded if "train/srl_loss" in values]
+    assert len(dumps.dumps) == 2
+    assert dumps.dumps[1]["train/srl_loss"] == pytest.approx(np.mean(losses[:9]), rel=1e-5)
+
+
 def test_srl_loss_is_recorded_by_every_call_of_train() -> None:
     """Between dumps the logger holds a detached tensor; reading its value is left to the dump."""
     model = tiny_model("CnnPolicy", PixelBox()).learn(10)
