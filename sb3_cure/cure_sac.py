@@ -477,6 +477,8 @@ class CuReSAC(SAC):
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        # SB3 does so after each step: the first one would see where the former call ended.
+        self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         self._metrics.attach(self.logger)
         self._read_env_attributes()
         self._check_skipping()

@@ -275,6 +275,25 @@ def test_schedules_never_see_progress_below_zero() -> None:
     assert min(seen) == 0
 
 
+def test_schedules_begin_where_the_call_begins() -> None:
+    """Also in a further call: SB3's progress is still that of the end of the one before at its first step."""
+    seen: list[float] = []
+
+    def schedule(remaining: float) -> float:
+        seen.append(remaining)
+        return 0.5
+
+    model = acting_model(PixelBox(), curiosity_prob=schedule, learning_starts=0)
+    model.learn(2)
+    seen.clear()
+    model.learn(4)
+    assert seen == [1, 0.75, 0.5, 0.25]
+    seen.clear()
+    model.learn(4, reset_num_timesteps=False)
+    assert seen == [0.5, 0.375, 0.25, 0.125]
+    model.learn(0)
+
+
 def test_scheduled_probability() -> None:
     """p_c may be a schedule of the remaining progress."""
     model = acting_model(PixelBox(), curiosity_prob=lambda progress: float(progress > 0.5), learning_starts=10)
