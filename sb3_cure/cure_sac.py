@@ -881,7 +881,8 @@ class CuReSAC(SAC):
     @property
     def _in_srl_phase(self) -> bool:
         only_srl = self._collector == "random"
-        return only_srl or self.srl_schedule == "simultaneous" or self._n_updates // self.srl_period % 2 == 0
+        # Of torch's kind: NumPy's whole numbers compare to booleans of its own.
+        return only_srl or self.srl_schedule == "simultaneous" or bool(self._n_updates // self.srl_period % 2 == 0)
 
     @property
     def _in_rl_phase(self) -> bool:

@@ -200,6 +200,13 @@ def test_alternating_schedule(update: str) -> None:
             assert names == {"encoder", *agents, *STATISTICS}
 
 
+def test_periods_may_be_numbers_of_numpy() -> None:
+    """As from ``numpy.arange``; what they are compared to decides whether gradients are wanted."""
+    given = dict(srl_schedule="alternating", actor_update_interval=np.int64(2), target_update_interval=np.int64(2))
+    models = [tiny_model("MlpPolicy", VectorBox(), srl_period=kind(3), **given).learn(25) for kind in (int, np.int64)]
+    assert differences(*map(state_of, models)) == []
+
+
 # ------------------------------------------------------------------ who acts
 
 
