@@ -262,7 +262,9 @@ def walk(callback: BaseCallback) -> list[BaseCallback]:
     :param callback: A callback
     :return: It and those inside it, in a fixed order
     """
-    inside = [*getattr(callback, "callbacks", []), *filter(None, [getattr(callback, "callback", None)])]
+    # `callback_on_new_best` is of SB3's EvalCallback.
+    single = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
+    inside = [*getattr(callback, "callbacks", []), *single]
     return [callback, *(each for child in inside if isinstance(child, BaseCallback) for each in walk(child))]
 
 

@@ -435,14 +435,30 @@ def test_callbacks_go_on_counting(case: str, kill_at: int, tmp_path: Path) -> No
         def on_period(self) -> None:
             self.at.append(self.num_timesteps)
 
+    class Note(BaseCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.at: list[int] = []
+
+        def _on_step(self) -> bool:
+            self.at.append(self.num_timesteps)
+            return True
+
     def callbacks() -> tuple[Count, EvalCallback]:
         evaluation = EvalCallback(
-            OneStart(PixelBox(episode_length=7)), eval_freq=9, n_eval_episodes=1, verbose=0, warn=False
+            OneStart(PixelBox(episode_length=7)),
+            callback_on_new_best=Note(),
+            eval_freq=9,
+            n_eval_episodes=1,
+            verbose=0,
+            warn=False,
         )
         return Count(), evaluation
 
     def at_end(each: tuple[Count, EvalCallback]) -> Any:
-        return each[0].at, each[1].evaluations_timesteps, each[1].n_calls, each[1].best_mean_reward
+        count, evaluation = each
+        at_best = evaluation.callback_on_new_best.at  # type: ignore[union-attr]
+        return count.at, at_best, evaluation.evaluations_timesteps, evaluation.n_calls, evaluation.best_mean_reward
 
     whole, killed, resumed = callbacks(), callbacks(), callbacks()
     train(CASES[case], tmp_path / "whole", False, *whole)
