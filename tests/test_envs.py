@@ -342,6 +342,16 @@ def test_vectorised_environments_give_the_same_stream(start_method):
 # --------------------------------------------------------------------------------- any Gymnasium environment
 
 
+def test_repeats_of_ones_own_environment_are_counted():
+    """An environment that tells its own repeat, inside another one."""
+    painting = Painting()
+    painting.action_repeat = 4
+    assert make_pixel_env(painting, image_size=40).get_wrapper_attr("action_repeat") == 4
+    twice = make_pixel_env(painting, image_size=40, action_repeat=2)
+    assert twice.get_wrapper_attr("action_repeat") == 8
+    assert twice.metadata["render_fps"] == 15
+
+
 def test_any_environment_that_renders_can_be_seen_through_pixels():
     painting = Painting(action_space=spaces.Box(np.float32([0, -2]), np.float32([10, 2])))
     env = make_pixel_env(painting, image_size=40, frame_stack=3, action_repeat=4)

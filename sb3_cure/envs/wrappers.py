@@ -101,10 +101,12 @@ class ActionRepeat(RepeatAction):
     """
 
     def __init__(self, env: gym.Env, num_repeats: int) -> None:
-        self.action_repeat = check_at_least_one("action_repeat", num_repeats, usual=4)
-        super().__init__(env, self.action_repeat)
+        num_repeats = check_at_least_one("action_repeat", num_repeats, usual=4)
+        super().__init__(env, num_repeats)
+        # The environment may repeat actions, too.
+        self.action_repeat = num_repeats * action_repeat_of(env)
         if "render_fps" in env.metadata:
-            self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / self.action_repeat}
+            self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / num_repeats}
 
 
 def action_repeat_of(env: gym.Env) -> int:
