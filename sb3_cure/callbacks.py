@@ -643,12 +643,13 @@ class DiagnosticsCallback(PeriodicCallback):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        if n_samples < 2 or min(min_updates, autoencoder_updates) < 0:
+        if not (is_integer(n_samples, 2) and is_integer(min_updates, 0) and is_integer(autoencoder_updates, 0)):
             raise ValueError(
-                f"DiagnosticsCallback got n_samples={n_samples}, min_updates={min_updates} and autoencoder_updates="
-                f"{autoencoder_updates}, but they must be at least 2, 0 and 0: change them."
+                f"DiagnosticsCallback got n_samples={n_samples!r}, min_updates={min_updates!r} and autoencoder_updates="
+                f"{autoencoder_updates!r}, but they must be at least 2, 0 and 0: change them to whole numbers."
             )
-        if len(temperature_bounds) != 2 or not 0 <= temperature_bounds[0] < temperature_bounds[1]:
+        bounds = np.asarray(temperature_bounds)  # of texts, as YAML reads 1e-4, if they are no numbers
+        if bounds.shape != (2,) or bounds.dtype.kind not in "iuf" or not 0 <= bounds[0] < bounds[1]:
             raise ValueError(
                 f"DiagnosticsCallback got temperature_bounds={temperature_bounds!r}, but they are the least and the "
                 "greatest temperature: give two numbers >= 0 in rising order, such as [0.0001, 100]."
