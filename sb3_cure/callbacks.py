@@ -554,6 +554,14 @@ class CuriosityMapCallback(_PictureCallback):
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
         _check_spaces("CuriosityMapCallback", self.eval_env, self.model)
+        with _untouched_randomness(self.model.device):
+            self.eval_env.reset(seed=self.seed)
+            shape = np.shape(self.state(self.eval_env))  # rather than when the first map is due
+        if shape != (len(self.names),):
+            raise ValueError(
+                f"CuriosityMapCallback got {len(self.names)} names for states of shape {shape}: state must return a "
+                "vector, and names have one name for each of its values."
+            )
 
     def on_period(self) -> None:
         """Roll out each policy and draw."""
@@ -572,11 +580,6 @@ class CuriosityMapCallback(_PictureCallback):
                 )
                 pairs = [(episode.states, episode.srl_errors) for episode in episodes]
                 states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-                if states.shape[1:] != (len(self.names),):
-                    raise ValueError(
-                        f"CuriosityMapCallback got {len(self.names)} names for states of shape {states.shape[1:]}: "
-                        "state must return a vector, and names have one name for each of its values."
-                    )
                 self.visits[actor] = self._finite(actor, states, errors)
         if not any(len(states) for states, _ in self.visits.values()):
             return

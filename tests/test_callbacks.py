@@ -579,8 +579,10 @@ def test_stacked_by_sb3_watched_in_one_environment() -> None:
 def test_states_and_observations_must_fit(tmp_path: Path) -> None:
     """Too few names, and observations of another shape."""
     named = CuriosityMapCallback(VectorBox(), tmp_path, 5, state=position, names=["x", "y", "z"], n_episodes=1)
+    model = SAC("MlpPolicy", VectorBox())
     with pytest.raises(ValueError, match=r"got 3 names for states of shape \(2,\)"):
-        SAC("MlpPolicy", VectorBox()).learn(5, callback=named)
+        model.learn(5, callback=named)
+    assert model.num_timesteps == 0  # and not when the first map is due
     shown = ReconstructionCallback(tmp_path, observations=np.zeros((2, 3, 8, 8), np.uint8))
     with pytest.raises(
         ValueError, match=r"observations of shape \(2, 3, 8, 8\), but the model learns from \(6, 36, 36"
