@@ -3,6 +3,7 @@ off-policy one), but for the SRL errors in them."""
 
 import contextlib
 import importlib
+import random
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -34,8 +35,8 @@ from sb3_cure.values import check_folder, is_integer, is_number
 class PeriodicCallback(BaseCallback):
     """Does something every so many agent steps: subclass it and implement ``on_period``.
 
-    It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random streams of NumPy
-    and PyTorch are set aside meanwhile: watching a training does not change it.
+    It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random streams of
+    Python, NumPy and PyTorch are set aside meanwhile: watching a training does not change it.
 
     :param every: Agent steps between two calls (of all environments together)
     :param verbose: Verbosity level
@@ -69,11 +70,12 @@ class PeriodicCallback(BaseCallback):
 
 @contextlib.contextmanager
 def _untouched_randomness(device: th.device) -> Iterator[None]:
-    numpy_state = np.random.get_state()
+    python_state, numpy_state = random.getstate(), np.random.get_state()
     with th.random.fork_rng([device] if device.type == "cuda" else []):
         try:
             yield
         finally:
+            random.setstate(python_state)
             np.random.set_state(numpy_state)
 
 
@@ -108,11 +110,11 @@ class EvalBothCallback(PeriodicCallback):
             )
         super().__init__(eval_freq, verbose)
         _check_env("EvalBothCallback", eval_env)
-        _check_seed("EvalBothCallback", seed)
         self.eval_env = eval_env
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
         self.deterministic = deterministic
+        _check_seed("EvalBothCallback", seed)
         self.seed = seed
         #: One row per evaluation: agent steps and the logged values
         self.history: list[dict[str, float]] = []
@@ -270,18 +272,19 @@ class PolicyVideoCallback(_PictureCallback):
             )
         if fps is not None and not is_number(fps, low=1):
             raise ValueError(f"PolicyVideoCallback got fps={fps!r}, but a video needs at least 1: give a number >= 1.")
-        _check_seed("PolicyVideoCallback", seed)
         self.eval_env = eval_env
         self.actors = actors
         self.deterministic = deterministic
+        _check_seed("PolicyVideoCallback", seed)
         self.seed = seed
         self.fps = fps or max(round(eval_env.metadata.get("render_fps") or 30), 1)
 
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
         _check_spaces("PolicyVideoCallback", self.eval_env, self.model)
-        self.eval_env.reset(seed=self.seed)
-        check_frame(self.eval_env.render(), self.eval_env)  # rather than when the first video is due
+        with _untouched_randomness(self.model.device):
+            self.eval_env.reset(seed=self.seed)
+            check_frame(self.eval_env.render(), self.eval_env)  # rather than when the first video is due
 
     def on_period(self) -> None:
         """Film an episode of each policy."""
@@ -525,7 +528,6 @@ class CuriosityMapCallback(_PictureCallback):
                 f"CuriosityMapCallback got n_episodes={n_episodes!r} and bins={bins!r}, but each must be at least "
                 "1: give whole numbers >= 1."
             )
-        _check_seed("CuriosityMapCallback", seed)
         if (state is None) != (names is None):
             given, missing = ("names", "state") if state is None else ("state", "names")
             raise ValueError(
@@ -546,6 +548,7 @@ class CuriosityMapCallback(_PictureCallback):
         self.actors = actors
         self.n_episodes = n_episodes
         self.deterministic = deterministic
+        _check_seed("CuriosityMapCallback", seed)
         self.seed = seed
         self.bins = bins
         #: By policy, the states of the last map, [n, d], and their SRL errors, [n]

@@ -1,5 +1,6 @@
 """Videos, reconstructions and maps show what they promise, of any SB3 algorithm, and do not change the training."""
 
+import random
 import sys
 import warnings
 from collections.abc import Callable
@@ -113,6 +114,31 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
         + ["reconstructions.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
+
+
+class Careless(Filmed):
+    """Draws from generators that it shares with all others."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        random.random(), np.random.random(), th.rand(1)
+        return super().reset(**kwargs)
+
+
+@pytest.mark.parametrize("every", [15, 1000], ids=["watched", "looked at before training alone"])
+def test_watched_environments_may_draw_from_common_generators(every: int, tmp_path: Path) -> None:
+    """The training draws from them as if nobody watched."""
+    drawn = []
+    for watched in (False, True):
+        env, callbacks = Careless(PixelBox()), []
+        if watched:
+            callbacks = [
+                EvalBothCallback(env, every, n_episodes=1),
+                PolicyVideoCallback(env, tmp_path, every),
+                CuriosityMapCallback(env, tmp_path, every, n_episodes=1, **MAP),
+            ]
+        tiny_model("CnnPolicy", PixelBox()).learn(20, callback=callbacks)
+        drawn.append((random.random(), np.random.random(), float(th.rand(1))))
+    assert drawn[0] == drawn[1]
 
 
 @pytest.mark.parametrize(
