@@ -114,8 +114,7 @@ class EvalBothCallback(PeriodicCallback):
         self.eval_freq = eval_freq
         self.n_episodes = n_episodes
         self.deterministic = deterministic
-        _check_seed("EvalBothCallback", seed)
-        self.seed = seed
+        self.seed = _check_seed("EvalBothCallback", seed)
         #: One row per evaluation: agent steps and the logged values
         self.history: list[dict[str, float]] = []
 
@@ -206,9 +205,10 @@ def _actions(deterministic: bool) -> str:
     return "deterministic actions" if deterministic else "sampled actions"
 
 
-def _check_seed(user: str, seed: Any) -> None:
+def _check_seed(user: str, seed: Any) -> int | None:
     if seed is not None and not is_integer(seed, 0):
         raise ValueError(f"{user} got seed={seed!r}, but it must be None or a whole number >= 0: change seed.")
+    return None if seed is None else int(seed)
 
 
 def _check_spaces(user: str, eval_env: gym.Env, model: BaseAlgorithm) -> None:
@@ -275,8 +275,7 @@ class PolicyVideoCallback(_PictureCallback):
         self.eval_env = eval_env
         self.actors = actors
         self.deterministic = deterministic
-        _check_seed("PolicyVideoCallback", seed)
-        self.seed = seed
+        self.seed = _check_seed("PolicyVideoCallback", seed)
         self.fps = fps or max(round(eval_env.metadata.get("render_fps") or 30), 1)
 
     def _init_callback(self) -> None:
@@ -548,8 +547,7 @@ class CuriosityMapCallback(_PictureCallback):
         self.actors = actors
         self.n_episodes = n_episodes
         self.deterministic = deterministic
-        _check_seed("CuriosityMapCallback", seed)
-        self.seed = seed
+        self.seed = _check_seed("CuriosityMapCallback", seed)
         self.bins = bins
         #: By policy, the states of the last map, [n, d], and their SRL errors, [n]
         self.visits: dict[str, tuple[np.ndarray, np.ndarray]] = {}

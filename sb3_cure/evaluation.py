@@ -1,6 +1,7 @@
 """Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
 
 import contextlib
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -166,6 +167,7 @@ def run_episodes(
         raise ValueError(
             f"n_episodes is {n_episodes!r}, but it must be a whole number of at least 1: change n_episodes."
         )
+    seed = None if seed is None else operator.index(seed)  # Gymnasium takes no numbers of NumPy
     state_of = physics_state if states is True else states
     choose = _actor(model, env, actor, deterministic)
     if seed is not None:

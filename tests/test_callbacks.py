@@ -141,6 +141,15 @@ def test_watched_environments_may_draw_from_common_generators(every: int, tmp_pa
     assert drawn[0] == drawn[1]
 
 
+@pytest.mark.parametrize("watch", [EvalBothCallback, PolicyVideoCallback, CuriosityMapCallback])
+def test_seeds_may_be_numbers_of_numpy(watch: Any, tmp_path: Path) -> None:
+    """Which Gymnasium's own generators refuse."""
+    folder = () if watch is EvalBothCallback else (tmp_path,)
+    state = MAP if watch is CuriosityMapCallback else {}
+    callback = watch(Filmed(VectorBox()), *folder, 5, seed=np.int64(3), **state)
+    SAC("MlpPolicy", VectorBox()).learn(5, callback=callback)
+
+
 @pytest.mark.parametrize(
     ("make", "env"),
     [
