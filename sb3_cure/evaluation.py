@@ -167,6 +167,11 @@ def run_episodes(
         raise ValueError(
             f"n_episodes is {n_episodes!r}, but it must be a whole number of at least 1: change n_episodes."
         )
+    if not isinstance(env, gym.Env):
+        raise ValueError(
+            f"env is {env!r}, but one environment is rolled out at a time: give a gymnasium.Env with the observations "
+            "of training."
+        )
     seed = None if seed is None else operator.index(seed)  # Gymnasium takes no numbers of NumPy
     state_of = physics_state if states is True else states
     choose = _actor(model, env, actor, deterministic)

@@ -95,6 +95,13 @@ def test_unknown_actor_is_one_sentence() -> None:
         list(run_episodes(model, PixelBox(), 1, "best"))
 
 
+def test_vectorised_environments_are_one_sentence() -> None:
+    """As those that SB3 returns."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    with pytest.raises(ValueError, match=r"env is <.*DummyVecEnv.*>, but one environment is rolled out at a time"):
+        next(run_episodes(model, model.get_env(), 1))  # type: ignore[arg-type]
+
+
 def test_a_heads_error_must_be_one_number_per_sample() -> None:
     """Said before the first update, too, as grids evaluate then."""
 
