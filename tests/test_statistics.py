@@ -426,6 +426,7 @@ def test_the_papers_tables() -> None:
         ("eval.csv", "environment_steps,return_mean\n0,x\n", r"eval\.csv has 'x' as return_mean in line 2"),
         ("eval.csv", "environment_steps,return_mean\n0,1,2\n", r"eval\.csv has a row that is shorter or longer"),
         ("eval.csv", "environment_steps,return_mean\n8,1\n8,2\n", r"eval\.csv has environment_steps that do not grow"),
+        ("eval.csv", "environment_steps,return_mean\n0,1\n100000,31", r"eval\.csv ends within a line"),
         ("eval.csv", b"\xff\xfe\x00", r"eval\.csv cannot be read"),
         ("eval.csv", "", r"eval\.csv has no column 'environment_steps'"),
         ("eval.csv", "environment_steps,return_mean\n", r"evaluations of no environment steps, .* trained for 100000"),
@@ -475,6 +476,10 @@ def test_no_row_of_a_finished_curve_may_be_lost(tmp_path: Path) -> None:
         )
         with pytest.raises(ResultsError, match=r"eval\.csv has no evaluation between 0 and \d+ environment steps: "):
             read_results(tmp_path)
+    write_grid(tmp_path / "visits", kind="visitation", budget=1000)
+    write_cell(tmp_path / "visits", TASK, "sac_ae", 0, {0: 1, 500: 2}, **settings, states={})
+    with pytest.raises(ResultsError, match=r"eval\.csv has evaluations of from 0 to 500 environment steps"):
+        read_results(tmp_path / "visits")
     (path / "eval.csv").unlink()
     with pytest.raises(ResultsError, match=r"seed0 is marked as DONE, but has no eval\.csv: remove the cell's folder"):
         read_results(tmp_path)
@@ -512,8 +517,8 @@ def test_states_of_a_cell_are_not_lost_without_a_word(tmp_path: Path) -> None:
     """Its seed would be missing in the coverage; and states of two tasks would be counted as of one."""
     write_grid(tmp_path, kind="visitation")
     walk = np.random.default_rng(0).normal(size=(50, 2))
-    path = write_cell(tmp_path, TASK, "sac_ae", 0, {0: 1}, states={"random": walk})
-    write_cell(tmp_path, TASK, "sac_ae", 1, {0: 1}, states={"random": walk}, state_units=("rad", "rad/s"))
+    path = write_cell(tmp_path, TASK, "sac_ae", 0, {}, states={"random": walk})
+    write_cell(tmp_path, TASK, "sac_ae", 1, {}, states={"random": walk}, state_units=("rad", "rad/s"))
     sentence = r"seed0 has states with the units m, m, but \S+seed1 has rad, rad/s: they are of two tasks; put"
     with pytest.raises(ResultsError, match=sentence):
         state_coverage(read_results(tmp_path)[0])

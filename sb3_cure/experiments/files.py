@@ -1,6 +1,7 @@
 """Files of results: written whole or not at all, and what every result says about where it comes from."""
 
 import csv
+import io
 import json
 import os
 import platform
@@ -91,13 +92,16 @@ def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     :raises ValueError: saying what of the file's form is wrong
     """
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        rows, names = list(reader), reader.fieldnames or ()
+        text = file.read()
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    rows, names = list(reader), reader.fieldnames or ()
     for name in needed:
         if name not in names:
             raise ValueError(f"has no column {name!r}")
     if any(None in row or None in row.values() for row in rows):
         raise ValueError("has a row that is shorter or longer than its header")
+    if not text.endswith("\n"):
+        raise ValueError("ends within a line, whose last number may have lost digits")
     return [{key: _number(value) for key, value in row.items()} for row in rows]
 
 

@@ -284,7 +284,7 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
         if not (folder / name).exists():
             raise ResultsError(f"{folder} is marked as DONE, but has no {name}: {_AGAIN}.")
     evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
-    if "eval.csv" in needed:
+    if "eval.csv" in needed or (own_budget > 0 and evaluations and len(evaluations["environment_steps"])):
         _check_whole(folder / "eval.csv", evaluations, own_budget, config)
     visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
