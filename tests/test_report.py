@@ -120,6 +120,22 @@ def test_tables_of_curves(results: Path) -> None:
     assert "2 pairs of seeds on cartpole-swingup: inconclusive." in headlines
 
 
+def test_small_returns_are_not_rounded_away(tmp_path: Path) -> None:
+    """Such as rates of success, beside a task of another scale."""
+    write_grid(tmp_path, tasks=["mine/Reach-v0", "mine/Push-v0"])
+    for seed in (0, 1):
+        for task, scale in (("Reach", 1), ("Push", 400)):
+            write_cell(tmp_path, task, "sac_ae", seed, curve(0, scale * (0.5 + 0.25 * seed)))
+            write_cell(tmp_path, task, "cure_sac_ae", seed, curve(0, scale * (0.75 + 0.25 * seed)), arguments=CURE)
+    assert report.main([str(tmp_path), "--thresholds", "0.7,300"]) == 0
+    header, reach, _, push, _ = rows_of(tmp_path / "table.md", "Learning curves")
+    assert reach[3:7] == ["0.31 ± 0.09", "0.62 ± 0.18", "0.12", "0.06"]
+    assert push[3:7] == ["125 ± 35", "250 ± 71", "50", "25"]
+    assert header[7:] == ["steps to 0.7", "steps to 300"]
+    _, both, alone, _ = rows_of(tmp_path / "table.md", "Paired difference from sac\\_ae: area")
+    assert (both[4], alone[4:7]) == ("25.1", ["0.12", "[0.12, 0.12]", "[0.12, 0.12]"])
+
+
 def test_pairs_that_begin_otherwise_are_told(tmp_path: Path) -> None:
     """Such as those of another implementation, with other initial weights."""
     write_grid(tmp_path)

@@ -289,9 +289,10 @@ def _curves(
         if row.task is None or row.method not in several:
             alike = "" if row.same_starts == row.pairs else f", {row.same_starts} with the same start,"
             where = f"{plural(row.pairs, 'pair')} of seeds{alike} on {of_tasks(row)}"
-            shown = f" {interval_text(row.t, 1)}" if row.t.low is not None else ""
+            digits = tables.difference_digits(row, experiment)
+            shown = f" {interval_text(row.t, digits)}" if row.t.low is not None else ""
             headlines.append(
-                f"{row.method} minus {row.other}: area under the curve {number_text(row.t.value, 1)}"
+                f"{row.method} minus {row.other}: area under the curve {number_text(row.t.value, digits)}"
                 f"{shown}, {where}: {row.t.verdict}."
             )
     if not differences:
@@ -310,7 +311,7 @@ def _curves(
         parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
     pairs = list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []
     if pairs:
-        parts.append(tables.pairs_table(pairs))
+        parts.append(tables.pairs_table(experiment, pairs))
     try:
         found = statistics.aggregate(experiment)
     except ResultsError as error:

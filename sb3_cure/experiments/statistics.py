@@ -351,7 +351,7 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
             if not -1e-6 <= score <= 1 + 1e-6:
                 raise ResultsError(
                     f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
-                    f"suite, but a return on {task} is {score * HIGHEST_RETURN:.0f}."
+                    f"suite, but a return on {task} is {score * HIGHEST_RETURN:.6g}."
                 )
     library = _import_rliable()
     n = len(next(iter(scores.values())))

@@ -97,11 +97,22 @@ def _error(value: float) -> str:
     return f"{value:.2e}" if math.isfinite(value) else NONE
 
 
-def _mean_std(values: np.ndarray) -> str:
+def return_digits(experiment: Experiment, task: str | None = None) -> int:
+    """
+    :param experiment: An experiment
+    :param task: Short name, or None for all tasks
+    :return: How many digits behind the point its returns need: none from 10 on, else three significant ones
+    """
+    cells = [cell for cell in experiment.cells.values() if task in (None, cell.task)]
+    highest = max((float(np.abs(cell.curve()[1]).max(initial=0)) for cell in cells), default=0.0)
+    return 2 - math.floor(math.log10(highest)) if 0 < highest < 10 else 0
+
+
+def _mean_std(values: np.ndarray, digits: int = 0) -> str:
     if not len(values):
         return ""
-    std = f" ± {number_text(float(values.std(ddof=1)))}" if len(values) > 1 else ""
-    return f"{number_text(float(values.mean()))}{std}"
+    std = f" ± {number_text(float(values.std(ddof=1)), digits)}" if len(values) > 1 else ""
+    return f"{number_text(float(values.mean()), digits)}{std}"
 
 
 def interval_text(estimate: Estimate, digits: int = 0) -> str:
@@ -169,14 +180,16 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     :return: Area under the curve, final return, spread over seeds, steps to thresholds
     """
     columns = ["task", "arm", ">seeds", ">area under curve", ">final return", ">IQR, final", ">IQR, curve"]
-    columns += [f">steps to {number_text(limit)}" for limit in thresholds]
+    columns += [f">steps to {limit:,.15g}".replace("-", "\N{MINUS SIGN}") for limit in thresholds]
     rows = []
     for task in experiment.tasks:
+        digits = return_digits(experiment, task)
         for method in experiment.methods:
             arm = statistics.summarise_arm(experiment, task, method, thresholds)
             row = [task, method, str(len(arm.seeds))]
-            row += [_mean_std(values) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
-            row += [number_text(statistics.interquartile_range(arm.finals)), number_text(arm.curve_iqr)]
+            row += [_mean_std(values, digits) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
+            spreads = statistics.interquartile_range(arm.finals), arm.curve_iqr
+            row += [number_text(spread, digits) for spread in spreads]
             rows.append(row + [_reached(arm.reached[limit], experiment.budget) for limit in thresholds])
     return Table(
         "Learning curves",
@@ -213,7 +226,7 @@ def difference_table(
     :param note: What to know about them
     :return: The differences with both intervals
     """
-    texts = [[difference_label(row, experiment), of_tasks(row), *_difference(row)] for row in rows]
+    texts = [[difference_label(row, experiment), of_tasks(row), *_difference(row, experiment)] for row in rows]
     columns = ["arm", "task", *_DIFFERENCE_COLUMNS]
     return Table(f"Paired difference from {experiment.baseline}: {measure}", columns, texts, note)
 
@@ -227,12 +240,13 @@ def difference_label(row: statistics.PairedDifference, experiment: Experiment) -
     return row.method if row.other == experiment.baseline else f"{row.method} minus {row.other}"
 
 
-def pairs_table(rows: Sequence[statistics.PairedDifference]) -> Table:
+def pairs_table(experiment: Experiment, rows: Sequence[statistics.PairedDifference]) -> Table:
     """
-    :param rows: Paired differences in area between any two arms
+    :param experiment: An experiment
+    :param rows: Its paired differences in area between any two arms
     :return: One row for each
     """
-    texts = [[f"{row.method} minus {row.other}", of_tasks(row), *_difference(row)] for row in rows]
+    texts = [[f"{row.method} minus {row.other}", of_tasks(row), *_difference(row, experiment)] for row in rows]
     title = "Paired difference between any two arms: area under the curve"
     return Table(title, ["arms", "task", *_DIFFERENCE_COLUMNS], texts, "As above, over all tasks.")
 
@@ -240,9 +254,20 @@ def pairs_table(rows: Sequence[statistics.PairedDifference]) -> Table:
 _DIFFERENCE_COLUMNS = (">pairs", ">same start", ">difference", ">95 % t", ">95 % percentile", ">above", "verdict")
 
 
-def _difference(row: statistics.PairedDifference) -> list[str]:
-    numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, 1)]
-    return [*numbers, interval_text(row.t, 1), interval_text(row.percentile, 1), str(row.wins), row.t.verdict]
+def difference_digits(row: statistics.PairedDifference, experiment: Experiment) -> int:
+    """
+    :param row: A paired difference in return
+    :param experiment: Of which experiment
+    :return: How many digits behind the point it needs, at least one
+    """
+    return max(1, return_digits(experiment, row.task))
+
+
+def _difference(row: statistics.PairedDifference, experiment: Experiment) -> list[str]:
+    digits = difference_digits(row, experiment)
+    numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, digits)]
+    intervals = [interval_text(each, digits) for each in (row.t, row.percentile)]
+    return [*numbers, *intervals, str(row.wins), row.t.verdict]
 
 
 def of_tasks(row: statistics.PairedDifference) -> str:
@@ -379,7 +404,7 @@ def pretraining_table(experiment: Experiment) -> Table:
             difference = NONE
             if len(finals) and theirs is not None:
                 difference = number_text(float(finals.mean()) - theirs.mean)
-            ours = _mean_std(finals) or _state(experiment, task, method)
+            ours = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
             rows.append([task, method, str(len(finals)), ours, _published(theirs), difference])
     return Table(
         "Final return after pretraining, beside the paper's",
