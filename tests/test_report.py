@@ -340,6 +340,31 @@ def test_a_report_of_results_that_cannot_be_written_to(
     assert "report.html cannot be written (Permission denied): choose another --out." in capsys.readouterr().err
 
 
+def test_a_disk_that_is_full_costs_no_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that are there stay whole; and experiments that can be written to get theirs."""
+    folders = [tmp_path / name for name in ("full", "later")]
+    for folder in folders:
+        write_curves(folder)
+    assert report.main([str(tmp_path)]) == 0
+    before = (folders[0] / "table.md").read_text()
+    (folders[1] / "table.md").unlink()
+    write_bytes = Path.write_bytes
+
+    def refuse(self: Path, content: bytes) -> int:
+        if "full" in self.parts:
+            write_bytes(self, content[:100])
+            raise OSError(28, "No space left on device")
+        return write_bytes(self, content)
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    assert report.main([str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("full cannot be written to (No space left on device): its tables") == 1
+    assert (folders[0] / "table.md").read_text() == before
+    assert (folders[1] / "table.md").exists()
+
+
 def test_which_media(tmp_path: Path) -> None:
     """Of each arm the first seed that has some, which is named; all or none on demand."""
     write_curves(tmp_path / "curves")

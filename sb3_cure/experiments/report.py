@@ -13,6 +13,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
@@ -36,6 +37,7 @@ from sb3_cure.experiments.tables import (
     ratio_text,
 )
 from sb3_cure.experiments.visit_statistics import HEADS, Coverage, ErrorSummary, state_coverage, summarise_errors
+from sb3_cure.files import replacing
 
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
@@ -605,17 +607,22 @@ def write_report(
         for part in section.parts:
             if isinstance(part, Figure):
                 files[section.experiment.folder / f"{part.name}.png"] = part.png
-    written = []
+    written: list[Path] = []
+    failed: set[Path] = set()
     for path, content in files.items():
+        if path.parent in failed:
+            continue
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            with nullcontext(path) if path == out else replacing(path) as file:
+                file.write_bytes(content)
         except OSError as error:
             if path == out:
                 raise ResultsError(f"{path} cannot be written ({error.strerror}): choose another --out.") from None
-            # Others' results may be read-only.
+            # Others' results may be read-only, of some experiments or of all.
             print(f"{path.parent} cannot be written to ({error.strerror}): its tables and plots are in {out} alone.")
-            break
+            failed.add(path.parent)
+            continue
         written.append(path)
     return written
 
