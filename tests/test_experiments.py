@@ -795,6 +795,23 @@ def test_a_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out.count(": done") == 2
 
 
+def test_returns_that_are_no_numbers_end_a_cell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """With transitions skipped it was DONE, and the report of all experiments refused it, however often it was run."""
+    step = PixelBox.step
+
+    def step_or_nan(self: PixelBox, action: np.ndarray) -> tuple[Any, ...]:
+        observation, reward, terminated, truncated, info = step(self, action)
+        return observation, math.nan if truncated else reward, terminated, truncated, info
+
+    monkeypatch.setattr(PixelBox, "step", step_or_nan)
+    path = write_grid(tmp_path, methods={"a": {"config": "zoo.yml", "overrides": {"on_bad_transition": "skip"}}})
+    assert run.main([str(path), "--out", str(tmp_path / "out"), "--no-pictures"]) == 1
+    sentence = "seed0 failed: ValueError: episode 0 of the evaluation at 0 environment steps has the return nan, but"
+    assert sentence in capsys.readouterr().out
+
+
 def test_a_cell_that_cannot_be_written_does_not_stop_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

@@ -264,6 +264,11 @@ class _Record(BaseCallback):
                 run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
             ):
                 returns.append(float(episode.total_reward))
+                if not math.isfinite(returns[-1]):  # reports could not be made of it
+                    raise ValueError(
+                        f"episode {number} of the evaluation at {row['environment_steps']} environment steps has the "
+                        f"return {returns[-1]}, but curves need finite ones: mend the rewards of {self.cell.task}."
+                    )
                 errors.append(episode.srl_errors)
                 values = (row["environment_steps"], actor, number, returns[-1])
                 self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
