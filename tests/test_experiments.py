@@ -533,6 +533,14 @@ class Buffer(FrameStackReplayBuffer):
 """
 
 
+def test_cells_may_be_trained_after_each_episode(tmp_path: Path) -> None:
+    """As with rl-zoo's files, in which a pair is a list."""
+    path = write_grid(tmp_path, methods={"a": {"config": "zoo.yml", "overrides": {"train_freq": [1, "episode"]}}})
+    grid = load_grid(path)
+    assert run.run_grid(grid, tmp_path, pictures=False) == []
+    assert steps_of(tmp_path / grid.cells[0].folder / "eval.csv") == [0, 160, 320, 400]
+
+
 def test_an_environment_of_ones_own_is_named_with_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its images have the channels last, and its frames lie on disk; common heads load what it has trained."""
     (tmp_path / "camera_of_a_grid.py").write_text(CAMERA)

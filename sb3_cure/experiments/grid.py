@@ -89,6 +89,8 @@ class Cell:
     def build_arguments(self) -> dict[str, Any]:
         """A copy of ``arguments``, as SB3 writes into some, with the classes that are named by their modules."""
         arguments = copy.deepcopy(self.arguments)
+        if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
+            arguments["train_freq"] = tuple(arguments["train_freq"])
         for name in _CLASSES:
             if "." in str(arguments.get(name)):
                 arguments[name] = pkgutil.resolve_name(arguments[name])
