@@ -186,6 +186,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
         self._remove_run()
         if not isinstance(error, SettingsError) and _is_about_input(error):
             sentence = _explained(error)
+            if self.normalize and "VecNormalize with norm_obs=False" in sentence:
+                raise SettingsError(
+                    f"normalize in {self._source('normalize')} asks for observations to be normalised, but images are "
+                    "taken as they are: leave it out, or normalise rewards alone, as normalize: {norm_obs: false} "
+                    '(-params "normalize:dict(norm_obs=False)").'
+                ) from error
             raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
 
     def _remove_run(self) -> None:

@@ -64,6 +64,10 @@ def refusal(command: str, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 TRAIN = f"train --env {TASK} --conf-file settings.yml"
+OF_NORMALIZING = (
+    "asks for observations to be normalised, but images are taken as they are: leave it out, or normalise rewards "
+    'alone, as normalize: {norm_obs: false} (-params "normalize:dict(norm_obs=False)").'
+)
 #: what is wrong -> (settings that differ, or the file's text; the whole sentence)
 ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     "no YAML": (
@@ -88,6 +92,10 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     "a misspelt argument": (
         {"curiousity": None},
         "sb3-cure train: settings.yml has 'curiousity', but CuReSAC has no such argument: write 'curiosity'.",
+    ),
+    "normalised images": (
+        {"normalize": True},
+        f"sb3-cure train: normalize in settings.yml {OF_NORMALIZING}",
     ),
     "a number as text": (
         {"batch_size": "8"},
