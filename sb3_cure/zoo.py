@@ -389,8 +389,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
             self.args.env_kwargs = dict(hyperparams["env_kwargs"])
             if self._eval_env_kwargs_args is None:
                 self.eval_env_kwargs = self.args.env_kwargs
-        if "." in str(hyperparams.get("srl")):
-            hyperparams["srl"] = _head("srl", hyperparams["srl"])
+        srl = hyperparams.get("srl")
+        if isinstance(srl, str) and "." in srl:  # else a class, which a Python file may hold
+            hyperparams["srl"] = _head("srl", srl)
         buffer = hyperparams.get("replay_buffer_class")
         if isinstance(buffer, str) and re.fullmatch(r"\w+(\.\w+)+", buffer):  # else it is Python, for rl-zoo3
             hyperparams["replay_buffer_class"] = _imported("replay_buffer_class", buffer)
@@ -575,7 +576,10 @@ def train() -> None:
 
 
 class RunLoader(yaml.SafeLoader):
-    """Reads the settings that rl-zoo3 saves with a run: plain values, tuples and ordered dictionaries, nothing else."""
+    """Reads the settings that rl-zoo3 saves with a run: plain values, tuples and ordered dictionaries, nothing else.
+
+    Of classes and functions, such as an ``activation_fn``, the names are read, and nothing is imported.
+    """
 
 
 RunLoader.add_constructor(
@@ -585,6 +589,7 @@ RunLoader.add_constructor(
 RunLoader.add_constructor(
     "tag:yaml.org,2002:python/tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True))
 )
+RunLoader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader, name, node: name)
 
 
 def _load_run(load: Callable[..., Any], stream: Any, Loader: Any) -> Any:

@@ -207,6 +207,17 @@ def test_an_environment_of_ones_own(folder: Path) -> None:
     assert video.stat().st_size > 1000
 
 
+def test_classes_in_settings(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file of settings in Python may hold them, and so may -params; the run can be watched."""
+    (folder / "tiny.py").write_text(
+        f"from sb3_cure.srl import RAE\nhyperparams = {SETTINGS}\nhyperparams['default']['srl'] = RAE"
+    )
+    train = ["train", "--env", TASK, "--conf-file", "tiny.py", "--eval-freq", "-1"]
+    assert cli.main([*train, "-params", "policy_kwargs:dict(net_arch=[8], activation_fn=th.nn.Tanh)"]) == 0
+    assert cli.main(["enjoy", "--env", TASK, "-n", "20", "--no-render"]) == 0
+    assert "2 Episodes" in capsys.readouterr().out
+
+
 def test_an_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
     """As the README's example does; what was trained so can be filmed."""
     readme = (Path(__file__).parent.parent / "README.md").read_text()
@@ -377,8 +388,9 @@ def test_versions_are_compared_with_the_requirements() -> None:
 
 
 def test_a_runs_settings_cannot_run_code(tmp_path: Path) -> None:
-    """What rl-zoo3 writes beside a model is read as data: the kinds that it has come back, an object is refused."""
+    """What rl-zoo3 writes beside a model is read as data, classes as their names; objects are refused."""
     settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5))])
     assert yaml.load(yaml.dump(settings), Loader=zoo.RunLoader) == settings
+    assert yaml.load("!!python/name:no_such.module ''", Loader=zoo.RunLoader) == "no_such.module"
     with pytest.raises(yaml.YAMLError, match="could not determine a constructor"):
         yaml.load("!!python/object/apply:os.system ['true']", Loader=zoo.RunLoader)
