@@ -662,6 +662,14 @@ def _parse_flags(
         if value is not None and value != parser.get_default(name) and value < low:
             flag = f"--{name.replace('_', '-')}"
             raise SettingsError(f"{flag} is {value}, but it must be at least {low}: change it, or leave it out.")
+    lowest = 0 if "no_render" in flags else -np.inf  # negative: `train` draws one
+    if not lowest <= given.seed < 2**32:
+        raise SettingsError(f"--seed is {given.seed}, but it must be from 0 to 2**32 - 1: change it, or leave it out.")
+    if flags.get("n_jobs", 1) < 1 and given.n_jobs != -1:
+        raise SettingsError(
+            f"--n-jobs is {given.n_jobs}, but it must be at least 1, or -1 for as many as there are cores: change it, "
+            "or leave it out."
+        )
     if given.n_timesteps < 1 and given.n_timesteps != parser.get_default("n_timesteps"):
         raise SettingsError(
             f"-n/--n-timesteps is {given.n_timesteps}, but it must be a number of agent steps of at least 1: give one, "

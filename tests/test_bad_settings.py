@@ -280,6 +280,27 @@ COMMANDS: dict[str, str] = {
             ("--n-startup-trials", -1, 0),
         )
     },
+    f"{TRAIN} -params normalize:True": f"sb3-cure train: normalize in -params {OF_NORMALIZING}",
+    f"{TRAIN} -params normalize:dict(norm_reward=False)": f"sb3-cure train: normalize in -params {OF_NORMALIZING}",
+    **{
+        f"{command} --seed {seed}": (
+            f"sb3-cure {command.split()[0]}: --seed is {seed}, but it must be from 0 to 2**32 - 1: change it, or leave "
+            "it out."
+        )
+        for command, seed in (
+            (TRAIN, 2**32),
+            (TRAIN.replace("train", "optimize", 1), 2**32),
+            (f"enjoy --env {TASK} --no-render", -1),
+            (f"record --env {TASK}", 2**32),
+        )
+    },
+    **{
+        f"optimize --env {TASK} --conf-file settings.yml --n-jobs {number}": (
+            f"sb3-cure optimize: --n-jobs is {number}, but it must be at least 1, or -1 for as many as there are "
+            "cores: change it, or leave it out."
+        )
+        for number in (0, -2)
+    },
     f"record --env {TASK} --n-envs 0": (
         "sb3-cure record: --n-envs is 0, but it must be at least 1: change it, or leave it out."
     ),
