@@ -1173,9 +1173,14 @@ class CuReSAC(SAC):
         :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
         :param exact_match: Whether all of the model's parameters have to be there, and no others
         :param device: As in SB3; the parameters stay on the model's device
-        :raises ArchiveError: if a file's parameters are not finite or do not fit the model
+        :raises ArchiveError: (a ``ValueError``) if parameters are not finite or of other sizes than the model's, or a
+            file's do not fit it otherwise; the model stays what it was
         """
-        if not isinstance(load_path_or_dict, dict):
+        if isinstance(load_path_or_dict, dict):
+            known = {*self._get_torch_save_params()[0]}  # of other names SB3 tells
+            shared = {name: state for name, state in load_path_or_dict.items() if name in known}
+            check_parameters(self, shared, "the dictionary of parameters", exact_match=False)
+        else:
             archive = read_model(load_path_or_dict, settings=False)
             check_parameters(self, archive.params, archive.name, exact_match)
             load_path_or_dict = archive.params

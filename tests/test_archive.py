@@ -345,14 +345,17 @@ def test_other_algorithms(algorithm: Any, trusted: bool) -> None:
 
 
 def test_set_parameters_of_another_model() -> None:
-    """A file's parameters are checked before the first one is set: the model stays what it was."""
+    """Parameters are checked before the first one is set: the model stays what it was."""
     model = tiny_model("CnnPolicy", PixelBox()).learn(12)
     before = state_of(model)
     file = io.BytesIO()
-    wide = dict(features_extractor_kwargs=dict(n_filters=5, n_layers=2))
-    tiny_model("CnnPolicy", PixelBox(), policy_kwargs=wide).save(file)
-    with pytest.raises(ArchiveError, match=r"policy has .* of shape .* are expected: it belongs to a model with other"):
-        model.set_parameters(file)
+    wide = tiny_model(
+        "CnnPolicy", PixelBox(), policy_kwargs=dict(features_extractor_kwargs=dict(n_filters=5, n_layers=2))
+    )
+    wide.save(file)
+    for source in (file, wide.get_parameters()):
+        with pytest.raises(ArchiveError, match=r"policy has .* of shape .* are expected: it belongs to a model with"):
+            model.set_parameters(source)
     tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True)).save(file)
     with pytest.raises(ArchiveError, match="lacks parameters"):
         model.set_parameters(file)
