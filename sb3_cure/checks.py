@@ -315,6 +315,11 @@ def _check_networks(model: "CuReSAC") -> None:
     known = arguments_of(policy_class)
     # `share_encoder` asks for our policies where nothing else does.
     known = known and (known | {"use_sde", "share_encoder"}) - _NOT_THE_USERS
+    if known and "share_features_extractor" in given and "share_features_extractor" not in known:
+        raise TypeError(
+            f"policy_kwargs has 'share_features_extractor', but actors and critics of {policy_class.__name__} share "
+            "the encoder in any case, and critics train it: remove it."
+        )
     check_keywords("policy_kwargs", given, known, policy_class.__name__)
     _check_net_arch(given.get("net_arch"))
     if "n_critics" in given:

@@ -1003,6 +1003,11 @@ UNKNOWN_KEYWORDS: dict[str, tuple[dict[str, Any], str]] = {
         "n_critics, net_arch, normalize_images, optimizer_class, optimizer_kwargs, "
         "share_encoder, use_sde.",
     ),
+    "of SB3's policy": (
+        {"policy_kwargs": {"share_features_extractor": True}},
+        "policy_kwargs has 'share_features_extractor', but actors and critics of CnnPolicy share the encoder in any "
+        "case, and critics train it: remove it.",
+    ),
     "of the encoder": (
         {"policy_kwargs": {"features_extractor_kwargs": {"filters": 8}}},
         "features_extractor_kwargs of policy_kwargs has 'filters', but PixelEncoder has no "
