@@ -321,7 +321,9 @@ def try_rendering() -> dict[str, Any]:
 
     :return: Its result, or ``error``: a sentence
     """
-    command = [sys.executable, "-m", "sb3_cure.doctor", "--render"]
+    # Where modules are found is as here: the working directory, with a random.py perhaps, is not to come first.
+    program = f"import sys; sys.path[:] = {sys.path!r}; from sb3_cure import doctor; doctor.main(['--render'])"
+    command = [sys.executable, "-P", "-c", program]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=RENDERING_TIMEOUT)
     except subprocess.TimeoutExpired:

@@ -334,6 +334,12 @@ def test_the_doctor_survives_broken_opengl(
     assert "Training cannot work here yet." in report
 
 
+def test_the_doctor_in_a_folder_of_any_names(folder: Path) -> None:
+    """A random.py in the working directory is not taken for Python's own."""
+    (folder / "random.py").write_text("1 / 0")
+    assert "error" not in doctor.try_rendering()
+
+
 @pytest.mark.parametrize(
     ("renderer", "gpus", "install"),
     [
