@@ -37,6 +37,7 @@ from sb3_cure.settings import (
     check_sizes,
     plain_arguments,
 )
+from sb3_cure.values import arguments_of, check_keywords
 from sb3_cure.weights import Allowance, TensorInfo, TorchFile, check_parameters, check_tensor, expect_keys
 
 if TYPE_CHECKING:
@@ -262,6 +263,8 @@ def load_model(
         print("== SAVED MODEL SYSTEM INFO ==")
         print("".join(character for character in archive.system_info if character.isprintable() or character == "\n"))
     settings = _complete(archive, custom_objects, kwargs)
+    known = arguments_of(cls)
+    check_keywords("load", kwargs, known and known | settings.keys(), cls.__name__)
     if env is not None:
         env = cls._wrap_env(env, settings.get("verbose", 0))
         _check_spaces(archive.name, settings, env)

@@ -231,6 +231,13 @@ def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     assert moved and all("target" in name for name in moved)
 
 
+def test_misspelt_arguments_of_load(tmp_path: Path) -> None:
+    """They are refused rather than ignored."""
+    tiny_model("MlpPolicy", VectorBox()).save(tmp_path / "model")
+    with pytest.raises(TypeError, match="load has 'batchsize', but CuReSAC has no such argument: write 'batch_size'"):
+        CuReSAC.load(tmp_path / "model", batchsize=8)
+
+
 @pytest.mark.parametrize("change", [dict(update="sequential"), dict(curiosity_encoder_grad=False)], ids=str)
 def test_loading_into_another_algorithm_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     """The encoder's optimiser states belong to the sources and the mode that they were made with."""
