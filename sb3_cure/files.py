@@ -6,6 +6,7 @@ import io
 import os
 import pathlib
 import platform
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,8 +32,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     :return: Name to write under meanwhile, in the same folder
     """
     path = Path(path)
-    # Another name for each process and machine: several may write the same file.
-    beside = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}")
+    # Another name for each thread, process and machine: several may write the same file.
+    beside = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}.{threading.get_ident()}")
     try:
         yield beside
         flush_to_disk(beside)
@@ -90,7 +91,7 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
         path.parent.mkdir(parents=True, exist_ok=True)
     if not path.parent.is_dir():
         raise NotADirectoryError(f"cannot write '{path}', as '{path.parent}' is a file: choose another path.")
-    with replacing(path) as beside:
+    with replacing(path.resolve() if path.is_symlink() else path) as beside:  # what a link leads to, not the link
         yield beside
 
 

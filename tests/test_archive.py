@@ -15,6 +15,7 @@ import tracemalloc
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -285,6 +286,22 @@ def test_names_of_files(tmp_path: Path) -> None:
     assert (tmp_path / "new" / "model.zip").read_bytes() == before
     with pytest.raises(FileNotFoundError):
         CuReSAC.load(tmp_path / "none")
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    """As by SB3: what it leads to is replaced, and it stays a link."""
+    (tmp_path / "latest.zip").symlink_to("model.zip")
+    tiny_model("MlpPolicy", VectorBox(), batch_size=7).save(tmp_path / "latest")
+    assert (tmp_path / "latest.zip").is_symlink() and CuReSAC.load(tmp_path / "model").batch_size == 7
+
+
+def test_threads_save_to_one_file(tmp_path: Path) -> None:
+    """As trials of one process do: one of them is the file, whole."""
+    models = [tiny_model("MlpPolicy", VectorBox(), batch_size=size) for size in (5, 6, 7)]
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(lambda model: [model.save(tmp_path / "model") for _ in range(5)], models))
+    assert CuReSAC.load(tmp_path / "model").batch_size in (5, 6, 7)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.zip"]
 
 
 def test_include_and_exclude(tmp_path: Path) -> None:
