@@ -400,7 +400,7 @@ class _Progress:
     def line(self) -> str:
         """The summary, with the best return of all cells."""
         best = max(((row.best, str(row.unit.folder)) for row in self.rows if row.best is not None), default=None)
-        return self.summary() + ("" if best is None else f", best return {_return_text(best[0])} ({best[1]})")
+        return self.summary() + ("" if best is None else f", best return {best[0]:.0f} ({best[1]})")
 
 
 def _unit_progress(unit: Unit, results: Path) -> _UnitProgress:
@@ -414,10 +414,6 @@ def _unit_progress(unit: Unit, results: Path) -> _UnitProgress:
             done += unit.pretrain.budget
     rate = done / progress["seconds"] if progress.get("seconds") else 0.0
     return _UnitProgress(unit, state, done, total, rate, progress.get("best_return"))
-
-
-def _return_text(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.3g}"
 
 
 def progress_table(units: Sequence[Unit], results: Path) -> Table:
@@ -436,7 +432,7 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
                 *(
                     f"{rate:.1f}",
                     _duration((total - done) / rate) if rate else "",
-                    "" if best is None else _return_text(best),
+                    "" if best is None else f"{best:.0f}",
                 ),
             )
     if not table.row_count:
