@@ -105,7 +105,7 @@ class Generations:
                 raise CheckpointError(f"{path} has {path.stat().st_size} bytes, more than a manifest can have")
             signed = json.loads(path.read_bytes())
             content = signed["manifest"]
-            if signed["sha256"] != _sha256_of(_canonical(content)):
+            if signed["sha256"] != _sha256_of(content):
                 raise CheckpointError(f"{path} is damaged")
             files, segments = ([Entry(*entry) for entry in content[key]] for key in ("files", "segments"))
             about = dict(content["about"])
@@ -172,7 +172,7 @@ class Generations:
                 files = [draft.seal(path) for path in sorted(draft.folder.iterdir())]
                 content = {"files": files, "segments": draft.segments, "about": about}
                 manifest = draft.folder / "manifest.json"
-                manifest.write_text(json.dumps({"manifest": content, "sha256": _sha256_of(_canonical(content))}))
+                manifest.write_text(json.dumps({"manifest": content, "sha256": _sha256_of(content)}))
                 for path in (manifest, draft.folder, self.segments):
                     flush_to_disk(path)
                 draft.folder.rename(self.folder(number))
@@ -291,12 +291,8 @@ class Draft:
                 path.unlink(missing_ok=True)
 
 
-def _canonical(content: dict[str, Any]) -> bytes:
-    return json.dumps(content, sort_keys=True).encode()
-
-
-def _sha256_of(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+def _sha256_of(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _digest(path: Path) -> tuple[str, int]:
