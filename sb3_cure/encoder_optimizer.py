@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch as th
+from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
 
 from sb3_cure.guards import Guard
@@ -125,7 +126,7 @@ class EncoderOptimizer:
         self.gradient_norms, self._norms = self._norms, {}
         if self.mode == "joint" and self._latents is not None:
             optimizer = self.optimizers["joint"]
-            self._set_rate(optimizer, self.learning_rate * len(self._pulls) ** 0.5)
+            update_learning_rate(optimizer, self.learning_rate * len(self._pulls) ** 0.5)
             optimizer.zero_grad()
             self._latents.backward(th.stack(list(self._pulls.values())).sum(dim=0))
             self.guard.check("joint loss at the encoder", None, optimizer)
@@ -147,12 +148,7 @@ class EncoderOptimizer:
         """
         self.learning_rate = learning_rate
         for optimizer in self.optimizers.values():
-            self._set_rate(optimizer, learning_rate)
-
-    @staticmethod
-    def _set_rate(optimizer: th.optim.Optimizer, learning_rate: float) -> None:
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate
+            update_learning_rate(optimizer, learning_rate)
 
     def state_dict(self) -> dict[str, Any]:
         """
