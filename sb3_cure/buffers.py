@@ -5,7 +5,7 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +98,20 @@ class _SkipsMarked(ReplayBuffer):
         rows[bad], env_inds[bad] = stored[good_rows[drawn]], good_envs[drawn]
         return rows, env_inds
 
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        Transitions of the given rows, each of a randomly drawn environment; other rows where these are marked.
+
+        :param batch_inds: Row positions in [0, buffer_size): the row that ``add`` wrote when ``pos`` had this value,
+            [batch_size]
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: Batch on ``device``
+        :raises IndexError: If a row of a ``FrameStackReplayBuffer`` is empty, or its frames have been overwritten
+        """
+        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
+        self.last_sampled = self._without_marked(batch_inds, env_inds)
+        return transitions(self, *self.last_sampled, env)
+
 
 class SkippingReplayBuffer(_SkipsMarked):
     """
@@ -147,11 +161,6 @@ class SkippingReplayBuffer(_SkipsMarked):
         for array in (self.observations, self.next_observations, self.actions, self.rewards):
             array[row, marks] = 0
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
-        self.last_sampled = self._without_marked(batch_inds, env_inds)
-        return transitions(self, *self.last_sampled, env)
-
 
 def why_not_skipping(buffer: ReplayBuffer) -> str | None:
     """
@@ -181,18 +190,15 @@ def skip_marked(buffer: ReplayBuffer, infos: list[dict[str, Any]]) -> None:
     :param infos: What it is about to be given
     :raises ValueError: If there is a mark and the buffer is of a class that cannot skip it
     """
-    if isinstance(buffer, _SkipsMarked) or not any(is_marked(info) for info in infos):
+    told = [info[mark] for info in infos for mark in MARKS if info.get(mark) is not None]
+    if isinstance(buffer, _SkipsMarked) or not told:
         return
     reason = why_not_skipping(buffer)
     if reason is not None:
-        raise ValueError(f"A transition is to be left out of the replay buffer ({next(_told(infos))}), {reason}")
+        raise ValueError(f"A transition is to be left out of the replay buffer ({told[0]}), {reason}")
     # In place, as a rollout under way holds this very object.
     buffer.__class__ = SkippingReplayBuffer
     buffer._start_marking()  # type: ignore[attr-defined]
-
-
-def _told(infos: list[dict[str, Any]]) -> Iterator[str]:
-    return (str(info[mark]) for info in infos for mark in MARKS if info.get(mark) is not None)
 
 
 class FrameStackReplayBuffer(_SkipsMarked):
@@ -426,20 +432,6 @@ class FrameStackReplayBuffer(_SkipsMarked):
         if self._n_valid < n_stored:
             rows = (rows + self.pos - self._n_valid) % self.buffer_size
         return self._get_samples(rows, env=env)
-
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """
-        Transitions of the given rows, each of a randomly drawn environment; other rows where these are marked.
-
-        :param batch_inds: Row positions in [0, buffer_size), as for ``ReplayBuffer``: the row that ``add`` wrote when
-            ``pos`` had this value, [batch_size]
-        :param env: VecEnv to normalize the observations and rewards with
-        :return: Batch on ``device``
-        :raises IndexError: If a row is empty, or its frames have been overwritten
-        """
-        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))
-        self.last_sampled = self._without_marked(batch_inds, env_inds)
-        return self.transitions(*self.last_sampled, env)
 
     def transitions(
         self, rows: np.ndarray, env_inds: np.ndarray, env: VecNormalize | None = None
