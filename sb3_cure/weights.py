@@ -286,16 +286,14 @@ def expect_keys(state: Any, keys: Any, path: str) -> dict[str, Any]:
     return state
 
 
-def check_tensor(
-    value: Any, shape: tuple[int, ...], path: str, part: object, dtype: th.dtype | None = None, finite: bool = True
-) -> None:
+def check_tensor(value: Any, shape: tuple[int, ...], path: str, part: object, dtype: th.dtype | None = None) -> None:
     if not isinstance(value, th.Tensor) or value.shape != shape or dtype not in (None, value.dtype):
         kind = f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, th.Tensor) else type(value).__name__
         raise ArchiveError(
             f"{path} has {part!s:.100} as {kind}, but {dtype or 'numbers'} of shape {tuple(shape)} are expected: it "
             "belongs to a model with other settings."
         )
-    if finite and not bool(th.isfinite(value).all()):
+    if not bool(th.isfinite(value).all()):
         raise ArchiveError(
             f"{path} has {part!s:.100} with values that are not finite: what it was saved from is broken."
         )
@@ -325,15 +323,12 @@ def _check_optimizer(optimizer: th.optim.Optimizer, state: Any, path: str) -> No
                 f"{path} lacks {sorted(needed - moments.keys())[0]!r} of parameter {index}: it is damaged."
             )
         for part, value in moments.items():
-            if isinstance(value, th.Tensor) and value.numel() != 1:
+            if part in ("exp_avg", "exp_avg_sq") or (isinstance(value, th.Tensor) and value.numel() != 1):
                 check_tensor(value, parameters[index].shape, path, part)
             elif isinstance(value, th.Tensor):
                 check_tensor(value, value.shape, path, part)
             elif not _is_option(value):
                 raise ArchiveError(f"{path} has {part!s:.50}={value!s:.50}: it is damaged.")
-        for part in ("exp_avg", "exp_avg_sq"):
-            if part in moments:
-                check_tensor(moments[part], parameters[index].shape, path, part)
 
 
 def _is_option(value: Any) -> bool:
