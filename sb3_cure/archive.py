@@ -276,13 +276,13 @@ def load_model(
             settings["action_noise"] = noise.base_noise  # of which `learn` makes one for each environment
     with sentences(archive.name, _SMALLER):
         model = cls(settings["policy_class"], env, device=device, _init_setup_model=False)
-        later = _apply(model, settings, archive, trusted)
+        known = vars(model).keys() | SCHEMA.keys()
+        vars(model).update({key: value for key, value in settings.items() if key in known or trusted})
         vars(model).update(kwargs)
         with contextlib.nullcontext() if trusted else Allowance(archive.tensors, archive.name):
             model._setup_model()
-        unknown = sorted(key for key in later if key not in vars(model) and not trusted)
         is_heir = archive.saved_by in map(_name_of, cls.__mro__)
-        for key in unknown:
+        for key in [] if trusted else sorted(settings.keys() - known - vars(model).keys()):
             # A callback, say, may have noted it at a model of this class, none of whose own names it may cover.
             if not is_heir or hasattr(cls, key):
                 raise ArchiveError(
@@ -306,15 +306,14 @@ def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dic
     missing = sorted(archive.placeholders.keys() - custom_objects.keys() - kwargs.keys())
     if missing:
         raise ObjectsMissing(archive.name, {key: archive.placeholders[key] for key in missing})
-    for key, value in settings.items():
-        words, check = SCHEMA.get(key, ("", lambda _: True))
-        with sentences(archive.name, _SMALLER):
-            fits = check(value)
-        if not fits:
-            raise ArchiveError(
-                f"{archive.name} has {key}={value!r:.100}, but {key} is {words}: it is damaged, or of another version."
-            )
     with sentences(archive.name, _SMALLER):
+        for key, value in settings.items():
+            words, check = SCHEMA.get(key, ("", lambda _: True))
+            if not check(value):
+                raise ArchiveError(
+                    f"{archive.name} has {key}={value!r:.100}, but {key} is {words}: it is damaged, or of another "
+                    "version."
+                )
         check_sizes(settings)
     known = settings.keys() | archive.placeholders.keys()
     settings.update({key: value for key, value in custom_objects.items() if key in known})
@@ -340,13 +339,6 @@ def _check_spaces(name: str, settings: dict[str, Any], env: VecEnv) -> None:
         raise ArchiveError(
             f"{name} was trained with the {what} {trained}, but the environment has {given}: {fix}, or train anew."
         )
-
-
-def _apply(model: "CuReSAC", settings: dict[str, Any], archive: ModelArchive, trusted: bool) -> list[str]:
-    """Give a new model its settings, but for those that it does not have, whose names are returned."""
-    known = vars(model).keys() | SCHEMA.keys()
-    vars(model).update({key: value for key, value in settings.items() if key in known or trusted})
-    return [key for key in settings if key not in known]
 
 
 def _set_variables(model: "CuReSAC", archive: ModelArchive) -> None:
