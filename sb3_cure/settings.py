@@ -4,10 +4,9 @@ Classes are looked up by name in a fixed table; nothing that a file names is imp
 """
 
 import math
-import pathlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ class SettingsEncoder(Encoder):
         write = _WRITERS.get(type(value))
         if write is not None:
             return {type(value).__name__: part(write(value))}
-        if isinstance(value, pathlib.PurePath):
+        if isinstance(value, PurePath):
             return {"Path": str(value)}
         if callable(value) and hasattr(value, "__qualname__"):
             kind = "class" if isinstance(value, type) else "function"
@@ -179,18 +178,6 @@ def _number_type(name: Any) -> type:
     return numeric_dtype(name).type
 
 
-def _read_discrete(n: int, start: int, dtype: str) -> spaces.Discrete:
-    return spaces.Discrete(n, start=start, dtype=_number_type(dtype))
-
-
-def _read_multi_discrete(nvec: np.ndarray, start: np.ndarray, dtype: str) -> spaces.MultiDiscrete:
-    return spaces.MultiDiscrete(nvec, dtype=_number_type(dtype), start=start)
-
-
-def _read_multi_binary(shape: list[int]) -> spaces.MultiBinary:
-    return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
-
-
 def _read_mixer(n_steps: int, n_curious: int, state: dict[str, Any]) -> CuriousMixer:
     # Its probability is the setting `curiosity_prob`, which set-up gives it.
     mixer = CuriousMixer(0.0)
@@ -203,10 +190,6 @@ def whole(value: Any) -> int:
     if type(value) is not int or not 0 <= value < 2**63:
         raise ArchiveError(f"the archive has the count {value!r:.50}.")
     return value
-
-
-def _read_normal_noise(mean: Any, sigma: Any, dtype: str) -> NormalActionNoise:
-    return NormalActionNoise(mean, sigma, _number_type(dtype))
 
 
 def _read_ou_noise(
@@ -282,9 +265,9 @@ _WRITERS: dict[type, Callable[[Any], Any]] = {
 }
 _READERS: dict[str, Callable[..., Any]] = {
     "Box": _read_box,
-    "Discrete": _read_discrete,
-    "MultiDiscrete": _read_multi_discrete,
-    "MultiBinary": _read_multi_binary,
+    "Discrete": lambda n, start, dtype: spaces.Discrete(n, start=start, dtype=_number_type(dtype)),
+    "MultiDiscrete": lambda nvec, start, dtype: spaces.MultiDiscrete(nvec, dtype=_number_type(dtype), start=start),
+    "MultiBinary": lambda shape: spaces.MultiBinary(shape[0] if len(shape) == 1 else shape),
     "Dict": lambda *items: spaces.Dict(OrderedDict(items)),  # in this order, where a dict would be sorted
     "Tuple": lambda *parts: spaces.Tuple(parts),
     "OrderedDict": lambda *items: OrderedDict(items),
@@ -292,7 +275,7 @@ _READERS: dict[str, Callable[..., Any]] = {
     "FloatSchedule": FloatSchedule,
     "LinearSchedule": LinearSchedule,
     "TrainFreq": lambda frequency, unit: TrainFreq(whole(frequency), TrainFrequencyUnit(unit)),
-    "NormalActionNoise": _read_normal_noise,
+    "NormalActionNoise": lambda mean, sigma, dtype: NormalActionNoise(mean, sigma, _number_type(dtype)),
     "OrnsteinUhlenbeckActionNoise": _read_ou_noise,
     "VectorizedActionNoise": _read_vectorized_noise,
     "CuriousMixer": _read_mixer,
@@ -363,10 +346,7 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
         "_total_timesteps": ("a whole number >= 0", lambda value: is_number(value, low=0) and value == int(value)),
         "start_time": ("a number", is_number),
         "verbose gradient_steps sde_sample_freq": ("a whole number", _is_integer),
-        "n_steps srl_period actor_update_interval target_update_interval _action_repeat _frame_stack batch_size": (
-            "a whole number >= 1",
-            lambda value: _is_count(value) and value >= 1,
-        ),
+        "n_steps srl_period actor_update_interval target_update_interval _action_repeat _frame_stack batch_size "
         "buffer_size": ("a whole number >= 1", lambda value: _is_count(value) and value >= 1),
         "n_envs": (f"a whole number from 1 to {MAX_ENVS}", lambda value: _is_count(value) and 1 <= value <= MAX_ENVS),
         "_stats_window_size": (
@@ -389,7 +369,7 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
         "compile": ("True, False or a string", _is_a(bool, str)),
         "srl_schedule curiosity_target update precision on_bad_transition": ("a string", _is_a(str)),
         "curiosity _collector": ("a string or None", _or_none(_is_a(str))),
-        "tensorboard_log": ("a path or None", _or_none(lambda value: isinstance(value, str | pathlib.PurePath))),
+        "tensorboard_log": ("a path or None", _or_none(lambda value: isinstance(value, str | PurePath))),
         "policy_kwargs replay_buffer_kwargs srl_kwargs": ("a dictionary", _is_a(dict)),
         "policy_class": ("a policy", _is_class(BasePolicy)),
         "replay_buffer_class": ("a replay buffer's class or None", _or_none(_is_class(sb3_buffers.ReplayBuffer))),
