@@ -97,18 +97,6 @@ class _FrameWatcher:
         """How many of the latest steps showed the same pixels, if anything moved meanwhile."""
         return self._n_same if self._n_moving else 0
 
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: What it remembers of the steps before
-        """
-        return {name: getattr(self, name) for name in ("_frame", "_position", "_n_same", "_n_moving")}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Result of ``state_dict``
-        """
-        vars(self).update(state)
-
     def check(self, observation: Any, of_step: bool) -> None:
         """
         :param observation: What the environment returned
@@ -202,10 +190,11 @@ class _Environment:
         setattr(self.env, *name_and_value)
 
     def watcher_state(self, _: None) -> dict[str, Any]:
-        return self.watcher.state_dict()
+        """What it remembers of the steps before."""
+        return {name: getattr(self.watcher, name) for name in ("_frame", "_position", "_n_same", "_n_moving")}
 
     def load_watcher_state(self, state: dict[str, Any]) -> None:
-        self.watcher.load_state_dict(state)
+        vars(self.watcher).update(state)
 
     def is_wrapped(self, wrapper_class: type[gym.Wrapper]) -> bool:
         return is_wrapped(self.env, wrapper_class)
