@@ -137,7 +137,8 @@ class CURL(SRLHead):
         self._fill_bank(batch.observations)
         keys = self._keys(self._augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
-        error = F.cross_entropy(self._logits(latents, keys), labels, reduction="none")
+        # Row maxima are subtracted inside cross_entropy.
+        error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
         return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()
@@ -190,10 +191,6 @@ class CURL(SRLHead):
     @th.no_grad()
     def _keys(self, views: th.Tensor) -> th.Tensor:
         return self.target_encoder(self.preprocess(views)).float()
-
-    def _logits(self, anchors: th.Tensor, keys: th.Tensor) -> th.Tensor:
-        # Row maxima are subtracted inside cross_entropy.
-        return anchors.float() @ self.W @ keys.T
 
     @th.no_grad()
     def _fill_bank(self, observations: th.Tensor) -> None:
