@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC
 
 
-#: Classes whose contents are written without pickle, with what is written of them: counters, and arrays of rows
+#: What is written of a replay buffer: counters, and arrays of rows
 _COUNTERS = ("buffer_size", "n_envs", "pos")
 _FRAME_COUNTERS = ("n_valid", "n_frames")
 _ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "marked")
@@ -48,11 +48,10 @@ def save_buffer(buffer: sb3_buffers.ReplayBuffer, path: PathOrFile, pickle: Call
     :param pickle: Writes it to a path or file as SB3 does, for classes of which no more is known
     """
     with writing(path, "pkl") as target:
-        if not can_be_kept(type(buffer)):
-            # A name with a suffix, as SB3 would add one.
-            pickle(target)
-            return
-        write_state(target, _buffer_state(buffer))
+        if can_be_kept(type(buffer)):
+            write_state(target, _buffer_state(buffer))
+        else:
+            pickle(target)  # a name with a suffix, as SB3 would add one
 
 
 def frame_rows(buffer: FrameStackReplayBuffer) -> dict[str, Any]:
