@@ -4,7 +4,6 @@ import contextlib
 import errno
 import io
 import os
-import pathlib
 import platform
 import threading
 import warnings
@@ -19,7 +18,7 @@ try:
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-PathOrFile: TypeAlias = str | pathlib.Path | io.BufferedIOBase
+PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 
 
 @contextlib.contextmanager
@@ -77,7 +76,7 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
     :raises ValueError: if it is neither
     :raises OSError: if the folder cannot be one
     """
-    if not isinstance(path, str | pathlib.Path):
+    if not isinstance(path, str | Path):
         yield open_path(_binary_file(path), "w")
         return
     path = Path(path)
@@ -104,7 +103,7 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     :raises ValueError: if it is neither
     :raises OSError: if there is no such file
     """
-    if not isinstance(path, str | pathlib.Path):
+    if not isinstance(path, str | Path):
         _binary_file(path)
     elif not any(map(os.path.exists, (path, f"{path}.{suffix}"))):
         raise FileNotFoundError(
@@ -115,9 +114,9 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     file = open_path(path, "r", suffix=suffix)
     try:
         file.seek(0)
-        yield file, f"'{path}'" if isinstance(path, str | pathlib.Path) else "the file"  # type: ignore[misc]
+        yield file, f"'{path}'" if isinstance(path, str | Path) else "the file"  # type: ignore[misc]
     finally:
-        if isinstance(path, str | pathlib.Path):
+        if isinstance(path, str | Path):
             file.close()
 
 
