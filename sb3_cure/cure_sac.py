@@ -5,7 +5,7 @@ import pathlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -101,32 +101,19 @@ class Agent:
         return self.ent_coef if self.log_ent_coef is None else self.log_ent_coef.detach().exp()  # type: ignore[return-value]
 
 
+@dataclass
 class EncoderPass:
     """One run of the shared encoder over a batch.
 
     :param latents: Latents of the observations, with their graph, [B, features_dim]
     :param for_actor: Computes what an actor's update reads, when it is due: trunk features of the observations,
         [B, trunk_dim], and their latents, [B, features_dim], both detached
-    :param next_features: Computes the trunk features of the next observations; called at most once
+    :param next_features: Trunk features of the next observations, detached, [B, trunk_dim]; computed by the first call
     """
 
-    def __init__(
-        self,
-        latents: th.Tensor,
-        for_actor: Callable[[], tuple[th.Tensor, th.Tensor]],
-        next_features: Callable[[], th.Tensor],
-    ):
-        self.latents = latents
-        self.for_actor = for_actor
-        self._compute_next_features = next_features
-        self._next_features: th.Tensor | None = None
-
-    @property
-    def next_features(self) -> th.Tensor:
-        """Trunk features of the next observations, detached, [B, trunk_dim]."""
-        if self._next_features is None:
-            self._next_features = self._compute_next_features()
-        return self._next_features
+    latents: th.Tensor
+    for_actor: Callable[[], tuple[th.Tensor, th.Tensor]]
+    next_features: Callable[[], th.Tensor]
 
 
 class CuReSAC(SAC):
@@ -714,7 +701,7 @@ class CuReSAC(SAC):
 
         rewards = batch.rewards
         if self.policy.srl is not None:
-            error = self._update_srl(batch, encode())
+            error = self._update_srl(self.policy.srl, batch, encode())
             if self._uses_curious_reward:
                 curious_reward = self._curious_reward(error)
                 if self.curiosity == "bonus":
@@ -744,22 +731,19 @@ class CuReSAC(SAC):
                 moved = encoder.trunk(observations)
                 return moved, encoder.projection(moved).float()
 
+        @cache
         def next_features() -> th.Tensor:
             with th.no_grad(), self._autocast():
                 return encoder.trunk(next_observations)
 
         return EncoderPass(latents, for_actor, next_features)
 
-    @property
-    def _srl_head(self) -> SRLHead:
-        return self.policy.srl  # type: ignore[return-value]
-
-    def _update_srl(self, batch: ReplayBufferSamples, encoded: EncoderPass) -> th.Tensor:
+    def _update_srl(self, srl: SRLHead, batch: ReplayBufferSamples, encoded: EncoderPass) -> th.Tensor:
         """UpdateSRL of Algorithm 1: train head and encoder.
 
         :return: SRL error of the observations (or next observations) that the curious reward is about, [B]
         """
-        srl, trains = self._srl_head, self._in_srl_phase
+        trains = self._in_srl_phase
         # The loss stops at a copy of the latents; the encoder's optimiser takes the gradient from there.
         latents = encoded.latents.detach().requires_grad_(trains)
         with th.set_grad_enabled(trains), self._autocast():
@@ -780,7 +764,7 @@ class CuReSAC(SAC):
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
-                next_latents = self.policy.encoder.projection(encoded.next_features).float()
+                next_latents = self.policy.encoder.projection(encoded.next_features()).float()
                 _, error = srl.loss(batch._replace(observations=batch.next_observations), next_latents)  # type: ignore[arg-type]
             error = error.float()
         return error
@@ -823,7 +807,7 @@ class CuReSAC(SAC):
         gamma = self.gamma if agent is self._task_agent else self.curiosity_gamma
         discounts = gamma if batch.discounts is None else batch.discounts
         with th.no_grad(), self._autocast():
-            next_actions, next_log_prob = agent.actor.action_log_prob(encoded.next_features)
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoded.next_features())
             next_q = th.cat(agent.critic_target(next_latents, next_actions), dim=1).amin(dim=1, keepdim=True)
         next_value = next_q - agent.temperature() * next_log_prob.unsqueeze(1)
         target = rewards + (1 - batch.dones) * discounts * next_value
