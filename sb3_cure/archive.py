@@ -264,7 +264,7 @@ def load_model(
         print("".join(character for character in archive.system_info if character.isprintable() or character == "\n"))
     settings = _complete(archive, custom_objects, kwargs)
     known = arguments_of(cls)
-    check_keywords("load", kwargs, known and known | settings.keys(), cls.__name__)
+    check_keywords("load", kwargs, known and known | settings.keys() | archive.placeholders.keys(), cls.__name__)
     if env is not None:
         env = cls._wrap_env(env, settings.get("verbose", 0))
         _check_spaces(archive.name, settings, env)

@@ -238,6 +238,14 @@ def test_misspelt_arguments_of_load(tmp_path: Path) -> None:
         CuReSAC.load(tmp_path / "model", batchsize=8)
 
 
+def test_objects_of_the_users_own_given_to_load(tmp_path: Path) -> None:
+    """What no archive holds may be given as an argument, too."""
+    model = tiny_model("MlpPolicy", VectorBox())
+    model.teacher = model.policy.actor  # type: ignore[attr-defined]
+    model.save(tmp_path / "model")
+    assert CuReSAC.load(tmp_path / "model", teacher="me").teacher == "me"  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("change", [dict(update="sequential"), dict(curiosity_encoder_grad=False)], ids=str)
 def test_loading_into_another_algorithm_is_refused(change: dict[str, Any], tmp_path: Path) -> None:
     """The encoder's optimiser states belong to the sources and the mode that they were made with."""
