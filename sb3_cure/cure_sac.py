@@ -1157,12 +1157,13 @@ class CuReSAC(SAC):
         :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
         :param exact_match: Whether all of the model's parameters have to be there, and no others
         :param device: As in SB3; the parameters stay on the model's device
-        :raises ArchiveError: (a ``ValueError``) if parameters are not finite or of other sizes than the model's, or a
-            file's do not fit it otherwise; the model stays what it was
+        :raises ArchiveError: (a ``ValueError``) if networks' parameters are not finite or of other sizes than the
+            model's, or a file's do not fit it otherwise; the model stays what it was
         """
         if isinstance(load_path_or_dict, dict):
-            known = {*self._get_torch_save_params()[0]}  # of other names SB3 tells
-            shared = {name: state for name, state in load_path_or_dict.items() if name in known}
+            # The rest is left to SB3, as states of optimisers of another version of torch; it tells of other names.
+            known = {name for name in self._get_torch_save_params()[0] if "optim" not in name}
+            shared = {k: v for k, v in load_path_or_dict.items() if k in known and isinstance(v, dict)}
             check_parameters(self, shared, "the dictionary of parameters", exact_match=False)
         else:
             archive = read_model(load_path_or_dict, settings=False)

@@ -244,7 +244,7 @@ def check_parameters(model: "CuReSAC", params: dict[str, Any], name: str, exact_
     :param model: The model that they are for
     :param params: State dicts by name
     :param name: What to call their origin
-    :param exact_match: Whether all of the model's parameters have to be there
+    :param exact_match: Whether all of the model's parameters have to be there, and of its types
     :raises ArchiveError: for the first that does not fit, in one sentence
     """
     expected = {*model._get_torch_save_params()[0]}
@@ -273,7 +273,7 @@ def check_parameters(model: "CuReSAC", params: dict[str, Any], name: str, exact_
             if exact_match:
                 expect_keys(state, own.keys(), path)
             for part in own.keys() & state.keys():
-                check_tensor(state[part], own[part].shape, path, part, own[part].dtype)
+                check_tensor(state[part], own[part].shape, path, part, own[part].dtype if exact_match else None)
 
 
 def expect_keys(state: Any, keys: Any, path: str) -> dict[str, Any]:

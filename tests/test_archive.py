@@ -379,6 +379,16 @@ def test_set_parameters_of_another_model() -> None:
     assert differences(before, state_of(model)) == []
 
 
+def test_set_parameters_of_other_types() -> None:
+    """As SB3: means of models are float64, and states of optimisers may be of an older torch, which lack options."""
+    source, model = (tiny_model("MlpPolicy", VectorBox(), seed=seed).learn(12) for seed in (0, 1))
+    given = source.get_parameters()
+    given["policy"] = {name: value.double() for name, value in given["policy"].items()}
+    del given["actor.optimizer"]["param_groups"][0]["decoupled_weight_decay"]
+    model.set_parameters(given)
+    assert differences(source.policy.state_dict(), model.policy.state_dict()) == []
+
+
 # --------------------------------------------------------------- replay buffers
 
 
