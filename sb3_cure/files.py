@@ -85,12 +85,13 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
     if path.is_dir():
         warnings.warn(f"Path '{path}' is a folder. Will save instead to {path}_2", stacklevel=4)
         path = Path(f"{path}_2")
+    path = path.resolve() if path.is_symlink() else path  # what a link leads to is written, not the link
     if not path.parent.exists():
         warnings.warn(f"Path '{path.parent}' does not exist. Will create it.", stacklevel=4)
         path.parent.mkdir(parents=True, exist_ok=True)
     if not path.parent.is_dir():
         raise NotADirectoryError(f"cannot write '{path}', as '{path.parent}' is a file: choose another path.")
-    with replacing(path.resolve() if path.is_symlink() else path) as beside:  # what a link leads to, not the link
+    with replacing(path) as beside:
         yield beside
 
 

@@ -293,6 +293,10 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
     (tmp_path / "latest.zip").symlink_to("model.zip")
     tiny_model("MlpPolicy", VectorBox(), batch_size=7).save(tmp_path / "latest")
     assert (tmp_path / "latest.zip").is_symlink() and CuReSAC.load(tmp_path / "model").batch_size == 7
+    (tmp_path / "lost.zip").symlink_to("gone/model.zip")
+    with pytest.warns(UserWarning, match="gone' does not exist. Will create it."):
+        tiny_model("MlpPolicy", VectorBox(), batch_size=6).save(tmp_path / "lost")
+    assert CuReSAC.load(tmp_path / "lost").batch_size == 6
 
 
 def test_threads_save_to_one_file(tmp_path: Path) -> None:
