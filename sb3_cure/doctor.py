@@ -322,7 +322,8 @@ def try_rendering() -> dict[str, Any]:
     :return: Its result, or ``error``: a sentence
     """
     # Where modules are found is as here: the working directory, with a random.py perhaps, is not to come first.
-    program = f"import sys; sys.path[:] = {sys.path!r}; from sb3_cure import doctor; doctor.main(['--render'])"
+    folders = list(map(str, sys.path))  # notebooks add a Path
+    program = f"import sys; sys.path[:] = {folders!r}; from sb3_cure import doctor; doctor.main(['--render'])"
     command = [sys.executable, "-P", "-c", program]
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=RENDERING_TIMEOUT)

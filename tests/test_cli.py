@@ -334,9 +334,10 @@ def test_the_doctor_survives_broken_opengl(
     assert "Training cannot work here yet." in report
 
 
-def test_the_doctor_in_a_folder_of_any_names(folder: Path) -> None:
-    """A random.py in the working directory is not taken for Python's own."""
+def test_the_doctor_in_a_folder_of_any_names(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A random.py in the working directory is not taken for Python's own; modules may be looked for in a Path."""
     (folder / "random.py").write_text("1 / 0")
+    monkeypatch.setattr(sys, "path", [*sys.path, folder / "modules"])
     assert "error" not in doctor.try_rendering()
 
 
