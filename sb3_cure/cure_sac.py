@@ -1141,7 +1141,11 @@ class CuReSAC(SAC):
         :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled or of another algorithm
         """
         if trusted and is_pickled_model(path):
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            try:
+                return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            except KeyError as error:
+                # SB3 takes parameters that `set_parameters` refuses for those of an old DQN, and misses its optimiser.
+                raise (error.__context__ if isinstance(error.__context__, ValueError) else error) from None
         return load_model(  # type: ignore[return-value]
             cls, path, env, device, custom_objects, print_system_info, force_reset, trusted, kwargs
         )

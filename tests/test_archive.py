@@ -353,6 +353,9 @@ def test_pickled_archives_need_trust() -> None:
     with watching() as events:
         other.set_parameters(io.BytesIO(data))
     assert differences(model.get_parameters(), other.get_parameters()) == [] and events == []
+    model.policy.encoder.trunk[0].bias.data.fill_(np.nan)
+    with pytest.raises(ArchiveError, match=r"policy has .* with values that are not finite"):
+        CuReSAC.load(io.BytesIO(pickled_model(model)), trusted=True)
 
 
 @pytest.mark.parametrize("trusted", [False, True])
