@@ -1163,6 +1163,7 @@ class CuReSAC(SAC):
         :param device: As in SB3; the parameters stay on the model's device
         :raises ArchiveError: (a ``ValueError``) if networks' parameters are not finite or of other sizes than the
             model's, or a file's do not fit it otherwise; the model stays what it was
+        :raises RuntimeError: if the encoder's optimisers are of another ``update``; the model stays what it was
         """
         if isinstance(load_path_or_dict, dict):
             # The rest is left to SB3, as states of optimisers of another version of torch; it tells of other names.
@@ -1173,6 +1174,10 @@ class CuReSAC(SAC):
             archive = read_model(load_path_or_dict, settings=False)
             check_parameters(self, archive.params, archive.name, exact_match)
             load_path_or_dict = archive.params
+        own = getattr(self.policy, "encoder_optimizer", None)  # SB3's policies have none
+        given = load_path_or_dict.get("policy.encoder_optimizer")
+        if exact_match and own is not None and isinstance(given, dict):
+            own.check_origin(given)
         super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
 
     def save_replay_buffer(self, path: PathOrFile) -> None:

@@ -161,20 +161,31 @@ class EncoderOptimizer:
             "n_steps": self._n_steps,
         }
 
+    def check_origin(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        :raises RuntimeError: if it belongs to another mode or other sources
+        """
+        if not self._is_of_this_mode(state):
+            # As torch's own load_state_dict; SB3's `load` takes a ValueError for an archive of an old DQN.
+            raise RuntimeError(
+                f"the saved encoder was trained by {sorted(state['weights'])} with optimisers "
+                f"{sorted(state['optimizers'])}, but this model has {sorted(self.weights)} with "
+                f"{sorted(self.optimizers)}: load with the update=, srl= and curiosity= it was trained with."
+            )
+
+    def _is_of_this_mode(self, state: dict[str, Any]) -> bool:
+        return state["optimizers"].keys() == self.optimizers.keys() and state["weights"].keys() == self.weights.keys()
+
     def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
         """
         :param state: Result of ``state_dict``
         :param strict: Whether a state of other sources or of the other mode is an error (else it is skipped)
         :raises RuntimeError: if ``strict`` and the state belongs to another mode or other sources
         """
-        if state["optimizers"].keys() != self.optimizers.keys() or state["weights"].keys() != self.weights.keys():
-            if strict:
-                # As torch's own load_state_dict; SB3's `load` takes a ValueError for an archive of an old DQN.
-                raise RuntimeError(
-                    f"the saved encoder was trained by {sorted(state['weights'])} with optimisers "
-                    f"{sorted(state['optimizers'])}, but this model has {sorted(self.weights)} with "
-                    f"{sorted(self.optimizers)}: load with the update=, srl= and curiosity= it was trained with."
-                )
+        if strict:
+            self.check_origin(state)
+        elif not self._is_of_this_mode(state):
             return
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])

@@ -383,6 +383,11 @@ def test_set_parameters_of_another_model() -> None:
     tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True)).save(file)
     with pytest.raises(ArchiveError, match="lacks parameters"):
         model.set_parameters(file)
+    sequential = tiny_model("CnnPolicy", PixelBox(), update="sequential")
+    sequential.save(file := io.BytesIO())
+    for source in (file, sequential.get_parameters()):
+        with pytest.raises(RuntimeError, match=r"the saved encoder was trained by .* load with the update="):
+            model.set_parameters(source)
     assert differences(before, state_of(model)) == []
 
 
