@@ -96,8 +96,8 @@ class BatchNorm(BaseFeaturesExtractor):
 
     def __init__(self, observation_space: spaces.Space, dropout: float = 0.0):
         size = spaces.flatdim(observation_space)
-        super().__init__(observation_space, features_dim=size)
-        self.layers = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(size), nn.Dropout(dropout))
+        super().__init__(observation_space, features_dim=size + 1)  # two are too few for LayerNorm
+        self.layers = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(size), nn.Dropout(dropout), nn.ZeroPad1d((0, 1)))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         return self.layers(observations)
