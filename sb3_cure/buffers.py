@@ -190,8 +190,10 @@ def skip_marked(buffer: ReplayBuffer, infos: list[dict[str, Any]]) -> None:
     :param infos: What it is about to be given
     :raises ValueError: If there is a mark and the buffer is of a class that cannot skip it
     """
+    if isinstance(buffer, _SkipsMarked):
+        return
     told = [info[mark] for info in infos for mark in MARKS if info.get(mark) is not None]
-    if isinstance(buffer, _SkipsMarked) or not told:
+    if not told:
         return
     reason = why_not_skipping(buffer)
     if reason is not None:
