@@ -1462,6 +1462,54 @@ def test_a_killed_ray_worker_costs_nothing(tmp_path: Path) -> None:
     assert common_rows(out) == by_ray
 
 
+CARDS = """
+import os, time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+
+class Waits(gym.Env):
+    '''Notes the card that it sees, and begins once another process is under way as well.'''
+
+    observation_space = gym.spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        folder, me = Path(os.environ["CARDS"]), str(os.getpid())
+        (folder / me).write_text(os.environ["CUDA_VISIBLE_DEVICES"])
+        deadline = time.monotonic() + 120
+        while len(list(folder.iterdir())) < 2:
+            if time.monotonic() > deadline:
+                raise TimeoutError("no other process has begun")
+            time.sleep(0.05)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+gym.register("Waits-v0", entry_point=Waits, max_episode_steps=20)
+"""
+
+
+def test_cells_share_a_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray takes any machine's word for its cards: two cells of half a card each run at the same time, on that card."""
+    pytest.importorskip("ray")
+    (tmp_path / "cards.py").write_text(CARDS)
+    seen = tmp_path / "seen"
+    seen.mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CARDS", str(seen))
+    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1, "CPU": 4}')
+    path = write_grid(tmp_path, tasks=["cards:Waits-v0"], seeds=2, budget=40, evaluation=dict(every=40, episodes=1))
+    assert launch(path, tmp_path / "out", "--engine", "ray", "--gpus-per-cell", "0.5").wait(timeout=600) == 0
+    assert [card.read_text() for card in seen.iterdir()] == ["0", "0"]
+    assert len(list((tmp_path / "out").rglob("DONE"))) == 2
+
+
 def _holds(process: psutil.Process, path: Path) -> bool:
     try:
         return any(Path(file.path) == path for file in process.open_files())
