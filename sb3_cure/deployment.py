@@ -49,6 +49,7 @@ class DeterministicActor(nn.Module):
         :return: Actions within the environment's bounds, [B, *action shape]
         """
         (policy,) = self._policy
+        policy.set_training_mode(False)  # as `predict` does: the model may have trained on
         inputs = observations if self.trunk is None else self.trunk(policy.center(observations))
         mean, _, _ = self.actor.get_action_dist_params(inputs)
         scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)

@@ -47,6 +47,20 @@ def test_what_acts_is_all_that_leaves() -> None:
     assert sum(value.numel() for value in exported.state_dict.values()) == sum(map(th.numel, parts)) + 4  # two bounds
 
 
+def test_training_goes_on_after_it_was_made() -> None:
+    """Actions are still those of ``predict``, though training leaves the networks in another mode."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    model.policy.encoder.trunk.append(th.nn.Dropout())
+    module = DeterministicActor(model)
+    model.learn(14)
+    assert model.policy.training
+    batch = th.as_tensor(model.observation_space.sample()[None])
+    exported = th.export.export(module, (batch,)).module()
+    for follow in (module, exported):
+        actions = follow(batch).detach().numpy()
+        np.testing.assert_allclose(actions, model.predict(batch.numpy(), deterministic=True)[0], atol=1e-5)
+
+
 def test_a_policy_that_is_not_there() -> None:
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
     with pytest.raises(ValueError, match="actor is 'curious', but this model has 'task': choose one of them"):
