@@ -132,7 +132,9 @@ def check_action_space(action_space: spaces.Space) -> None:
             f"the action space is {action_space}, but SAC needs continuous actions (a Box): use another algorithm "
             "(DQN, PPO), or an environment with continuous actions."
         )
-    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_bounded = np.isfinite(action_space.high - action_space.low).all()  # actions are scaled by these
+    if not is_bounded:
         raise ValueError(
             f"the action space is {action_space}, but SAC needs finite bounds: give it some that suit the environment, "
             "such as gymnasium.wrappers.TransformAction(env, lambda action: action, gymnasium.spaces.Box(-1, 1, "

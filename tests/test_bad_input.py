@@ -556,6 +556,14 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "give it some that suit the environment, such as gymnasium.wrappers.TransformAction(env, "
         "lambda action: action, gymnasium.spaces.Box(-1, 1, (2,))).",
     ),
+    "bounds of the largest numbers": (
+        "CnnPolicy",
+        actions(spaces.Box(-3e38, 3e38, (2,), np.float32)),
+        {},
+        "the action space is Box(-3e+38, 3e+38, (2,), float32), but SAC needs finite bounds: "
+        "give it some that suit the environment, such as gymnasium.wrappers.TransformAction(env, "
+        "lambda action: action, gymnasium.spaces.Box(-1, 1, (2,))).",
+    ),
     "unbounded above": (
         "CnnPolicy",
         actions(spaces.Box(np.zeros(2, np.float32), np.array([1, np.inf], np.float32))),
