@@ -266,19 +266,20 @@ def _check_training_arguments(model: "CuReSAC") -> None:
             f"learning_rate is {learning_rate!r}, but it must be a float of at least 0, or a schedule of the remaining "
             "progress: change learning_rate."
         )
-    if not isinstance(model.train_freq, TrainFreq):
-        given: Any = model.train_freq
-        frequency, unit = given if isinstance(given, tuple) and len(given) == 2 else (given, "step")
-        if not (isinstance(frequency, int) and is_integer(frequency, 1) and is_one_of(unit, ("step", "episode"))):
-            raise ValueError(
-                f"train_freq is {model.train_freq!r}, but it must be a whole number of steps of at least 1, or a pair "
-                "such as (1, 'episode') or (4, 'step'): change train_freq."
-            )
-        if unit == "episode" and model.env is not None and model.n_envs > 1:
-            raise ValueError(
-                f"train_freq is {model.train_freq!r} with {model.n_envs} environments, but episodes are counted in a "
-                "single one: give train_freq in steps, or one environment."
-            )
+    given: Any = model.train_freq
+    if isinstance(given, TrainFreq):  # a loaded model's, perhaps with other environments
+        given = (given.frequency, given.unit.value)
+    frequency, unit = given if isinstance(given, tuple) and len(given) == 2 else (given, "step")
+    if not (isinstance(frequency, int) and is_integer(frequency, 1) and is_one_of(unit, ("step", "episode"))):
+        raise ValueError(
+            f"train_freq is {given!r}, but it must be a whole number of steps of at least 1, or a pair such as "
+            "(1, 'episode') or (4, 'step'): change train_freq."
+        )
+    if unit == "episode" and model.env is not None and model.n_envs > 1:
+        raise ValueError(
+            f"train_freq is {given!r} with {model.n_envs} environments, but episodes are counted in a single one: give "
+            "train_freq in steps, or one environment."
+        )
     _check_ent_coef(model.ent_coef)
     if model.target_entropy != "auto" and not is_number(model.target_entropy):
         raise ValueError(

@@ -308,6 +308,11 @@ def test_bad_train_freq_is_refused(extras: dict[str, Any]) -> None:
             tiny_model("MlpPolicy", VectorBox(), train_freq=train_freq, **extras)
     with pytest.raises(ValueError, match="with 2 environments, but episodes are counted in a single one"):
         tiny_model("MlpPolicy", vec_env(2), train_freq=(1, "episode"), **extras)
+    file = io.BytesIO()
+    tiny_model("MlpPolicy", VectorBox(), train_freq=(1, "episode"), **extras).save(file)
+    with pytest.raises(ValueError, match=r"train_freq is \(1, 'episode'\) with 2 environments, but episodes"):
+        CuReSAC.load(file, env=vec_env(2))
+    assert CuReSAC.load(file, env=vec_env(2), train_freq=1).learn(12).num_timesteps == 12
 
 
 @both_modes
