@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import stable_baselines3
 import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.utils import get_system_info
@@ -275,6 +276,7 @@ def load_model(
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != env.num_envs:
             settings["action_noise"] = noise.base_noise  # of which `learn` makes one for each environment
     with sentences(archive.name, _SMALLER):
+        _forget_n_step_buffer(settings)
         model = cls(settings["policy_class"], env, device=device, _init_setup_model=False)
         known = vars(model).keys() | SCHEMA.keys()
         vars(model).update({key: value for key, value in settings.items() if key in known or trusted})
@@ -296,6 +298,15 @@ def load_model(
         if model.use_sde:
             model.policy.reset_noise()  # type: ignore[operator]
     return model
+
+
+def _forget_n_step_buffer(settings: dict[str, Any]) -> None:
+    """That which SB3 chose for ``n_steps`` and ``gamma``: it chooses anew, as ``load`` may be given others."""
+    arguments = settings.get("replay_buffer_kwargs", {})
+    chosen = {name: settings.get(name) for name in ("n_steps", "gamma")}
+    if settings.get("replay_buffer_class") is NStepReplayBuffer and chosen.items() <= arguments.items():
+        settings["replay_buffer_class"] = None
+        settings["replay_buffer_kwargs"] = {key: value for key, value in arguments.items() if key not in chosen}
 
 
 def _complete(archive: ModelArchive, custom_objects: dict[str, Any], kwargs: dict[str, Any]) -> dict[str, Any]:
