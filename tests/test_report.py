@@ -30,6 +30,9 @@ addEventListener("load", async () => {
   });
   await Promise.all(videos.map(known));
   const sizes = {images: [...document.images].map(i => i.naturalWidth), videos: videos.map(v => v.videoWidth)};
+  const cut = e => e.scrollWidth > e.clientWidth && getComputedStyle(e).overflowX != "visible";
+  sizes.cut = [...document.querySelectorAll("main *")].filter(cut).map(e => e.scrollWidth);
+  sizes.captions = [...document.querySelectorAll("figcaption")].map(c => c.offsetHeight);
   document.documentElement.dataset.probe = JSON.stringify(sizes);
 });
 </script>"""
@@ -451,7 +454,8 @@ def chromium() -> str:
 
 
 def look(chromium: str, page: str, folder: Path) -> tuple[dict[str, list[int]], list[str]]:
-    """Open a page from disk: widths of its images and videos (0: broken), and what the console says.
+    """Open a page from disk: widths of its images and videos (0: broken), widths of what has to be scrolled to be
+    seen, heights of its captions (0: hidden), and what the console says.
 
     A script that measures is added, and the page's policy allows scripts for it; what else it forbids stays forbidden.
     """
@@ -459,6 +463,7 @@ def look(chromium: str, page: str, folder: Path) -> tuple[dict[str, list[int]], 
     assert allowed != page
     (folder / "probed.html").write_text(allowed.replace("</body>", PROBE + "</body>"))
     options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--enable-logging=stderr"]
+    options += ["--window-size=718,1000"]  # as wide as a sheet of A4
     options += ["--virtual-time-budget=10000", f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
     command = [chromium, *options, (folder / "probed.html").as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -483,3 +488,12 @@ def test_the_browser_check_finds_what_is_broken(chromium: str, results: Path, tm
     sizes, console = look(chromium, page.replace("</body>", broken), tmp_path)
     assert sizes["images"].count(0) == 2 and sizes["videos"].count(0) == 1
     assert len(console) == 2 and "Content Security Policy" in console[0] and "nowhere is not defined" in console[1]
+
+
+def test_print_shows_whole_tables(chromium: str, results: Path, tmp_path: Path) -> None:
+    """Paper cannot be scrolled. Videos, which it has not, leave no captions behind."""
+    page = (results / "report.html").read_text()
+    on_screen, _ = look(chromium, page, tmp_path)
+    printed, _ = look(chromium, page.replace("@media print", "@media all"), tmp_path)
+    assert on_screen["cut"] and printed["cut"] == []
+    assert 0 not in on_screen["captions"] and printed["captions"].count(0) == len(printed["videos"]) == 2

@@ -390,7 +390,8 @@ summary { cursor: pointer; font-weight: 600; overflow-wrap: anywhere; }
 pre { background: var(--wash); padding: 10px 14px; font-size: 12px; overflow-x: auto; white-space: pre-wrap; }
 footer { color: var(--soft); font-size: 13px; margin: 50px 0 30px; }
 @media print { header { background: white; color: black; } header p { color: #444; } body { font-size: 11px; }
-  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } video { display: none; } }
+  main { padding: 0; } nav, .wide { overflow: visible; } table { font-size: 9px; } th, td { padding-right: 8px; }
+  figure, tr { break-inside: avoid; } h2, h3 { break-after: avoid; } figure:has(video) { display: none; } }
 """
 # Whatever text from a results folder should manage to do, the page loads nothing and runs nothing.
 POLICY = (
