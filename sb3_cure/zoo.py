@@ -647,22 +647,29 @@ def _parse_flags(
     """For ``ArgumentParser.parse_args``: what rl-zoo3 finds wrong never, late, or without naming the flag."""
     if parser.get_default("algo") is None:  # of another program
         return _parse_args(parser, args, namespace)
+    acts = parser.get_default("no_render") is not None  # `enjoy` and `record`
+    if acts:
+        parser.add_argument("--srl", metavar="MODULE.CLASS", help="Head of your own, which a saved model does not hold")
+        if parser.get_default("gym_packages") is None:  # `record`
+            parser.add_argument("--gym-packages", nargs="+", default=[], help="Modules that register environments")
     # Its own --env is CartPole-v1, which suits its own algorithms.
     with mock.patch.object(StoreDict, "__call__", _store_each):
         given = _parse_args(parser, args, argparse.Namespace(env=None))
     flags = vars(given)
+    if acts:
+        ActingCuReSAC.objects = {} if given.srl is None else {"srl": _head("--srl", given.srl)}
     if given.env is None:
         if given.algo == ALGO:
             example = "dmc_pixels/finger-spin-v0"
             raise SettingsError(f"--env is missing: add the id of an environment, such as --env {example}.")
         given.env = parser.get_default("env")
-    _import_environment(given, acts="no_render" in flags)
+    _import_environment(given, acts)
     for name, low in _LEAST.items():
         value = flags.get(name)
         if value is not None and value != parser.get_default(name) and value < low:
             flag = f"--{name.replace('_', '-')}"
             raise SettingsError(f"{flag} is {value}, but it must be at least {low}: change it, or leave it out.")
-    lowest = 0 if "no_render" in flags else -np.inf  # negative: `train` draws one
+    lowest = 0 if acts else -np.inf  # negative: `train` draws one
     if not lowest <= given.seed < 2**32:
         raise SettingsError(f"--seed is {given.seed}, but it must be from 0 to 2**32 - 1: change it, or leave it out.")
     if flags.get("n_jobs", 1) < 1 and given.n_jobs != -1:
@@ -695,7 +702,7 @@ def _parse_flags(
 
 def _import_environment(given: argparse.Namespace, acts: bool) -> None:
     """Import what registers the environment: the modules of ``--gym-packages``, and that of ``--env module:id``."""
-    packages = getattr(given, "gym_packages", [])  # `record` has no such flag
+    packages = given.gym_packages
     module, _, task = getattr(given.env, "gym_id", given.env).rpartition(":")
     with _refusing():
         for name in packages:
@@ -739,16 +746,6 @@ def run(program: str, arguments: Sequence[str]) -> None:
     # Classes that settings and `--srl` name may lie in the working directory.
     if "" not in sys.path:
         sys.path.append("")
-    if acts:
-        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        parser.add_argument("--srl")
-        if program == "record":
-            parser.add_argument("--gym-packages", nargs="+", default=[])
-        own, arguments = parser.parse_known_args(arguments)
-        for name in getattr(own, "gym_packages", []):
-            with _refusing():
-                import_environments(name, "--gym-packages")
-        ActingCuReSAC.objects = {} if own.srl is None else {"srl": _head("--srl", own.srl)}
     register(ActingCuReSAC if acts else CuReSAC)
     # argparse takes the last of repeated flags, so that these are defaults.
     defaults = ["--algo", ALGO] + (["--folder", "logs"] if acts else [])

@@ -125,6 +125,14 @@ def test_a_users_missing_module_is_no_missing_extra(folder: Path, capsys: pytest
 # ------------------------------------------------------------------- rl-zoo
 
 
+@pytest.mark.parametrize("program", ["enjoy", "record"])
+def test_help_shows_what_rl_zoo_has_not(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([program, "--help"])
+    shown = capsys.readouterr().out
+    assert "--srl MODULE.CLASS" in shown and "--gym-packages" in shown and "--exp-id" in shown
+
+
 def test_train_enjoy_record(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A round trip with a user's own head: cure_sac is the algorithm, and the file's env_kwargs hold everywhere."""
     (folder / "my_heads.py").write_text(HEAD)
