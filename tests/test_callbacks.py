@@ -17,6 +17,7 @@ from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from matplotlib.axes import Axes
 from PIL import Image
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
@@ -410,6 +411,19 @@ def test_the_newest_frame_of_a_stack_is_shown(frames: int, tmp_path: Path, monke
     callback = ReconstructionCallback(tmp_path, every=20, columns=4, probe_updates=1)
     PPO("CnnPolicy", env, **PPO_ARGUMENTS).learn(32, callback=callback)
     np.testing.assert_array_equal(shown[0], callback.observations[:, -3:])
+
+
+def test_reconstructions_that_improve_are_seen_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their errors are small: .00038 and .00035 would both be .0004."""
+    labels: list[str] = []
+    set_yticks = Axes.set_yticks
+    monkeypatch.setattr(Axes, "set_yticks", lambda self, at, names: (labels.extend(names), set_yticks(self, at, names)))
+    observed = np.zeros((1, 1, 10, 10), np.uint8)
+    drawn = np.full_like(observed, 5)
+    better = drawn.copy()
+    better[..., :1, :] = 0
+    plots.reconstructions_over_training(tmp_path / "rows.png", observed, [(10, drawn), (20, better)], "title")
+    assert labels == ["observed", "10 agent steps\nMSE 0.00038", "20 agent steps\nMSE 0.00035"]
 
 
 def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:

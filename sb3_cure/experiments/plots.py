@@ -92,7 +92,7 @@ def reconstructions_over_training(
     """
     errors = [np.square((drawn.astype(np.float32) - observed) / 255).mean() for _, drawn in rows]
     labels = ["observed"]
-    labels += [f"{steps:,} agent steps\nMSE {error:.4f}" for (steps, _), error in zip(rows, errors, strict=True)]
+    labels += [f"{steps:,} agent steps\nMSE {error:.2g}" for (steps, _), error in zip(rows, errors, strict=True)]
     pictures = [observed, *(drawn for _, drawn in rows)]
     n_rows, columns = len(pictures), len(observed)
     height = 1.1 * n_rows * observed.shape[2] / observed.shape[3]
