@@ -198,7 +198,7 @@ def test_rliable_aggregates(tmp_path: Path) -> None:
     folder = tmp_path / "curves"
     write_grid(folder, tasks=["a/x-y-v0", "a/z-w-v0"], seeds=4)
     for task in ("x-y", "z-w"):
-        for seed, (base, final) in enumerate(zip((0, 50, 100, 500), (600, 700, 800, 1000), strict=True)):
+        for seed, (base, final) in enumerate(zip((0, 50, 100, 500), (611, 713, 815, 1000), strict=True)):
             write_cell(folder, task, "sac_ae", seed, curve(0, base))
             write_cell(folder, task, "cure_sac_ae", seed, curve(0, final))
     (experiment,) = read_results(folder)
@@ -212,6 +212,8 @@ def test_rliable_aggregates(tmp_path: Path) -> None:
     assert aggregates.improvement == {"cure_sac_ae": statistics.Estimate(1, 1, 1, 4)}
     at = int(np.argmin(np.abs(aggregates.taus - 0.3)))
     assert aggregates.profiles["sac_ae"][0][at] == pytest.approx(0.25)
+    falls = aggregates.taus[1:][np.diff(aggregates.profiles["cure_sac_ae"][0]) < 0]
+    np.testing.assert_allclose(falls, [0.611, 0.713, 0.815, 1.0], atol=0.002, err_msg="where the scores are")
     assert statistics.aggregate(experiment).iqm == aggregates.iqm  # type: ignore[union-attr]
 
 

@@ -355,7 +355,7 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
                 )
     library = _import_rliable()
     n = len(next(iter(scores.values())))
-    taus = np.linspace(0, 1, 51)
+    taus = np.linspace(0, 1, 1001)
 
     def estimates(values: Mapping[str, Any], function: Any) -> dict[str, Estimate]:
         points, intervals = library.get_interval_estimates(
