@@ -129,7 +129,8 @@ class CuReSAC(SAC):
 
     A loss or gradient that is not finite changes no parameter: ``train`` raises a ``sb3_cure.guards.NonFiniteError``
     that names it (on a GPU when the log is written, or ``learn`` ends), with a post-mortem beside the logs. What was
-    stepped before in the same update stays stepped. With everything off the losses are SB3's own, which looks at none.
+    stepped before in the same update stays stepped. With everything off the update is SB3's own, whose optimisers look
+    at the gradients before they step.
 
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
