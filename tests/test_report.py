@@ -410,6 +410,23 @@ def test_srl_errors_of_both_policies(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert legends[-1] == ["sac_ae (1 seed)", "cure_sac_ae (1 seed)", "task policy", "curious policy"]
     assert legends[0] == ["sac_ae (1 seed)", "cure_sac_ae (1 seed)"], "returns are the task policy's alone"
     assert "deterministic" in figures["learning_curves"].caption and "deterministic" in figures["srl_error"].caption
+    assert "the task policy (solid lines) and the curious policy (dashed lines)" in figures["srl_error"].caption
+
+
+def test_captions_name_what_is_drawn(results: Path, tmp_path: Path) -> None:
+    """No curious policy where none was measured, nor the paper's error beside other pixels."""
+    write_grid(tmp_path / "curves", seeds=1)
+    write_cell(tmp_path / "curves", TASK, "sac_ae", 0, curve(0, 50, 100))
+    write_visitation(tmp_path / "visitation")
+    for config in (tmp_path / "visitation").rglob("config.json"):
+        config.write_text(json.dumps({**json.loads(config.read_text()), "env_kwargs": {"image_size": 36}}))
+    report.write_report(tmp_path, tmp_path / "report.html")
+    curves, visitation = ((tmp_path / name / "table.md").read_text() for name in ("curves", "visitation"))
+    assert "met by the task policy (solid lines), acting" in curves and "(dashed" not in curves
+    zero_and_mean = "the mean error of always predicting zero, always predicting the mean image"
+    assert visitation.count(f"{zero_and_mean}.]") == 2
+    papers = f"{zero_and_mean}, the paper's curious policy.]"
+    assert (results / "visitation" / "table.md").read_text().count(papers) == 2
 
 
 def test_line_styles_tell_policies_apart(tmp_path: Path) -> None:

@@ -42,6 +42,12 @@ from sb3_cure.files import replacing
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
 PAIRS_UP_TO = 5
+#: Lines across the plots of SRL error: whose mean error each of them is
+_YARDSTICKS = {
+    "always zero": "always predicting zero",
+    "mean image": "always predicting the mean image",
+    "paper's cure": "the paper's curious policy",
+}
 _FILM = "deterministic actions; below the picture the return and, with an SRL head, the SRL error so far"
 #: Optional files of a cell: caption
 MEDIA = {
@@ -114,8 +120,12 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
             errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
     if errors:
-        caption = "SRL error, under the agent's own head, that the task policy (solid lines) and the curious policy "
-        caption = _of(f"{caption}(dashed) meet, each acting alone and deterministically,", errors)
+        drawn = {actor for lines in errors.values() for _, actor in lines}
+        names = {"task": "the task policy (solid lines)", "curious": "the curious policy (dashed lines)"}
+        who = " and ".join(name for actor, name in names.items() if actor in drawn)
+        caption = _of(
+            f"SRL error, under the agent's own head, met by {who}, acting alone and deterministically,", errors
+        )
         label = "SRL error\n(deterministic actions)"
         yield _figure("srl_error", caption, plots.srl_error_curves, errors, colors, label)
 
@@ -214,9 +224,11 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Table | Figure 
         caption = (
             f"SRL error per step under the {head} head, by policy (sampled actions): mean over seeds (bar), each seed "
             "(dot), lowest and highest of all steps (line), and how many times the random policy's, with its 95 % "
-            "interval. Lines across: the mean error of always predicting zero, or the mean image, and the paper's "
-            "value for curiosity."
+            "interval."
         )
+        shown = [text for label, text in _YARDSTICKS.items() if any(label in each for each in lines.values())]
+        if shown:
+            caption += f" Lines across: the mean error of {', '.join(shown)}."
         parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
     if errors:
         parts.append(tables.error_table(experiment, errors))
