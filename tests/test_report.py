@@ -208,10 +208,10 @@ def test_comparison_with_published_numbers(results: Path) -> None:
     rows = rows_of(results / "summary.md", "Beside published returns")[1:]
     by_arm = {(row[0], row[2]): row[3:10] for row in rows}
     suspected, minus = "suspected bug: below 0.75 x published", "\N{MINUS SIGN}"
-    expected = ["100,000", "2", "150 ± 71", "SAC-AE 311 ± 11", f"{minus}161", "0.48", suspected]
+    expected = ["100,000", "2", "150 ± 71", "SAC-AE 311 ± 11", f"{minus}161", "0.482", suspected]
     assert by_arm["curves", "sac_ae"] == expected
     assert by_arm["curves", "cure_sac_ae"][-1] == "adds curiosity, or changes settings: not judged"
-    assert by_arm["pretraining", "vanilla"] == ["100,000", "1", "300", "SAC-AE 311 ± 11", f"{minus}11", "0.96", "ok"]
+    assert by_arm["pretraining", "vanilla"] == ["100,000", "1", "300", "SAC-AE 311 ± 11", f"{minus}11", "0.965", "ok"]
 
 
 def test_pretraining_beside_the_paper(results: Path) -> None:
@@ -427,6 +427,15 @@ def test_captions_name_what_is_drawn(results: Path, tmp_path: Path) -> None:
     assert visitation.count(f"{zero_and_mean}.]") == 2
     papers = f"{zero_and_mean}, the paper's curious policy.]"
     assert (results / "visitation" / "table.md").read_text().count(papers) == 2
+
+
+def test_a_return_by_a_hair_too_low_is_seen_to_be(tmp_path: Path) -> None:
+    """0.749 of the published mean is below 0.75, which 0.75 is not."""
+    write_grid(tmp_path / "curves", seeds=1)
+    write_cell(tmp_path / "curves", TASK, "sac_ae", 0, curve(0, 50, 233))
+    report.write_report(tmp_path, tmp_path / "report.html")
+    (row,) = rows_of(tmp_path / "summary.md", "Beside published returns")[1:]
+    assert row[8:10] == ["0.749", "suspected bug: below 0.75 x published"]
 
 
 def test_line_styles_tell_policies_apart(tmp_path: Path) -> None:

@@ -436,7 +436,7 @@ def published_table(comparisons: Sequence[published.Comparison]) -> Table:
         theirs, difference, ratio, judgement = NONE, NONE, NONE, "not published"
         if row.theirs is not None:
             theirs = f"{row.published_as} {_published(row.theirs)}"
-            difference, ratio = number_text(row.ours - row.theirs.mean), f"{row.ours / row.theirs.mean:.2f}"
+            difference, ratio = number_text(row.ours - row.theirs.mean), f"{row.ours / row.theirs.mean:.3f}"
             judgement = "ok" if row.same_method else "adds curiosity, or changes settings: not judged"
         if row.suspect:
             judgement = f"suspected bug: below {published.SUSPECT_BELOW} x published"
