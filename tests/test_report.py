@@ -10,6 +10,7 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, write_cell, write_grid
@@ -436,6 +437,21 @@ def test_a_return_by_a_hair_too_low_is_seen_to_be(tmp_path: Path) -> None:
     report.write_report(tmp_path, tmp_path / "report.html")
     (row,) = rows_of(tmp_path / "summary.md", "Beside published returns")[1:]
     assert row[8:10] == ["0.749", "suspected bug: below 0.75 x published"]
+
+
+def test_all_arms_of_a_grid_of_ours_can_be_told_apart(tmp_path: Path) -> None:
+    """By colours of their own, in panels that the legend leaves as they are."""
+    grids = Path(__file__).parents[1] / "zoo_configs" / "experiments"
+    arms = max((list(yaml.safe_load(path.read_text())["methods"]) for path in grids.rglob("*.yml")), key=len)
+    colors = plots.arm_colors(arms, arms[0])
+    assert len(set(colors.values())) == len(arms) > 10
+    heights = []
+    for some in (arms[:2], arms):
+        line = np.linspace(0, 100, 5), np.full((1, 5), 0.5)
+        plots.learning_curves(tmp_path / "lines.png", {TASK: dict.fromkeys(some, line)}, colors, "return")
+        pixels = np.asarray(Image.open(tmp_path / "lines.png").convert("L"))
+        heights.append((pixels < 50).sum(axis=0).max())  # of the axis on the left
+    assert heights[1] > 0.9 * heights[0]
 
 
 def test_line_styles_tell_policies_apart(tmp_path: Path) -> None:

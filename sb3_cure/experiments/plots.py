@@ -275,9 +275,10 @@ def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     """
     :param methods: Arms of an experiment
     :param baseline: The one that the others are compared with: grey
-    :return: A colour for each; after nine of them they repeat
+    :return: A colour for each; after thirteen of them they repeat
     """
     others = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
+    others += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
     names = [method for method in methods if method != baseline]
     return {baseline: "#555555", **{name: others[index % len(others)] for index, name in enumerate(names)}}
 
@@ -523,6 +524,8 @@ def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
 def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
     if handles:
         columns = min(len(handles), int(figure.get_figwidth() // 2.4))
+        rows = -(-len(handles) // columns)
+        figure.set_figheight(figure.get_figheight() + 0.21 * max(rows - 2, 0))  # `_panels` leaves room for two
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
