@@ -430,6 +430,20 @@ def test_captions_name_what_is_drawn(results: Path, tmp_path: Path) -> None:
     assert (results / "visitation" / "table.md").read_text().count(papers) == 2
 
 
+def test_titles_tell_of_baselines_of_their_own(tmp_path: Path) -> None:
+    """The difference of "two minus one" is none from the experiment's baseline."""
+    write_grid(
+        tmp_path / "curves", seeds=1, methods={"base": {}, "one": {}, "two": {"baseline": "one"}}, baseline="base"
+    )
+    for method in ("base", "one", "two"):
+        write_cell(tmp_path / "curves", TASK, method, 0, curve(0, 50, 100))
+    report.write_report(tmp_path, tmp_path / "report.html")
+    text = (tmp_path / "curves" / "table.md").read_text()
+    assert "| two minus one |" in text
+    assert text.count('Paired difference from base, or the arm after "minus": ') == 2
+    assert 'minus that of base, or the arm after "minus": mean' in text
+
+
 def test_a_return_by_a_hair_too_low_is_seen_to_be(tmp_path: Path) -> None:
     """0.749 of the published mean is below 0.75, which 0.75 is not."""
     write_grid(tmp_path / "curves", seeds=1)

@@ -165,8 +165,8 @@ def difference_figure(
     ]
     return _figure(
         "paired_difference",
-        f"Area under the curve minus that of {experiment.baseline}: mean (diamond) with 95 % t interval (line; it may "
-        "leave the picture), and each pair of seeds (dots).",
+        f"Area under the curve minus that of {tables.compared_with(rows, experiment)}: mean (diamond) with 95 % t "
+        "interval (line; it may leave the picture), and each pair of seeds (dots).",
         plots.paired_differences,
         lines,
         colors,

@@ -228,7 +228,7 @@ def difference_table(
     """
     texts = [[difference_label(row, experiment), of_tasks(row), *_difference(row, experiment)] for row in rows]
     columns = ["arm", "task", *_DIFFERENCE_COLUMNS]
-    return Table(f"Paired difference from {experiment.baseline}: {measure}", columns, texts, note)
+    return Table(f"Paired difference from {compared_with(rows, experiment)}: {measure}", columns, texts, note)
 
 
 def difference_label(row: statistics.PairedDifference, experiment: Experiment) -> str:
@@ -238,6 +238,16 @@ def difference_label(row: statistics.PairedDifference, experiment: Experiment) -
     :return: The arm, and what it is compared with if that is another than the experiment's baseline
     """
     return row.method if row.other == experiment.baseline else f"{row.method} minus {row.other}"
+
+
+def compared_with(rows: Sequence[statistics.PairedDifference], experiment: Experiment) -> str:
+    """
+    :param rows: Paired differences, each with its ``difference_label``
+    :param experiment: Of which experiment
+    :return: The baseline, and where to find the others
+    """
+    has_others = any(row.other != experiment.baseline for row in rows)
+    return experiment.baseline + (', or the arm after "minus"' if has_others else "")
 
 
 def pairs_table(experiment: Experiment, rows: Sequence[statistics.PairedDifference]) -> Table:
