@@ -496,6 +496,8 @@ def test_map_of_an_algorithm_without_errors(tmp_path: Path) -> None:
     tiny_model("MlpPolicy", VectorBox(), srl="rae").learn(20, callback=both)
     one, two = (Image.open(tmp_path / f"curiosity_map_{steps}_steps.png").size for steps in (16, 20))
     assert one[1] == two[1] and one[0] == pytest.approx(two[0] / 2, rel=0.1)
+    borders = np.asarray(Image.open(tmp_path / "curiosity_map_16_steps.png").convert("L"))[:, [0, -1]]
+    assert (borders == 255).all()  # of the title nothing is cut off
 
 
 def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:

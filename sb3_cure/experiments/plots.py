@@ -142,7 +142,7 @@ def uncomfortable_frames(
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
     note += f", and how many times the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
-    figure.suptitle(f"{title}\n{note}", fontsize=10)
+    figure.suptitle(f"{title}\n{note}", fontsize=10, wrap=True)
     figure.savefig(path, dpi=120)
 
 
@@ -202,7 +202,7 @@ def curiosity_map(
             bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
             bar.ax.minorticks_off()
     n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
-    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", fontsize=11)
+    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", fontsize=11, wrap=True)
     figure.savefig(path, dpi=120)
 
 
