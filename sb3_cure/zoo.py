@@ -75,6 +75,8 @@ _OF_INPUT = (
     ZeroDivisionError, gym.error.Error, GLUnavailableError,
 )  # fmt: skip
 _PACKAGES = ("sb3_cure", "rl_zoo3", "gymnasium", "importlib", "os", "pathlib")
+#: Folder of a run: the environment, and its number, with a unique id after it if ``--uuid`` asked for one
+_RUN = re.compile(r"(.+)_((\d+)(?:_[0-9a-f-]{36})?)")
 _OF_RUN = "give the run's --env, with -f the folder that it was trained into, and perhaps --exp-id"
 
 
@@ -477,10 +479,11 @@ def _not_of_run(missing: Path) -> str:
     if missing.suffix != ".zip":
         missing /= "rl_model_*_steps.zip"
     run = missing.parent
+    name = _RUN.fullmatch(run.name)
     steps = sorted(int(file.stem.split("_")[-2]) for file in run.glob("rl_model_*_steps.zip"))
     shown = map(str, steps if len(steps) < 10 else [*steps[:4], "...", *steps[-4:]])
     models = {
-        "the last model (without --load flags)": (run / f"{run.name.rpartition('_')[0]}.zip").is_file(),
+        "the last model (without --load flags)": (run / f"{name[1] if name else run.name}.zip").is_file(),
         "the best one (--load-best)": (run / "best_model.zip").is_file(),
         f"checkpoints at {', '.join(shown)} (--load-checkpoint)": bool(steps),
     }
@@ -618,11 +621,28 @@ def _reading_runs() -> Iterator[None]:
             yield
 
 
+class _RunId(int):
+    """The number of a run, which reads as the end of its folder's name: ``--uuid`` adds to the number there."""
+
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
 def _latest_run(latest: Callable[..., int], log_path: str, env_name: str) -> int:
     """For ``get_latest_run_id``: the latest run that holds a model, which `optimize` and failed runs do not."""
-    runs = [run for run in Path(log_path).glob("*") if re.fullmatch(rf"{re.escape(env_name)}_\d+", run.name)]
-    with_model = [int(run.name.rpartition("_")[2]) for run in runs if any(run.glob("*.zip"))]
-    return max(with_model) if with_model else latest(log_path, env_name)
+    runs = []
+    for run in Path(log_path).glob("*"):
+        name, models = _RUN.fullmatch(run.name), [*run.glob("*.zip")]
+        if name and name[1] == env_name and models:
+            runs.append((int(name[3]), max(model.stat().st_mtime for model in models), name[2]))
+    if not runs:
+        return latest(log_path, env_name)
+    number, _, text = max(runs)
+    run_id = _RunId(number)
+    run_id.text = text
+    return run_id
 
 
 def enjoy() -> None:

@@ -216,14 +216,18 @@ def test_an_environment_of_ones_own(folder: Path) -> None:
 
 
 def test_classes_in_settings(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file of settings in Python may hold them, and so may -params; the run can be watched."""
+    """A file of settings in Python may hold them, and so may -params; the run, of a unique name, can be watched."""
     (folder / "tiny.py").write_text(
         f"from sb3_cure.srl import RAE\nhyperparams = {SETTINGS}\nhyperparams['default']['srl'] = RAE"
     )
-    train = ["train", "--env", TASK, "--conf-file", "tiny.py", "--eval-freq", "-1"]
+    train = ["train", "--env", TASK, "--conf-file", "tiny.py", "--eval-freq", "-1", "--uuid"]
     assert cli.main([*train, "-params", "policy_kwargs:dict(net_arch=[8], activation_fn=th.nn.Tanh)"]) == 0
-    assert cli.main(["enjoy", "--env", TASK, "-n", "20", "--no-render"]) == 0
-    assert "2 Episodes" in capsys.readouterr().out
+    enjoy = ["enjoy", "--env", TASK, "-n", "20", "--no-render"]
+    assert cli.main(enjoy) == 0
+    (run,) = folder.glob("logs/cure_sac/*_1_*")
+    output = capsys.readouterr().out
+    assert f"id={run.name.partition('-v0_')[2]}\n" in output and "2 Episodes" in output
+    assert cli.main([*enjoy, "--load-best"]) == 2 and "its run has the last model" in capsys.readouterr().err
 
 
 def test_an_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
