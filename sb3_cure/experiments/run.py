@@ -303,7 +303,7 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
                 told = _tell_finished(list_units(), results, told)
                 if time.monotonic() - told_at >= SUMMARY_SECONDS:
                     told_at = time.monotonic()
-                    print(_Progress(list_units(), results).line(), flush=True)
+                    print(_Progress(list_units(), results).summary(), flush=True)
             except BrokenPipeError:  # nobody reads on, and the cells are to be finished all the same
                 _write_to_nobody()
 
@@ -386,21 +386,21 @@ class _Progress:
         self.rows = [_unit_progress(unit, results) for unit in units]
 
     def summary(self) -> str:
-        """What is done and under way, how fast it goes, when it will be finished."""
+        """What is done and under way, how fast it goes, when it will be finished, and the best return of all cells."""
         done = {row.unit.folder for row in self.rows if row.state == "done"}
         running = sum(row.state == "running" for row in self.rows)
         told = f"{_count(self.units, done)} done" + (f", {running} running" if running else "")
         left = [row for row in self.rows if row.state not in ("done", "failed") and isinstance(row.unit, Cell)]
         speed = sum(row.rate for row in left if row.state == "running")
-        if not speed:
-            return told
-        seconds = sum(row.total - row.done for row in left) / speed
-        return f"{told}, {speed:.1f} environment steps/s, about {_duration(seconds)} left"
-
-    def line(self) -> str:
-        """The summary, with the best return of all cells."""
+        if speed:
+            seconds = sum(row.total - row.done for row in left) / speed
+            told += f", {speed:.1f} environment steps/s, about {_duration(seconds)} left"
         best = max(((row.best, str(row.unit.folder)) for row in self.rows if row.best is not None), default=None)
-        return self.summary() + ("" if best is None else f", best return {best[0]:.0f} ({best[1]})")
+        return told + ("" if best is None else f", best return {_return(best[0])} ({best[1]})")
+
+
+def _return(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def _unit_progress(unit: Unit, results: Path) -> _UnitProgress:
@@ -432,7 +432,7 @@ def progress_table(units: Sequence[Unit], results: Path) -> Table:
                 *(
                     f"{rate:.1f}",
                     _duration((total - done) / rate) if rate else "",
-                    "" if best is None else f"{best:.0f}",
+                    "" if best is None else _return(best),
                 ),
             )
     if not table.row_count:
@@ -493,7 +493,7 @@ def _seed_choice(text: str) -> int | list[int]:
 
 
 def _names(text: str) -> list[str]:
-    names = [name for name in text.split(",") if name]
+    names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise argparse.ArgumentTypeError(f"{text!r} names nothing: write for example a,b")
     return names
