@@ -3,6 +3,8 @@
 from typing import TYPE_CHECKING
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
 from torch import nn
 
 from sb3_cure.evaluation import trained_actors
@@ -19,7 +21,7 @@ class DeterministicActor(nn.Module):
 
     :param model: A trained model
     :param actor: ``"task"`` or ``"curious"``; by default that of ``predict``
-    :raises ValueError: if the model has no such policy
+    :raises ValueError: if the model has no such policy, or is none
     """
 
     low: th.Tensor
@@ -27,6 +29,11 @@ class DeterministicActor(nn.Module):
 
     def __init__(self, model: "CuReSAC", actor: str | None = None):
         super().__init__()
+        if not isinstance(model, SAC):
+            raise ValueError(
+                f"model is a {type(model).__name__}, but it must be a CuReSAC, or SB3's SAC: give the model itself, "
+                "not its policy; of other algorithms export the policy as SB3's documentation tells."
+            )
         names = {"task": "actor", "curious": "curious_actor"}
         trained = trained_actors(model)
         actor = trained[0] if actor is None else actor
@@ -38,6 +45,7 @@ class DeterministicActor(nn.Module):
         # In a tuple, so that critics and decoder are no part of what is exported.
         self._policy = (model.policy,)
         self.trunk = model.policy.encoder.trunk if isinstance(model.policy, CuRePolicy) else None
+        self._observation_space = model.observation_space
         space = model.action_space
         self.register_buffer("low", th.as_tensor(space.low, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
         self.register_buffer("high", th.as_tensor(space.high, dtype=th.float32, device=model.device))  # type: ignore[attr-defined]
@@ -47,7 +55,17 @@ class DeterministicActor(nn.Module):
         """
         :param observations: As the agent sees them, [B, *shape]: images uint8, channels first
         :return: Actions within the environment's bounds, [B, *action shape]
+        :raises ValueError: for a single observation, and for images that are not uint8
         """
+        space = self._observation_space
+        if isinstance(space, spaces.Box):
+            kind = th.uint8 if space.dtype == "uint8" else observations.dtype
+            if observations.dim() != len(space.shape) + 1 or observations.dtype != kind:
+                raise ValueError(
+                    f"observations are {observations.dtype} of {observations.dim()} dimensions, but a batch of "
+                    f"{kind}, [B, {', '.join(map(str, space.shape))}], is expected: add the batch's dimension to a "
+                    "single one by observation[None], and do not divide images by 255."
+                )
         (policy,) = self._policy
         policy.set_training_mode(False)  # as `predict` does: the model may have trained on
         inputs = observations if self.trunk is None else self.trunk(policy.center(observations))

@@ -67,6 +67,17 @@ def test_a_policy_that_is_not_there() -> None:
         DeterministicActor(model, "curious")
 
 
+def test_what_is_no_model_or_no_batch_of_images() -> None:
+    """Floats in [0, 1] would be divided by 255 once more, and give actions all the same."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    with pytest.raises(ValueError, match="model is a CnnPolicy, but it must be a CuReSAC, or SB3's SAC: give the"):
+        DeterministicActor(model.policy)  # type: ignore[arg-type]
+    module, image = DeterministicActor(model), th.zeros(model.observation_space.shape, dtype=th.uint8)
+    for wrong, told in ((image, "torch.uint8 of 3 dimensions"), (image[None] / 255, "torch.float32 of 4 dimensions")):
+        with pytest.raises(ValueError, match=rf"observations are {told}, but a batch of torch.uint8, \[B, 6, 36, 36\]"):
+            module(wrong)
+
+
 def test_actors_are_not_asked_as_sb3s_are() -> None:
     model = tiny_model("CnnPolicy", PixelBox())
     with pytest.raises(ValueError, match="it reads the shared encoder's features: call the policy, or"):
