@@ -1128,7 +1128,7 @@ class CuReSAC(SAC):
         imported.
 
         :param path: Path with or without its suffix ``.zip``, or a binary file
-        :param env: Environment to go on learning in; not needed to predict
+        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
         :param device: Device of the networks
         :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
             ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
@@ -1141,6 +1141,7 @@ class CuReSAC(SAC):
         :return: The model
         :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled or of another algorithm
         """
+        env = make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
         if trusted and is_pickled_model(path):
             try:
                 return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

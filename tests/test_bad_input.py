@@ -1601,6 +1601,11 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: CuReSAC.load(3),
         "got 3 for a file, but expected a path, or a file that is open in binary mode.",
     ),
+    "load: environment": (
+        lambda: CuReSAC.load("there", env=3),
+        "env is 3, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for example "
+        "make_dmc_env('cartpole', 'swingup').",
+    ),
     "load: custom_objects": (
         lambda: CuReSAC.load("there", custom_objects=3),
         "custom_objects is a int, but it must be a dict or None.",

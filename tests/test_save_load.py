@@ -217,6 +217,12 @@ def test_load_without_environment(tmp_path: Path) -> None:
     assert (loaded.num_timesteps, loaded._n_updates) == (20, 10)
 
 
+def test_load_with_the_id_of_an_environment(tmp_path: Path) -> None:
+    """As the constructor takes it."""
+    tiny_model("MlpPolicy", "Pendulum-v1").save(tmp_path / "model")
+    assert CuReSAC.load(tmp_path / "model", env="Pendulum-v1").learn(5).num_timesteps == 5
+
+
 def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     """``load(..., name=value)`` replaces arguments, also the one that the mixer keeps."""
     tiny_model("CnnPolicy", PixelBox(), curiosity_prob=0.0).learn(15).save(tmp_path / "model")
