@@ -927,7 +927,7 @@ def test_a_list_of_cells_may_be_cut_off(tmp_path: Path) -> None:
 def test_cells_are_finished_though_nobody_reads_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """``sb3-cure experiment | tee log``, whose ``tee`` has died: neither cells nor what is shown later know of it."""
     monkeypatch.setattr(run, "SUMMARY_SECONDS", 0.0)
-    write_line, run_cell, told = run._Progress.line, run.run_cell, threading.Event()
+    write_line, run_cell, told = run._Progress.summary, run.run_cell, threading.Event()
 
     def line(progress: run._Progress) -> str:
         told.set()
@@ -939,7 +939,7 @@ def test_cells_are_finished_though_nobody_reads_on(tmp_path: Path, monkeypatch: 
         assert told.wait(60)
         run_cell(*arguments)
 
-    monkeypatch.setattr(run._Progress, "line", line)
+    monkeypatch.setattr(run._Progress, "summary", line)
     monkeypatch.setattr(run, "run_cell", run_later)
     grid = load_grid(write_grid(tmp_path, seeds=2))
     with unread_stdout():
