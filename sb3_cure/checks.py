@@ -49,15 +49,16 @@ _NOT_THE_USERS = {
 }  # fmt: skip
 
 
-def make_env(env: Any, verbose: int) -> Any:
+def make_env(env: Any, verbose: int, required: bool = False) -> Any:
     """SB3's ``maybe_make_env`` for whatever the user gave.
 
     :param env: Environment, vectorised environment, Gymnasium id, or None
     :param verbose: Verbosity level
+    :param required: Whether None is refused
     :return: The environment; None for None
     :raises ValueError: if it is nothing of these, or there is no such id
     """
-    if not isinstance(env, str | gym.Env | VecEnv | None):
+    if not isinstance(env, str | gym.Env | VecEnv) and (required or env is not None):
         given = repr(env) if len(repr(env)) < 100 else f"a {type(env).__name__}"
         raise ValueError(
             f"env is {given}, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, "

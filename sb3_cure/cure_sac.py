@@ -1063,6 +1063,14 @@ class CuReSAC(SAC):
         if strip is not None:
             self.logger.record("srl/reconstructions", Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))
 
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
+        """
+        :param env: Environment, vectorised environment or Gymnasium id; spaces and number of environments stay the same
+        :param force_reset: Whether the next ``learn`` resets it first
+        :raises ValueError: if it is nothing of these, or has other spaces
+        """
+        super().set_env(make_env(env, self.verbose, required=True), force_reset)
+
     def set_random_seed(self, seed: int | None = None) -> None:
         """
         :param seed: Of all random streams, that of p_c among them; None changes nothing

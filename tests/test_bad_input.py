@@ -1606,6 +1606,11 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         "env is 3, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for example "
         "make_dmc_env('cartpole', 'swingup').",
     ),
+    "set_env: environment": (
+        lambda: model_of().set_env(None),
+        "env is None, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for "
+        "example make_dmc_env('cartpole', 'swingup').",
+    ),
     "load: custom_objects": (
         lambda: CuReSAC.load("there", custom_objects=3),
         "custom_objects is a int, but it must be a dict or None.",

@@ -218,9 +218,13 @@ def test_load_without_environment(tmp_path: Path) -> None:
 
 
 def test_load_with_the_id_of_an_environment(tmp_path: Path) -> None:
-    """As the constructor takes it."""
+    """As the constructor takes it; `set_env` too."""
     tiny_model("MlpPolicy", "Pendulum-v1").save(tmp_path / "model")
-    assert CuReSAC.load(tmp_path / "model", env="Pendulum-v1").learn(5).num_timesteps == 5
+    loaded = CuReSAC.load(tmp_path / "model", env="Pendulum-v1")
+    assert loaded.learn(5).num_timesteps == 5
+    before = loaded.get_env()
+    loaded.set_env("Pendulum-v1")
+    assert loaded.get_env() is not before and loaded.learn(5).num_timesteps == 5
 
 
 def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
