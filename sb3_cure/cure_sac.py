@@ -55,7 +55,7 @@ from sb3_cure.guards import (
     Guard,
     TransitionGuard,
     check_actions,
-    look_before_steps,
+    looking_before_steps,
     post_mortem_of_a_step,
     warn_of_dark_images,
 )
@@ -304,9 +304,6 @@ class CuReSAC(SAC):
             check_sb3s_images(self.policy_class, self.observation_space, self.policy_kwargs)
             with explaining_memory(self):
                 super()._setup_model()
-            # SB3's update knows no guard: its optimisers look before they step.
-            optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
-            look_before_steps(self, {**optimizers, "temperature": self.ent_coef_optimizer})
             return
         check_shared_encoder_space(self.observation_space, self.policy_class)
         self._choose_replay_buffer()
@@ -675,7 +672,10 @@ class CuReSAC(SAC):
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         if self.is_plain_sac:
-            super().train(gradient_steps, batch_size)
+            # SB3's update knows no guard: its optimisers look before they step.
+            optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
+            with looking_before_steps(self, {**optimizers, "temperature": self.ent_coef_optimizer}):
+                super().train(gradient_steps, batch_size)
         else:
             self.policy.set_training_mode(True)
             self._update_learning_rates()

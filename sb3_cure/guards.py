@@ -305,11 +305,12 @@ class Guard:
         error.post_mortem = _write_post_mortem(model, str(error.update), report, "batch.npz", arrays)
 
 
-def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> None:
-    """See to it that no optimiser steps along gradients that are not finite, whoever calls it.
+@contextlib.contextmanager
+def looking_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> Iterator[None]:
+    """Within this context no optimiser steps along gradients that are not finite, whoever calls it.
 
     The value is read at once, which on a GPU waits for it. The post-mortem knows the gradients, and the batch if the
-    replay buffer remembers it.
+    replay buffer remembers it. (Not for good, as copies of an optimiser have no hooks.)
 
     :param model: The model
     :param optimizers: Optimisers by the name of what they train; None is left out
@@ -326,9 +327,11 @@ def look_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimi
             guard._post_mortem(model, error, draw, *_batch_of(model, draw))
             raise
 
-    for name, optimizer in optimizers.items():
-        if optimizer is not None:
-            optimizer.register_step_pre_hook(partial(look, name))
+    with contextlib.ExitStack() as hooks:
+        for name, optimizer in optimizers.items():
+            if optimizer is not None:
+                hooks.callback(optimizer.register_step_pre_hook(partial(look, name)).remove)
+        yield
 
 
 def _write_post_mortem(

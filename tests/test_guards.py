@@ -7,6 +7,7 @@ import functools
 import io
 import itertools
 import json
+import pickle
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -404,6 +405,19 @@ def test_with_everything_off_no_optimiser_takes_what_is_not_finite(
     model.replay_buffer.rewards[:] = 0
     model.train(1, 8)
     assert differences(before, model.policy.state_dict()) != []
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+@pytest.mark.parametrize("extras", [{}, {"srl": None, "curiosity": None}], ids=["all", "plain SAC"])
+def test_copies_look_as_their_originals(extras: dict[str, Any], copied: Any) -> None:
+    """Copies of torch's optimisers have no hooks."""
+    original = tiny_model("MlpPolicy", VectorBox(), **extras).learn(30)
+    model = copied(original)
+    model.replay_buffer.rewards[:] = NAN
+    with pytest.raises(NonFiniteError, match="critic"):
+        model.train(1, 8)
+    assert all(th.isfinite(value).all() for value in model.policy.state_dict().values())
+    original.train(1, 8)
 
 
 # ----------------------------------------------------------------- transitions
