@@ -288,6 +288,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
             n_trials = len(optuna.load_study(study_name=self.study_name, storage=storage).trials) if known else 0
             if self.trial_id in range(n_trials):
                 return self.load_trial(self.storage, self.study_name, self.trial_id)
+        except KeyError as error:
+            raise SettingsError(
+                f"--trial-id {self.trial_id} of --study-name {self.study_name!r} has no {_one_line(error)!r}: name a "
+                f"trial that was finished, of a study that was made with --algo {self.algo}."
+            ) from error
         except Exception as error:  # of Optuna or of the database's driver, whichever that is
             raise SettingsError(
                 f"--trial-id {self.trial_id} of --study-name {self.study_name!r} in --storage {self.storage!r} cannot "
@@ -406,6 +411,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
         try:
             super().hyperparameters_optimization()
         except ValueError as error:
+            if "same parameter name" in str(error):  # of Optuna's distributions
+                raise SettingsError(
+                    f"--study-name is {self.study_name!r}, but this study in --storage {self.storage!r} was made with "
+                    f"other parameters ({_one_line(error)}): choose a --study-name of its own."
+                ) from error
             if "No trials are completed" not in str(error):
                 raise
             raise SettingsError(

@@ -383,6 +383,10 @@ COMMANDS: dict[str, str] = {
         "sb3-cure train: --trial-id is 1, but --study-name 'mine' has 1 trials, the first of "
         "which is 0: name one of them."
     ),
+    f"{TRAIN} --storage study.log --study-name mine --trial-id 0": (
+        "sb3-cure train: --trial-id 0 of --study-name 'mine' has no 'batch_size_pow': name a trial that was finished, "
+        "of a study that was made with --algo cure_sac."
+    ),
     f"{TRAIN} --storage no-study.log --study-name mine --trial-id 0": (
         "sb3-cure train: --trial-id 0 of --study-name 'mine' in --storage 'no-study.log' "
         "cannot be read (Expecting value: line 1 column 1 (char 0)): name a trial that is there."
@@ -557,6 +561,22 @@ def test_a_study_without_a_trial_that_was_finished(
     monkeypatch.setattr(zoo.ExperimentManager, "objective", interrupted)
     assert cli.main([*TRAIN.replace("train", "optimize", 1).split(), "--n-trials", "1"]) == 2
     assert "no trial was finished" in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("storage", ["study.log", "sqlite:///study.db"])
+def test_a_study_of_other_parameters(storage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """As of another algorithm: Optuna says so in the middle of the first trial."""
+    Path("settings.yml").write_text(yaml.safe_dump(SETTINGS))
+    opened = JournalStorage(JournalFileBackend(storage)) if storage.endswith(".log") else storage
+    study = optuna.create_study(study_name="mine", storage=opened, direction="maximize")
+    study.tell(study.ask({"learning_rate": optuna.distributions.FloatDistribution(1e-5, 1e-3)}), 1.0)
+    flags = ["--n-trials", "1", "--storage", storage, "--study-name", "mine"]
+    assert cli.main([*TRAIN.replace("train", "optimize", 1).split(), *flags]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        f"sb3-cure optimize: --study-name is 'mine', but this study in --storage '{storage}' was made with other "
+        "parameters (Cannot set different log configuration to the same parameter name): choose a --study-name of its "
+        "own."
+    )
 
 
 def test_the_length_of_the_file_can_be_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
