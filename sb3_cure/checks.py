@@ -34,6 +34,7 @@ from sb3_cure.values import (
     arguments_of,
     check_folder,
     check_keywords,
+    check_optimizer_kwargs,
     is_integer,
     is_number,
     is_one_of,
@@ -45,7 +46,8 @@ if TYPE_CHECKING:
 #: What the algorithm itself tells policies and replay buffers
 _NOT_THE_USERS = {
     "observation_space", "action_space", "lr_schedule", "srl_class", "srl_kwargs", "curious", "curiosity_kwargs",
-    "encoder_sources", "update", "acting", "buffer_size", "device", "n_envs", "optimize_memory_usage", "env",
+    "encoder_sources", "update", "acting", "buffer_size", "device", "n_envs", "optimize_memory_usage", "env", "params",
+    "lr",
 }  # fmt: skip
 
 
@@ -338,6 +340,8 @@ def _check_networks(model: "CuReSAC") -> None:
             known = None if chosen is None else arguments_of(chosen)
             whose = getattr(chosen, "__name__", kind.__name__)
             arguments = given[f"{part}_kwargs"]
+            if part == "optimizer":
+                check_optimizer_kwargs("optimizer_kwargs of policy_kwargs", arguments)
             check_keywords(f"{part}_kwargs of policy_kwargs", arguments, known and known - _NOT_THE_USERS, whose)
             if "features_dim" in arguments:
                 _check_integer("features_dim of features_extractor_kwargs", arguments["features_dim"], 1)

@@ -23,6 +23,7 @@ from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.layers import Projection, full_precision, init_weights, preprocess
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
+from sb3_cure.values import check_optimizer_kwargs
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -221,6 +222,7 @@ class CuRePolicy(SACPolicy):
             with th.random.fork_rng(devices=()):
                 th.default_generator.manual_seed(head_seed)
                 self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
+            check_optimizer_kwargs(f"{srl_class.__name__}.optimizer_kwargs", self.srl.optimizer_kwargs)
             self.srl.bind_target_encoder(self.encoder_target)
             # A head may hold the encoder as a part of its own: it is the encoder's optimiser that trains it.
             shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))

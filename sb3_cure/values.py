@@ -65,6 +65,19 @@ def check_keywords(where: str, given: Any, known: Iterable[str] | None, whose: s
             raise TypeError(f"{where} has {name!r}, but {whose} has no such argument: {fix}.")
 
 
+def check_optimizer_kwargs(where: str, given: Any) -> None:
+    """
+    :param where: What the user gave them as
+    :param given: What the user gave
+    :raises TypeError: if a learning rate is among them
+    """
+    if isinstance(given, Mapping) and "lr" in given:
+        raise TypeError(
+            f"{where} has lr={given['lr']!r}, but everything learns at learning_rate: remove it, and change "
+            "learning_rate."
+        )
+
+
 def arguments_of(function: Any) -> set[str] | None:
     """
     :param function: A class, of whose constructor the arguments are asked, or a function

@@ -1025,7 +1025,12 @@ UNKNOWN_KEYWORDS: dict[str, tuple[dict[str, Any], str]] = {
         {"policy_kwargs": {"optimizer_kwargs": {"momentum": 0.9}}},
         "optimizer_kwargs of policy_kwargs has 'momentum', but Adam has no such argument: "
         "remove it, or choose of amsgrad, betas, capturable, decoupled_weight_decay, "
-        "differentiable, eps, foreach, fused, lr, maximize, params, weight_decay.",
+        "differentiable, eps, foreach, fused, maximize, weight_decay.",
+    ),
+    "of the optimiser, for the learning rate": (
+        {"policy_kwargs": {"optimizer_kwargs": {"lr": 1e-4}}},
+        "optimizer_kwargs of policy_kwargs has lr=0.0001, but everything learns at learning_rate: remove it, and "
+        "change learning_rate.",
     ),
     "of the replay buffer": (
         {"replay_buffer_kwargs": {"frames": 3}},

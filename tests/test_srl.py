@@ -648,6 +648,17 @@ def test_heads_that_no_archive_could_give_back_are_refused(head: type[SRLHead], 
         tiny_model("CnnPolicy", PixelBox(), srl=head)
 
 
+def test_a_head_has_no_learning_rate_of_its_own() -> None:
+    class Slow(RAE):
+        def __init__(self, *args: Any, **kwargs: Any):
+            super().__init__(*args, **kwargs)
+            self.optimizer_kwargs["lr"] = 1e-4
+
+    sentence = r"^Slow.optimizer_kwargs has lr=0.0001, but everything learns at learning_rate: remove it, and change"
+    with pytest.raises(TypeError, match=sentence):
+        tiny_model("CnnPolicy", PixelBox(), srl=Slow)
+
+
 @pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_preprocessing_leaves_its_input_alone(channels: int, memory_format: th.memory_format) -> None:

@@ -37,7 +37,7 @@ class SRLHead(nn.Module):
     warmup_updates: ClassVar[int] = 0
     #: Optimiser of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
-    #: Extra arguments of the optimiser of the head's own parameters, e.g. weight decay
+    #: Extra arguments (but the learning rate) of the optimiser of the head's own parameters, e.g. weight decay
     optimizer_kwargs: dict[str, Any]
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space):
