@@ -194,6 +194,13 @@ class ExperimentManager(exp_manager.ExperimentManager):
                     "taken as they are: leave it out, or normalise rewards alone, as normalize: {norm_obs: false} "
                     '(-params "normalize:dict(norm_obs=False)").'
                 ) from error
+            if self.normalize and "VecNormalize lies around" in sentence:
+                raise SettingsError(
+                    f"normalize in {self._source('normalize')} lies within what rl-zoo3 stacks frames or moves "
+                    "channels with, but must lie around it, as SB3 stores what it sees: leave frame_stack out, and "
+                    "give of vec_env_wrapper: [stable_baselines3.common.vec_env.VecTransposeImage, "
+                    "{stable_baselines3.common.vec_env.VecFrameStack: {n_stack: 3}}] what the images need."
+                ) from error
             raise SettingsError(f"{sentence} (settings: {self._sources(sentence)}).") from error
 
     def _remove_run(self) -> None:

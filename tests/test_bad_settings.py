@@ -17,7 +17,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from test_bad_input import files_in, is_one_sentence
 
-from sb3_cure import cli, zoo
+from sb3_cure import CuReSAC, cli, zoo
 from sb3_cure.srl import RAE
 
 TASK = "tests/PixelBox-v0"
@@ -68,6 +68,14 @@ OF_NORMALIZING = (
     "asks for observations to be normalised, but images are taken as they are: leave it out, or normalise rewards "
     'alone, as normalize: {norm_obs: false} (-params "normalize:dict(norm_obs=False)").'
 )
+VEC_ENV_WRAPPER = (
+    "[stable_baselines3.common.vec_env.VecTransposeImage, "
+    "{stable_baselines3.common.vec_env.VecFrameStack: {n_stack: 3}}]"
+)
+OF_STACKS = (
+    "lies within what rl-zoo3 stacks frames or moves channels with, but must lie around it, as SB3 stores what it "
+    f"sees: leave frame_stack out, and give of vec_env_wrapper: {VEC_ENV_WRAPPER} what the images need."
+)
 #: what is wrong -> (settings that differ, or the file's text; the whole sentence)
 ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     "no YAML": (
@@ -96,6 +104,14 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
     "normalised images": (
         {"normalize": True},
         f"sb3-cure train: normalize in settings.yml {OF_NORMALIZING}",
+    ),
+    "normalised rewards within stacks": (
+        {"normalize": {"norm_obs": False}, "frame_stack": 3},
+        f"sb3-cure train: normalize in settings.yml {OF_STACKS}",
+    ),
+    "normalised rewards within moved channels": (
+        {"normalize": "dict(norm_obs=False)", "env_kwargs": {"channels_last": True}},
+        f"sb3-cure train: normalize in settings.yml {OF_STACKS}",
     ),
     "a number as text": (
         {"batch_size": "8"},
@@ -536,6 +552,17 @@ class Breaks(PixelBox):
         if self.seen > 30:
             raise ValueError("the camera is broken")
         return super().observe(first)
+
+
+def test_the_way_to_normalised_rewards_of_stacks_works() -> None:
+    changes = {
+        "env_kwargs": {"channels_last": True, "frame_stack": 1},
+        "normalize": {"norm_obs": False},
+        "vec_env_wrapper": yaml.safe_load(VEC_ENV_WRAPPER),
+    }
+    Path("settings.yml").write_text(yaml.safe_dump({"default": {**SETTINGS["default"], **changes}}))
+    assert cli.main(TRAIN.split()) == 0
+    assert CuReSAC.load(f"{RUN}_1/tests-PixelBox-v0.zip").observation_space.shape == (9, 36, 36)
 
 
 @pytest.mark.filterwarnings("ignore:.*Monitor.*:UserWarning")
