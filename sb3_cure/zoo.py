@@ -369,6 +369,18 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"env_kwargs in {self._source('env_kwargs')} is {hyperparams['env_kwargs']!r}, but it must be a "
                 "mapping (key: value): change env_kwargs."
             )
+        frame_stack = hyperparams.get("frame_stack")
+        if frame_stack is not None and not is_integer(frame_stack, 1):
+            raise SettingsError(
+                f"frame_stack in {self._source('frame_stack')} is {frame_stack!r}, but it must be a whole number of "
+                "frames of at least 1: change it, or leave it out."
+            )
+        normalize = hyperparams.get("normalize") or False
+        if not isinstance(normalize, bool | dict) and not re.match(r"\s*(dict\s*\(|{)", str(normalize)):
+            raise SettingsError(
+                f"normalize in {self._source('normalize')} is {normalize!r}, but it must be true, false, or arguments "
+                "of SB3's VecNormalize: write for example normalize: {norm_obs: false}."
+            )
         self._check_noise(hyperparams)
         if isinstance(kwargs := hyperparams.get("monitor_kwargs"), dict):
             with _refusing():

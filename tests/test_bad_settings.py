@@ -113,6 +113,16 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
         {"normalize": "dict(norm_obs=False)", "env_kwargs": {"channels_last": True}},
         f"sb3-cure train: normalize in settings.yml {OF_STACKS}",
     ),
+    "normalising in words": (
+        {"normalize": "True"},
+        "sb3-cure train: normalize in settings.yml is 'True', but it must be true, false, or arguments of SB3's "
+        "VecNormalize: write for example normalize: {norm_obs: false}.",
+    ),
+    "frames in words": (
+        {"frame_stack": "3"},
+        "sb3-cure train: frame_stack in settings.yml is '3', but it must be a whole number of frames of at least "
+        "1: change it, or leave it out.",
+    ),
     "a number as text": (
         {"batch_size": "8"},
         "sb3-cure train: batch_size is '8', but it must be a whole number of at least 1: "
