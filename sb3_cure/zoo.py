@@ -364,11 +364,13 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"n_envs in {self._source('n_envs')} is {hyperparams['n_envs']!r}, but it must be a whole number of at "
                 "least 1: change n_envs."
             )
-        if not isinstance(hyperparams.get("env_kwargs") or {}, dict):
-            raise SettingsError(
-                f"env_kwargs in {self._source('env_kwargs')} is {hyperparams['env_kwargs']!r}, but it must be a "
-                "mapping (key: value): change env_kwargs."
-            )
+        # Texts are Python, for rl-zoo3, of a monitor's arguments only.
+        for name, kinds in (("env_kwargs", dict), ("monitor_kwargs", dict | str)):
+            if not isinstance(hyperparams.get(name) or {}, kinds):
+                raise SettingsError(
+                    f"{name} in {self._source(name)} is {hyperparams[name]!r}, but it must be a mapping (key: value): "
+                    f"change {name}."
+                )
         frame_stack = hyperparams.get("frame_stack")
         if frame_stack is not None and not is_integer(frame_stack, 1):
             raise SettingsError(
@@ -382,10 +384,13 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 "of SB3's VecNormalize: write for example normalize: {norm_obs: false}."
             )
         self._check_noise(hyperparams)
-        if isinstance(kwargs := hyperparams.get("monitor_kwargs"), dict):
+        kwargs = hyperparams.get("monitor_kwargs") or {}
+        if isinstance(kwargs, dict):
             with _refusing():
                 where = f"monitor_kwargs in {self._source('monitor_kwargs')}"
                 check_keywords(where, kwargs, arguments_of(Monitor), "SB3's Monitor")
+        if hyperparams.get("policy") is None:
+            raise SettingsError(f"{self.config} has no policy: add policy: CnnPolicy, or MlpPolicy for vectors.")
         rate = hyperparams.get("learning_rate", 0.0)
         if isinstance(rate, str) and not re.fullmatch(r"lin_\d*\.?\d+(e-?\d+)?", rate):
             raise SettingsError(
@@ -415,6 +420,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
             self.args.env_kwargs = dict(hyperparams["env_kwargs"])
             if self._eval_env_kwargs_args is None:
                 self.eval_env_kwargs = self.args.env_kwargs
+        if isinstance(kwargs := hyperparams.get("monitor_kwargs"), dict):  # the Monitor adds tuples, which YAML has not
+            lists = {name: tuple(value) for name, value in kwargs.items() if isinstance(value, list)}
+            hyperparams["monitor_kwargs"] = {**kwargs, **lists}
         srl = hyperparams.get("srl")
         if isinstance(srl, str) and "." in srl:  # else a class, which a Python file may hold
             hyperparams["srl"] = _head("srl", srl)

@@ -113,6 +113,15 @@ ZOO: dict[str, tuple[dict[str, Any] | str, str]] = {
         {"normalize": "dict(norm_obs=False)", "env_kwargs": {"channels_last": True}},
         f"sb3-cure train: normalize in settings.yml {OF_STACKS}",
     ),
+    "no policy": (
+        {"policy": None},
+        "sb3-cure train: settings.yml has no policy: add policy: CnnPolicy, or MlpPolicy for vectors.",
+    ),
+    "a monitor's arguments in a list": (
+        {"monitor_kwargs": ["is_success"]},
+        "sb3-cure train: monitor_kwargs in settings.yml is ['is_success'], but it must be a mapping (key: value): "
+        "change monitor_kwargs.",
+    ),
     "normalising in words": (
         {"normalize": "True"},
         "sb3-cure train: normalize in settings.yml is 'True', but it must be true, false, or arguments of SB3's "
@@ -562,6 +571,20 @@ class Breaks(PixelBox):
         if self.seen > 30:
             raise ValueError("the camera is broken")
         return super().observe(first)
+
+
+class TellsSuccess(PixelBox):
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], {"is_success": True}
+
+
+def test_a_monitors_keywords_may_be_a_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    """YAML has no tuples, which SB3's Monitor asks for."""
+    monkeypatch.setitem(gym.registry, TASK, EnvSpec(TASK, TellsSuccess, kwargs={"episode_length": 5}))
+    settings = {**SETTINGS["default"], "monitor_kwargs": {"info_keywords": ["is_success"]}}
+    Path("settings.yml").write_text(yaml.safe_dump({"default": settings}))
+    assert cli.main(TRAIN.split()) == 0
+    assert Path(f"{RUN}_1/0.monitor.csv").read_text().splitlines()[1] == "r,l,t,is_success"
 
 
 def test_the_way_to_normalised_rewards_of_stacks_works() -> None:
