@@ -242,10 +242,11 @@ class Guard:
         except NonFiniteError as error:
             for buffer, before in statistics:
                 buffer.copy_(before)
-            model.policy.encoder_optimizer.discard()
             draw = _draw(model, len(batch.rewards), random_state)
             self._post_mortem(model, error, draw, batch, "as it was sampled")
             raise
+        finally:  # also where it was interrupted: what pulled is no part of the next update
+            model.policy.encoder_optimizer.discard()
         for buffer, before in statistics:
             if self._bad is not None:
                 buffer.copy_(self.choose(buffer, before))

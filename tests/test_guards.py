@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvW
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions
+from sb3_cure.encoder_optimizer import EncoderOptimizer
 from sb3_cure.guards import BadTransitionError, Guard, NonFiniteError, TransitionGuard
 from sb3_cure.serialization import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -849,3 +850,17 @@ def test_one_skipped_reward_does_not_hide_the_returns_of_others() -> None:
         model.learn(80)
     model._update_info_buffer([{"episode": None}])
     assert len(model.ep_info_buffer) == 3 and np.isfinite([each["r"] for each in model.ep_info_buffer]).all()
+
+
+def test_an_interrupted_update_pulls_at_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where pretraining ended between the gradient of its curious critic and the step of the encoder."""
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
+
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(EncoderOptimizer, "step", interrupted)
+        model.pretrain(20, "curious")
+    model.learn(11)  # one update
+    assert model.policy.encoder_optimizer.shares.keys() == {"srl", "task"}
