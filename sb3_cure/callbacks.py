@@ -18,6 +18,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
 
 from sb3_cure import diagnostics
@@ -59,7 +60,7 @@ class PeriodicCallback(BaseCallback):
         due = self.num_timesteps // self.every > self._last_period // self.every
         self._last_period = self.num_timesteps
         if due:
-            with _untouched_randomness(self.model.device):
+            with untouched_randomness(self.model.device):
                 self.on_period()
         return True
 
@@ -69,10 +70,17 @@ class PeriodicCallback(BaseCallback):
 
 
 @contextlib.contextmanager
-def _untouched_randomness(device: th.device) -> Iterator[None]:
+def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator[None]:
+    """Set the random streams of Python, NumPy and PyTorch aside for a while.
+
+    :param device: Device whose stream is meant, besides the CPU's
+    :param seed: What they begin with meanwhile; None: they go on from where they are
+    """
     python_state, numpy_state = random.getstate(), np.random.get_state()
     with th.random.fork_rng([device] if device.type == "cuda" else []):
         try:
+            if seed is not None:
+                set_random_seed(seed)
             yield
         finally:
             random.setstate(python_state)
@@ -281,7 +289,7 @@ class PolicyVideoCallback(_PictureCallback):
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
         _check_spaces("PolicyVideoCallback", self.eval_env, self.model)
-        with _untouched_randomness(self.model.device):
+        with untouched_randomness(self.model.device):
             self.eval_env.reset(seed=self.seed)
             check_frame(self.eval_env.render(), self.eval_env)  # rather than when the first video is due
 
@@ -391,7 +399,7 @@ class ReconstructionCallback(_PictureCallback):
         run = getattr(self.model, "_run", None)
         resumed = run is not None and run.resumed is not None
         if self.observations is not None and not self.rows and not resumed:
-            with _untouched_randomness(self.model.device):
+            with untouched_randomness(self.model.device):
                 self.on_period()
 
     def _on_step(self) -> bool:
@@ -555,7 +563,7 @@ class CuriosityMapCallback(_PictureCallback):
     def _init_callback(self) -> None:
         self._check_actors(self.actors)
         _check_spaces("CuriosityMapCallback", self.eval_env, self.model)
-        with _untouched_randomness(self.model.device):
+        with untouched_randomness(self.model.device):
             self.eval_env.reset(seed=self.seed)
             shape = np.shape(self.state(self.eval_env))  # rather than when the first map is due
         if shape != (len(self.names),):

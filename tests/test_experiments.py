@@ -467,6 +467,51 @@ def test_pretrained_arms_have_the_same_warm_up(
     assert len(differences(warm_ups[0], warm_ups[3])) >= 4, "another seed has another warm-up"
 
 
+@pytest.mark.parametrize("draw", [np.random.uniform, random.uniform], ids=["NumPy's", "Python's"])
+def test_arms_are_paired_where_environments_draw_from_common_generators(
+    draw: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither evaluations, of one policy or two, nor pictures change a training; evaluations start alike all along."""
+    starts: list[float] = []
+    reset, finish, warm_ups = PixelBox.reset, cells._CellRun._keep_results, []
+
+    def careless(self: PixelBox, *, seed: int | None = None, options: Any = None) -> Any:
+        reset(self, seed=seed)
+        self.position = np.array([draw(-1, 1), 0.0])
+        starts.append(self.position[0])
+        return self.observe(first=True), {}
+
+    def keep(run_of_cell: Any) -> None:
+        warm_ups.append([each[:40] for each in transitions_of(run_of_cell) if each is not None])
+        finish(run_of_cell)
+
+    def evaluate(self: Any) -> None:
+        before = len(starts)
+        evaluated(self)
+        n_actors = len(cells.trained_actors(self.model))
+        assert starts[before:] == starts[before : before + 2] * n_actors
+        evaluations.add(tuple(starts[before:][:2]))
+
+    evaluated, evaluations = cells._Record.evaluate, set()
+    monkeypatch.setattr(PixelBox, "reset", careless)
+    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+    monkeypatch.setattr(cells._Record, "evaluate", evaluate)
+    alone = {"curiosity": None, "n_envs": 2, "learning_starts": 40}
+    methods = {
+        "cure": {"config": "zoo.yml", "overrides": {**alone, "curiosity": "separate"}},
+        "none": {"config": "zoo.yml", "overrides": alone},
+    }
+    grid = load_grid(write_grid(tmp_path, methods=methods, budget=200, evaluation=dict(every=120, episodes=2)))
+    for out, pictures in (("with", True), ("without", False)):
+        for cell in grid.cells:
+            run_cell(cell, tmp_path / out, pictures=pictures)
+    assert differences(warm_ups[0], warm_ups[1]) == []
+    assert warm_ups[0][0].shape[0] == 40 and len(evaluations) == 1
+    for cell in grid.cells:
+        tables = [(tmp_path / out / cell.folder / "episodes.csv").read_text() for out in ("with", "without")]
+        assert tables[0] == tables[1]
+
+
 @pytest.mark.parametrize("minutes", [0, 10], ids=["each step is kept", "only starts are kept"])
 def test_a_pretrained_cell_that_was_killed_ends_like_one_that_was_not(
     minutes: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,7 +18,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cure.callbacks import ExactCheckpoint
+from sb3_cure.callbacks import ExactCheckpoint, untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import run_episodes, trained_actors
@@ -118,7 +118,8 @@ class _CellRun:
             self.model.pretrain(steps, cell.pretrain.collector, callback=callbacks)
         record.evaluates = True
         if cell.budget > 0:
-            drawing = watch_reconstructions(cell, record.action_repeat, self.folder) if self.pictures else []
+            with untouched_randomness(self.model.device, EVAL_SEED):
+                drawing = watch_reconstructions(cell, record.action_repeat, self.folder) if self.pictures else []
             self.model.learn(record.agent_steps(cell.budget), callback=[*callbacks, *drawing])
 
     def _keep_results(self) -> None:
@@ -260,18 +261,20 @@ class _Record(BaseCallback):
         row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
         for actor in trained_actors(model):
             errors, returns = [], []
-            for number, episode in enumerate(
-                run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
-            ):
-                returns.append(float(episode.total_reward))
-                if not math.isfinite(returns[-1]):  # reports could not be made of it
-                    raise ValueError(
-                        f"episode {number} of the evaluation at {row['environment_steps']} environment steps has the "
-                        f"return {returns[-1]}, but curves need finite ones: mend the rewards of {self.cell.task}."
-                    )
-                errors.append(episode.srl_errors)
-                values = (row["environment_steps"], actor, number, returns[-1])
-                self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
+            # Environments may draw from the common random numbers of Python or NumPy, as training does.
+            with untouched_randomness(model.device, EVAL_SEED):
+                episodes = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
+                for number, episode in enumerate(episodes):
+                    returns.append(float(episode.total_reward))
+                    if not math.isfinite(returns[-1]):  # reports could not be made of it
+                        raise ValueError(
+                            f"episode {number} of the evaluation at {row['environment_steps']} environment steps has "
+                            f"the return {returns[-1]}, but curves need finite ones: mend the rewards of "
+                            f"{self.cell.task}."
+                        )
+                    errors.append(episode.srl_errors)
+                    values = (row["environment_steps"], actor, number, returns[-1])
+                    self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
             if actor == "task":
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_cure.callbacks import untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import Episode, even_negatives, run_episodes, trained_actors
@@ -80,8 +81,7 @@ def roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool 
     :return: The episodes
     """
     seed = VISIT_SEED + cell.seed
-    with th.random.fork_rng():
-        th.manual_seed(seed)
+    with untouched_randomness(model.device, seed):
         return list(run_episodes(model, env, cell.eval_episodes, actor, deterministic=False, seed=seed, states=states))
 
 
