@@ -24,14 +24,14 @@ import psutil
 import pytest
 import torch as th
 import yaml
-from envs_for_tests import PixelBox, differences, state_of
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_cure
 from benchmarks import zero_decoder
 from sb3_cure import CuReSAC, files, generations
-from sb3_cure.experiments import cells, heads, media, plots, probe, run, yardsticks
+from sb3_cure.experiments import cells, heads, media, plots, probe, run, visitation, yardsticks
 from sb3_cure.experiments import files as experiment_files
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import checkout_commit, read_rows, write_csv
@@ -1066,6 +1066,19 @@ def test_visits_are_measured_by_own_common_and_ignorant_heads(tmp_path: Path, mo
         for cell in grid.cells
     ]
     assert returns[0] == returns[1] and returns[2] == returns[3] and returns[0].isdisjoint(returns[2])
+
+
+def test_yardsticks_of_vectors_are_the_same_with_any_head() -> None:
+    """Zero and the mean vector, as vectors are not quantised; with an autoencoder, another head or none."""
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    episode: Any = SimpleNamespace(observations=seen)
+    for srl in ("rae", None):
+        model = tiny_model("MlpPolicy", VectorBox(), srl=srl, curiosity=None)
+        mean = visitation.mean_target(model, [episode])
+        assert mean == pytest.approx(seen.mean(axis=0), abs=1e-6)
+        for constant in (mean, np.zeros(2)):
+            expected = np.square(seen - constant).mean(axis=1)
+            assert visitation.constant_errors(model, seen, constant) == pytest.approx(expected, abs=1e-6)
 
 
 def test_pictures_show_every_policy_and_name_the_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.callbacks import untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
@@ -36,7 +37,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     """Roll out each policy, as it acts in training, and write ``visitation.csv`` and ``visits.npz``.
 
     Errors are those of the model's own head, and of two predictions that know nothing: ``zero``, the middle grey,
-    and ``mean_image``, the mean of everything that the policies saw in these episodes.
+    and ``mean_image``, the mean of everything that the policies saw in these episodes (of vectors: 0, and their mean).
 
     :param model: A trained model
     :param cell: Its cell
@@ -92,6 +93,8 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
         images = th.as_tensor(observations[start : start + 128], device=model.device)
         if isinstance(head, RAE):
             yield head.target(images, dither=False).cpu().numpy()
+        elif not is_image_space(model.observation_space):
+            yield images.float().flatten(1).cpu().numpy()
         else:
             yield ((images.div(8, rounding_mode="floor") + 0.5) / 32 - 0.5).cpu().numpy()
 
