@@ -323,6 +323,16 @@ def test_names_of_arms_are_no_verdicts(tmp_path: Path) -> None:
     assert "One arm: there is nothing to compare it with." in page and "any two arms" not in page
 
 
+def test_arms_without_returns_are_not_said_to_lack_seeds(tmp_path: Path) -> None:
+    """A curious agent alone has finished the baseline's seed, but there is no return to compare."""
+    write_grid(tmp_path, methods={"sac_ae": {}, "cure": {}})
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1))
+    write_cell(tmp_path, TASK, "cure", 0, dict.fromkeys(curve(0, 1), ""), arguments={**RAE, "task": False})
+    assert report.main([str(tmp_path)]) == 0
+    said = "No arm shares a seed that has returns with the baseline sac_ae: nothing to compare."
+    assert said in (tmp_path / "report.html").read_text()
+
+
 def test_a_report_of_results_that_cannot_be_written_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

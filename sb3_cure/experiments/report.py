@@ -311,7 +311,7 @@ def _curves(
             )
     if not differences:
         headlines.append(
-            f"No arm has a seed in common with the baseline {experiment.baseline}: nothing to compare yet."
+            f"No arm shares a seed that has returns with the baseline {experiment.baseline}: nothing to compare."
             if len(experiment.methods) > 1
             else "One arm: there is nothing to compare it with."
         )
