@@ -1081,6 +1081,27 @@ def test_yardsticks_of_vectors_are_the_same_with_any_head() -> None:
             assert visitation.constant_errors(model, seen, constant) == pytest.approx(expected, abs=1e-6)
 
 
+def test_yardsticks_of_discrete_observations_are_the_same_with_any_head() -> None:
+    """One-hot, as an autoencoder draws them."""
+
+    class Rooms(gym.ObservationWrapper):
+        def __init__(self) -> None:
+            super().__init__(VectorBox())
+            self.observation_space = gym.spaces.Discrete(2)
+
+        def observation(self, observation: np.ndarray) -> Any:
+            return np.int64(observation[0] > 0)
+
+    episode: Any = SimpleNamespace(observations=np.array([0, 0, 1, 0]))
+    for srl in ("rae", None):
+        model = tiny_model("MlpPolicy", Rooms(), srl=srl, curiosity=None)
+        mean = visitation.mean_target(model, [episode])
+        assert mean == pytest.approx([0.75, 0.25])
+        assert visitation.constant_errors(model, episode.observations, mean) == pytest.approx(
+            [0.0625, 0.0625, 0.5625, 0.0625]
+        )
+
+
 def test_pictures_show_every_policy_and_name_the_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Films of both policies; the map is that of the measured visits, of sampled and random actions, in any kind."""
     maps: list[dict[str, Any]] = []

@@ -17,6 +17,7 @@ from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import Episode, even_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, write_csv
 from sb3_cure.experiments.grid import Cell
+from sb3_cure.layers import preprocess
 from sb3_cure.srl import RAE
 
 #: Plus the cell's seed: the arms of a seed start from the same states, another seed from others
@@ -94,7 +95,7 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
         if isinstance(head, RAE):
             yield head.target(images, dither=False).cpu().numpy()
         elif not is_image_space(model.observation_space):
-            yield images.float().flatten(1).cpu().numpy()
+            yield preprocess(images, model.observation_space).flatten(1).cpu().numpy()
         else:
             yield ((images.div(8, rounding_mode="floor") + 0.5) / 32 - 0.5).cpu().numpy()
 
