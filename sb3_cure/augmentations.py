@@ -1,63 +1,127 @@
-"""Image augmentations: batched, on the batch's device, of any dtype (uint8 stays uint8)."""
+"""What the encoder sees of an observation: a random view to learn from, a centred one to act and to measure."""
 
+from typing import Any
+
+import numpy as np
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 
-def center_crop(images: th.Tensor, size: int) -> th.Tensor:
-    """Cut the central square.
+class Augmentation:
+    """No augmentation: the encoder sees observations as they are stored.
 
-    :param images: [B, C, H, W]
-    :param size: Side of the square, pixels
-    :return: [B, C, size, size]
-    :raises ValueError: if the images are smaller
+    Calling it draws a random view. Views have the dtype and the scale of observations: images uint8 in 0-255.
+
+    :param observation_space: Space of the stored observations
     """
-    _check_size(images, size)
-    top, left = (images.shape[2] - size) // 2, (images.shape[3] - size) // 2
-    return images[:, :, top : top + size, left : left + size]
+
+    def __init__(self, observation_space: spaces.Space):
+        self.observation_space = observation_space
+        #: Space of the views
+        self.view_space = observation_space
+
+    def __call__(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        :param observations: Observations as stored, [B, *shape]
+        :param generator: Source of the randomness (default: torch's global one)
+        :return: Random views, [B, *view shape]
+        """
+        return observations
+
+    def center(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: Observations as stored, [B, *shape]
+        :return: The view without randomness, [B, *view shape]
+        """
+        return observations
 
 
-def random_crop(images: th.Tensor, size: int, generator: th.Generator | None = None) -> th.Tensor:
-    """Cut a random square from each image, every offset (the last one too) equally likely.
+class RandomShift(Augmentation):
+    """Shifts images by up to ``pad`` pixels and repeats the border (DrQ, Yarats et al. 2021, section 4.1).
 
-    All channels of one observation, hence all its stacked frames, are cut alike (CURL, section 4.2).
-
-    :param images: [B, C, H, W]
-    :param size: Side of the square, pixels
-    :param generator: Source of the offsets (default: torch's global one)
-    :return: [B, C, size, size]
-    :raises ValueError: if the images are smaller
-    """
-    _check_size(images, size)
-    batch, _, height, width = images.shape
-    # Drawn on the CPU: a CUDA draw would not repeat a CPU run, and two short vectors cost nothing to send.
-    top = th.randint(height - size + 1, (batch, 1), generator=generator)
-    left = th.randint(width - size + 1, (batch, 1), generator=generator)
-    return _windows(images, top + th.arange(size), left + th.arange(size))
-
-
-def random_shift(images: th.Tensor, pad: int = 4, generator: th.Generator | None = None) -> th.Tensor:
-    """Shift each image by up to ``pad`` pixels, the border pixels repeated (DrQ, section 4.1).
-
-    :param images: [B, C, H, W]
+    :param observation_space: Images, channels first
     :param pad: Largest shift, pixels
-    :param generator: Source of the shifts (default: torch's global one)
-    :return: [B, C, H, W]
     """
-    batch, _, height, width = images.shape
-    down = th.randint(-pad, pad + 1, (batch, 1), generator=generator)
-    right = th.randint(-pad, pad + 1, (batch, 1), generator=generator)
-    # Rows and columns outside of the image are those of its border.
-    rows = (th.arange(height) + down).clamp(0, height - 1)
-    columns = (th.arange(width) + right).clamp(0, width - 1)
-    return _windows(images, rows, columns)
+
+    def __init__(self, observation_space: spaces.Space, pad: int = 4):
+        super().__init__(_images(observation_space, "shift"))
+        self.pad = pad
+
+    def __call__(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+        """All channels of an observation, hence all its frames, are shifted alike.
+
+        :param observations: [B, C, H, W]
+        :param generator: Source of the shifts (default: torch's global one)
+        :return: [B, C, H, W]
+        """
+        batch, _, height, width = observations.shape
+        down = th.randint(-self.pad, self.pad + 1, (batch, 1), generator=generator)
+        right = th.randint(-self.pad, self.pad + 1, (batch, 1), generator=generator)
+        # Rows and columns outside of the image are those of its border.
+        rows = (th.arange(height) + down).clamp(0, height - 1)
+        columns = (th.arange(width) + right).clamp(0, width - 1)
+        return _windows(observations, rows, columns)
 
 
-def _check_size(images: th.Tensor, size: int) -> None:
-    if size > min(images.shape[2:]):
-        raise ValueError(
-            f"size is {size}, but the images are {images.shape[2]} x {images.shape[3]} pixels: take smaller crops, or "
-            "larger images."
-        )
+class RandomCrop(Augmentation):
+    """Cuts a random square out of each image, every offset equally likely (CURL, Laskin et al. 2020, section 4.2).
+
+    :param observation_space: Images, channels first, larger than the crops
+    :param size: Side of the crops, pixels
+    :raises ValueError: if the images are not larger
+    """
+
+    def __init__(self, observation_space: spaces.Space, size: int = 84):
+        super().__init__(_images(observation_space, "crop"))
+        channels, height, width = observation_space.shape  # type: ignore[misc]
+        if not 0 < size < min(height, width):
+            raise ValueError(
+                f"augmentation='crop' cuts {size} x {size} pixels out of images of {height} x {width}: render larger "
+                "(CURL: image_size=100), set augmentation_kwargs=dict(size=...), or use augmentation='shift'."
+            )
+        self.size = size
+        self.view_space = spaces.Box(0, 255, (channels, size, size), np.uint8)
+
+    def __call__(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
+        """All channels of an observation, hence all its frames, are cut alike.
+
+        :param observations: [B, C, H, W]
+        :param generator: Source of the offsets (default: torch's global one)
+        :return: [B, C, size, size]
+        """
+        batch, _, height, width = observations.shape
+        # Drawn on the CPU: a CUDA draw would not repeat a CPU run, and two short vectors cost nothing to send.
+        top = th.randint(height - self.size + 1, (batch, 1), generator=generator)
+        left = th.randint(width - self.size + 1, (batch, 1), generator=generator)
+        return _windows(observations, top + th.arange(self.size), left + th.arange(self.size))
+
+    def center(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, C, H, W]
+        :return: The central squares, [B, C, size, size]
+        """
+        top, left = (observations.shape[2] - self.size) // 2, (observations.shape[3] - self.size) // 2
+        return observations[:, :, top : top + self.size, left : left + self.size]
+
+
+AUGMENTATIONS: dict[str | None, type[Augmentation]] = {None: Augmentation, "shift": RandomShift, "crop": RandomCrop}
+
+
+def make_augmentation(name: str | None, observation_space: spaces.Space, **kwargs: Any) -> Augmentation:
+    """
+    :param name: ``"shift"``, ``"crop"`` or None
+    :param observation_space: Space of the stored observations
+    :param kwargs: Arguments of the augmentation
+    :return: The augmentation
+    """
+    return AUGMENTATIONS[name](observation_space, **kwargs)
+
+
+def _images(space: spaces.Space, name: str) -> spaces.Space:
+    if not is_image_space(space):
+        raise ValueError(f"augmentation={name!r} works on images, but observations are {space}: set augmentation=None.")
+    return space
 
 
 def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:

@@ -7,7 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
 from sb3_cure.values import check_folder, is_integer
 
@@ -23,6 +23,27 @@ try:
     import psutil
 except ImportError:
     psutil = None  # type: ignore[assignment]
+
+
+class Samples(NamedTuple):
+    """A batch of one-step transitions, as heads, rewards and critics get it.
+
+    :param observations: As stored, images unscaled in 0-255, [B, *shape]
+    :param actions: Executed actions in [-1, 1], [B, action_dim]
+    :param next_observations: As stored, [B, *shape]
+    :param dones: 1 where the episode terminated (time limits do not count), [B, 1]
+    :param rewards: The task's rewards, [B, 1]
+    :param discounts: Discounts of SB3's n-step buffer, [B, 1]; None for single steps
+    :param views: What the encoder saw of the observations, before scaling, [B, *view shape]
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | None = None
+    views: th.Tensor | None = None
 
 
 #: Keys of ``info`` that mark a transition which is never to be sampled: ``FaultTolerantSubprocVecEnv`` sets
@@ -605,3 +626,48 @@ def _check_arguments(observation_space: spaces.Space, frame_stack: int, optimize
         raise ValueError(
             "optimize_memory_usage is True, but FrameStackReplayBuffer already stores each frame once: leave it False."
         )
+
+
+def choose_replay_buffer(
+    env: VecEnv | None, observation_space: spaces.Space, kwargs: dict[str, Any]
+) -> tuple[type[ReplayBuffer] | None, dict[str, Any]]:
+    """Keep each frame once where the user or the environment says that observations are stacked frames.
+
+    :param env: Environments, or None
+    :param observation_space: Their observations, channels first
+    :param kwargs: Arguments of the replay buffer that the user gave
+    :return: Class of the replay buffer (None: SB3's choice), and its arguments
+    """
+    stacked = None if env is None else unwrap_vec_wrapper(env, VecFrameStack)
+    frame_stack = kwargs.get("frame_stack")
+    if frame_stack is None and stacked is not None:
+        # Its stacks slide, whatever the environments in it stack.
+        frame_stack = stacked.stacked_obs.n_stack
+    elif frame_stack is None and env is not None:
+        frame_stack = told_frame_stack(env)
+    is_image = len(observation_space.shape or ()) == 3 and observation_space.dtype == np.uint8
+    if is_image and frame_stack is not None:
+        return FrameStackReplayBuffer, {"frame_stack": frame_stack, **kwargs}
+    if isinstance(observation_space, spaces.Box) and not kwargs:
+        return SkippingReplayBuffer, kwargs
+    return None, kwargs
+
+
+def told_frame_stack(env: VecEnv) -> int | None:
+    """
+    :param env: Environments, channels first
+    :return: Frames per observation, as the environments tell in ``frame_stack`` (those of this package do); None where
+        that cannot be meant
+    """
+    told: Any = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else None
+    shape = env.observation_space.shape or ()
+    return int(told) if isinstance(told, int) and told > 0 and (len(shape) != 3 or shape[0] % told == 0) else None
+
+
+def frame_stack_of(env: VecEnv) -> int:
+    """
+    :param env: Environments
+    :return: Frames per observation, as they and SB3's ``VecFrameStack`` around them tell; 1 where nothing tells
+    """
+    stacked = unwrap_vec_wrapper(env, VecFrameStack)
+    return (told_frame_stack(env) or 1) * (1 if stacked is None else stacked.stacked_obs.n_stack)

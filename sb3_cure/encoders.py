@@ -9,8 +9,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import FlattenImage, Projection, conv_sizes, init_weights
-from sb3_cure.values import is_integer
+from sb3_cure.layers import FlattenImage, FullPrecisionLinear, Projection, conv_sizes, init_weights
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -30,6 +29,11 @@ class Encoder(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Space, features_dim: int, trunk_dim: int):
         super().__init__(observation_space, features_dim)
         self.trunk_dim = trunk_dim
+
+    @property
+    def view_space(self) -> spaces.Space:
+        """Space of what the encoder sees: the observations', or that of crops of them."""
+        return self._observation_space
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
@@ -61,13 +65,8 @@ class PixelEncoder(Encoder):
         shape = observation_space.shape
         if len(shape) != 3:
             raise ValueError(
-                f"PixelEncoder got observations of shape {shape}, but needs images (channels, height, width): "
-                "use 'MlpPolicy' for vectors."
-            )
-        if not all(is_integer(size, 1) for size in (features_dim, n_filters, n_layers)):
-            raise ValueError(
-                f"PixelEncoder got features_dim={features_dim!r}, n_filters={n_filters!r}, n_layers={n_layers!r}, "
-                "but each must be at least 1: change features_extractor_kwargs."
+                f"'CnnPolicy' reads images (channels, height, width), but observations have the shape {shape}: use "
+                "'MlpPolicy' for vectors, or make_dmc_env / make_pixel_env for pixels."
             )
         height, width = conv_sizes(shape[1], shape[2], n_layers)[-1]
         super().__init__(observation_space, features_dim, trunk_dim=n_filters * height * width)
@@ -91,20 +90,14 @@ class VectorEncoder(Encoder):
     :param features_dim: Size of the latent state
     :param hidden_dim: Width of the hidden layer
     :param tanh: Whether latents end in a tanh
-    :raises ValueError: if a size is below 1
     """
 
     def __init__(
         self, observation_space: spaces.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True
     ):
-        if not (is_integer(features_dim, 1) and is_integer(hidden_dim, 1)):
-            raise ValueError(
-                f"VectorEncoder got features_dim={features_dim!r} and hidden_dim={hidden_dim!r}, but each must be at "
-                "least 1: change features_extractor_kwargs."
-            )
         super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
         inputs = get_flattened_obs_dim(observation_space)
-        self.trunk = nn.Sequential(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
+        self.trunk = nn.Sequential(nn.Flatten(), FullPrecisionLinear(inputs, hidden_dim), nn.ReLU())
         self.projection = Projection(hidden_dim, features_dim, tanh)
         init_weights(self)
 
@@ -130,14 +123,6 @@ def make_encoder(
     :param observation_space: Space of what the encoder sees (after the head's crop, if it has one)
     :param kwargs: Passed on to the class
     :return: The encoder
-    :raises ValueError: if the class cannot read such observations
     """
-    try:
-        extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
-    except (RuntimeError, AssertionError) as error:  # how torch and SB3's extractors say it
-        reason = " ".join(str(error).split())
-        raise ValueError(
-            f"{extractor_class.__name__} cannot read observations of shape {observation_space.shape} ({reason}): use a "
-            "larger image_size, or another policy_kwargs=dict(features_extractor_class=...)."
-        ) from error
+    extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
     return extractor if isinstance(extractor, Encoder) else ExtractorEncoder(extractor)

@@ -1,138 +1,53 @@
-"""What is not finite reaches neither parameters nor replay buffer, and its source is named.
-
-``Guard`` stands before every step of an optimiser, ``TransitionGuard`` before the replay buffer and the policy.
-"""
+"""What is not finite reaches no parameter, and its source is named: the look before every step of an optimiser."""
 
 import contextlib
-import copy
-import inspect
 import json
 import math
 import tempfile
-import warnings
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from importlib.metadata import version
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.utils import get_system_info
-from stable_baselines3.sac.sac import SAC
-
-from sb3_cure.buffers import transitions
-
-if TYPE_CHECKING:
-    from sb3_cure.cure_sac import CuReSAC
-
-Observations = np.ndarray | dict[str, np.ndarray]
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 #: Gradients with a larger norm overflow float32 where Adam squares them
 LARGEST_NORM = math.sqrt(np.finfo(np.float32).max)
-#: How many of the latest batches have their indices remembered until the flag is read, where it is not read at once
-BATCHES_REMEMBERED = 4096
 
 
-class _WithPostMortem(ValueError):
-    """An error of which more than a sentence may have been written down."""
+class NonFiniteError(ValueError):
+    """A loss or a gradient was not finite; the step was not taken.
 
-    #: Where that is
-    post_mortem = ""
-
-    @property
-    def _look(self) -> str:
-        return f"look at {self.post_mortem}, then " if self.post_mortem else ""
-
-
-class NonFiniteError(_WithPostMortem):
-    """A loss or a gradient was not finite; the step was not taken. ``post_mortem`` says where more is written.
-
-    :param source: What it was, say ``"task critic's loss"`` or ``"gradient of the SRL loss"``
-    :param value: Its value
+    :param source: What it was, say ``"task critic"``
+    :param loss: Value of the loss
+    :param norm: Norm of its gradient
     :param update: Number of the update
     """
 
-    def __init__(self, source: str, value: float, update: int):
-        super().__init__(source, value, update)
+    def __init__(self, source: str, loss: float, norm: float, update: int):
+        super().__init__(source, loss, norm, update)
         self.source = source
-        self.value = value
+        self.loss = loss
+        self.norm = norm
         self.update = update
+        #: Folder with the batch and the values, or ""
+        self.crash_report = ""
 
     def __str__(self) -> str:
+        look = f" The batch lies in {self.crash_report}." if self.crash_report else ""
         return (
-            f"the {self.source} was {self.value:g} in update {self.update}, but losses and gradients (their squares, "
-            f"too) must be finite: the parameters did not take it; {self._look}lower the learning rate, or fix the SRL "
-            "head or the rewards."
+            f"the {self.source} loss was {self.loss:g} with a gradient of norm {self.norm:g} in update {self.update}: "
+            "the parameters did not take it. Lower the learning rate, or look at the rewards and the SRL head." + look
         )
-
-
-class BadTransitionError(_WithPostMortem):
-    """A reward, an observation or an action was not finite; it was neither stored nor executed. ``post_mortem`` says
-    where more is written.
-
-    :param reason: What was not finite, where and when
-    :param consequence: What was not done with it
-    :param fix: What to do
-    """
-
-    def __init__(self, reason: str, consequence: str, fix: str):
-        super().__init__(reason, consequence, fix)
-        self.reason = reason
-        self.consequence = consequence
-        self.fix = fix
-
-    def __str__(self) -> str:
-        return f"{self.reason}: {self.consequence}; {self._look}{self.fix}."
-
-
-class Check(NamedTuple):
-    """One look at a loss and its gradients.
-
-    :param update: Number of the update
-    :param order: Number of the check within the update
-    :param loss: The loss
-    :param norm: Norm of the gradients
-    """
-
-    update: float
-    order: float
-    loss: float
-    norm: float
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether all of it may go into an optimiser."""
-        return math.isfinite(self.loss) and self.norm <= LARGEST_NORM
-
-
-class Draw(NamedTuple):
-    """Where a batch came from.
-
-    :param update: Number of the update
-    :param timestep: Agent steps at that time
-    :param rows: Rows of the replay buffer, [B], if they are known
-    :param env_inds: Environment of each, [B], if they are known
-    """
-
-    update: int
-    timestep: int
-    rows: np.ndarray | None
-    env_inds: np.ndarray | None
 
 
 class Guard:
     """Looks at losses and gradients before they are stepped along.
 
-    On a CPU it looks at once and raises before the step. Reading a value from a GPU would wait for it: there
-    (``deferred``) a flag on the device turns the bad step and the rest of its update into nothing, later updates go on,
-    and ``report``, called where values are read anyway, raises for the first source.
+    On a CPU it raises before the step. Reading a value from a GPU would wait for it: there (``deferred``) a flag on the
+    device turns the bad step and the rest of its update into nothing, and ``report`` raises where values are read
+    anyway.
 
     :param deferred: Whether to look later
     """
@@ -140,81 +55,59 @@ class Guard:
     def __init__(self, deferred: bool = False):
         self.deferred = deferred
         self._update = 0
-        self._order = 0
-        # By name, the latest check; while deferred a tensor [4], kept since the first update that went bad
-        self._checks: dict[str, Check | th.Tensor] = {}
-        # While deferred, 1.0 on the device if something in this update, or in an earlier one, was bad
+        #: While deferred, 1 on the device if something in this update was bad
         self._bad: th.Tensor | None = None
-        self._was_bad: th.Tensor | None = None
-        self._draws: deque[Draw] = deque(maxlen=BATCHES_REMEMBERED)
+        # Loss, norm and update where a loss was bad first (update < 0: never), by name, in the order of an update
+        self._first: dict[str, th.Tensor] = {}
 
-    def check(
-        self,
-        name: str,
-        loss: th.Tensor | None,
-        optimizer: th.optim.Optimizer | None = None,
-        gradients: Sequence[th.Tensor] = (),
+    def begin(self, update: int) -> None:
+        """
+        :param update: Number of the update that begins
+        """
+        self._update = update
+        self._bad = None
+
+    def step(
+        self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, also: Iterable[th.Tensor] = ()
     ) -> None:
+        """Step, unless the loss or a gradient is not finite.
+
+        :param name: Name of the loss
+        :param loss: Scalar, of which the gradients have been computed
+        :param optimizer: Makes the step; None: there is none to make
+        :param also: Further tensors whose gradients are looked at
+        :raises NonFiniteError: if something is not finite, unless that is found out later
         """
-        :param name: What is looked at, with its article left out
-        :param loss: Scalar; None: only its gradients are known
-        :param optimizer: Whose parameters' gradients are looked at
-        :param gradients: Further gradients
-        :raises NonFiniteError: if something is not finite, unless that is to be found out later
-        """
-        found = list(gradients)
-        if optimizer is not None:
-            found += [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        norm = th.linalg.vector_norm(th.stack(th._foreach_norm(found))) if found else None
-        loss = None if loss is None else loss.detach()
-        self._order += 1
+        owned = [p for group in optimizer.param_groups for p in group["params"]] if optimizer is not None else []
+        gradients = [tensor.grad for tensor in [*owned, *also] if tensor.grad is not None]
+        loss = loss.detach().float()
+        norm = th.stack(th._foreach_norm(gradients)).norm() if gradients else th.zeros_like(loss)
         if self.deferred:
-            self._check_later(name, loss, norm)
-            return
-        check = Check(
-            self._update, self._order, 0.0 if loss is None else float(loss), 0.0 if norm is None else float(norm)
-        )
-        self._checks[name] = check
-        if not check.is_sound:
-            raise _error(name, check)
+            self._look_later(name, loss, norm)
+        elif not (math.isfinite(loss) and norm <= LARGEST_NORM):
+            raise NonFiniteError(name, float(loss), float(norm), self._update)
+        if optimizer is not None:
+            self._step(optimizer)
 
-    def _check_later(self, name: str, loss: th.Tensor | None, norm: th.Tensor | None) -> None:
-        device = next(value.device for value in (loss, norm) if value is not None)
-        zero = th.zeros((), device=device)
-        loss = zero if loss is None else loss.float().reshape(())
-        norm = zero if norm is None else norm.float()
-        bad = (~(loss.isfinite() & (norm <= LARGEST_NORM))).float()
-        self._bad = bad if self._bad is None else th.maximum(self._bad, bad)
-        now = th.stack([th.full_like(zero, self._update), th.full_like(zero, self._order), loss, norm])
-        before = self._checks.get(name)
-        if self._was_bad is not None and isinstance(before, th.Tensor):
-            now = th.where(self._was_bad > 0, before, now)
-        self._checks[name] = now
+    def _look_later(self, name: str, loss: th.Tensor, norm: th.Tensor) -> None:
+        bad = ~(loss.isfinite() & (norm <= LARGEST_NORM))
+        now = th.stack([loss, norm, th.full_like(loss, self._update)])
+        first = self._first.get(name, th.full_like(now, -1))
+        self._first[name] = th.where(bad & (first[2] < 0), now, first)
+        self._bad = bad.float() if self._bad is None else th.maximum(self._bad, bad.float())
 
-    def step(self, optimizer: th.optim.Optimizer) -> None:
-        """
-        :param optimizer: Makes its step, unless a check in this update has found something bad
-        """
+    def _step(self, optimizer: th.optim.Optimizer) -> None:
         if self._bad is None:
             optimizer.step()
-        elif _is_fused_adam(optimizer):
+        elif all(group.get("fused") for group in optimizer.param_groups):
             # What torch's GradScaler does: the kernel itself looks at the flag.
             optimizer.found_inf = self._bad  # type: ignore[attr-defined]
             try:
                 optimizer.step()
             finally:
                 del optimizer.found_inf  # type: ignore[attr-defined]
-        elif not self._bad:
-            # Other optimisers know no flag: the device is waited for.
+        elif not self._bad:  # other optimisers know no flag: the device is waited for
             optimizer.step()
-
-    def choose(self, value: th.Tensor, otherwise: th.Tensor) -> th.Tensor:
-        """
-        :param value: What the update brings
-        :param otherwise: What there is instead if something in this update was bad
-        :return: One of them
-        """
-        return value if self._bad is None else th.where(self._bad > 0, otherwise, value)
 
     def rate(self, rate: float) -> float | th.Tensor:
         """
@@ -223,436 +116,44 @@ class Guard:
         """
         return rate if self._bad is None else rate * (1 - self._bad)
 
-    @contextlib.contextmanager
-    def update(self, model: "CuReSAC", batch: ReplayBufferSamples, random_state: dict[str, Any]) -> Iterator[None]:
-        """Within this context an update is made, which is bad as a whole if something in it is.
+    def report(self) -> None:
+        """Read what was found while deferred.
 
-        :param model: The model
-        :param batch: Its samples
-        :param random_state: NumPy's random state before they were drawn
-        :raises NonFiniteError: with a post-mortem; running statistics are then what they were
+        :raises NonFiniteError: for the first loss that was not finite
         """
-        self._start(model._n_updates)
-        # What forward passes write: running statistics of the curious reward, of normalisation layers, of heads
-        statistics = [(buffer, buffer.clone()) for buffer in model.policy.buffers() if buffer.is_floating_point()]
-        if self.deferred:
-            self._draws.append(_draw(model, len(batch.rewards), random_state))
-        try:
-            yield
-        except NonFiniteError as error:
-            for buffer, before in statistics:
-                buffer.copy_(before)
-            draw = _draw(model, len(batch.rewards), random_state)
-            self._post_mortem(model, error, draw, batch, "as it was sampled")
-            raise
-        finally:  # also where it was interrupted: what pulled is no part of the next update
-            model.policy.encoder_optimizer.discard()
-        for buffer, before in statistics:
-            if self._bad is not None:
-                buffer.copy_(self.choose(buffer, before))
+        found = {name: first.tolist() for name, first in self._first.items()}
+        self._first = {}
+        bad = [(update, name, loss, norm) for name, (loss, norm, update) in found.items() if update >= 0]
+        if bad:
+            update, name, loss, norm = min(bad, key=lambda each: each[0])
+            raise NonFiniteError(name, loss, norm, int(update))
 
-    def _start(self, update: int) -> None:
-        if self._bad is not None:
-            self._was_bad = self._bad if self._was_bad is None else th.maximum(self._was_bad, self._bad)
-        self._bad = None
-        self._update, self._order = update, 0
-        if not self.deferred:
-            self._checks = {}
 
-    def report(self, model: "CuReSAC") -> None:
-        """Read the flag, where values are read anyway.
+@contextlib.contextmanager
+def crash_report(model: OffPolicyAlgorithm, batch: Any) -> Iterator[None]:
+    """Write the batch of a ``NonFiniteError`` beside the logs, or among temporary files, and let the error say where.
 
-        :param model: The model
-        :raises NonFiniteError: with a post-mortem, for the first source since the last report, if there is one
-        """
-        if not self.deferred:
-            return
-        self._start(self._update)
-        was_bad, self._was_bad = self._was_bad, None
-        draws, self._draws = self._draws, deque(maxlen=BATCHES_REMEMBERED)
-        if was_bad is None or not was_bad:
-            return
-        latest = {name: Check(*check.tolist()) for name, check in self._checks.items() if isinstance(check, th.Tensor)}
-        name, first = min(((n, c) for n, c in latest.items() if not c.is_sound), key=lambda item: item[1][:2])
-        self._checks = {name: check for name, check in latest.items() if check.update == first.update}
-        error = _error(name, first)
-        draw = next((draw for draw in draws if draw.update == error.update), None)
-        draw = draw or Draw(error.update, model.num_timesteps, None, None)
-        self._post_mortem(model, error, draw, *_batch_of(model, draw))
-        self._checks = {}
-        raise error
-
-    def _post_mortem(
-        self, model: "CuReSAC", error: NonFiniteError, draw: Draw, batch: ReplayBufferSamples | None, origin: str
-    ) -> None:
-        """Write down batch, losses and settings, and let the error say where."""
-        losses = {
-            name: {"loss": _plain(check.loss), "gradient_norm": _plain(check.norm)}
-            for name, check in self._checks.items()
-            if isinstance(check, Check)
-        }
-        report = {
+    :param model: The model
+    :param batch: Samples that it learns from within this context
+    :raises NonFiniteError: the one that was raised within
+    """
+    try:
+        yield
+    except NonFiniteError as error:
+        folder = model.logger.dir if model.logger.dir and Path(model.logger.dir).is_dir() else None
+        path = Path(tempfile.mkdtemp(prefix=f"crash_report_{error.update}_", dir=folder))
+        rows, envs = getattr(model.replay_buffer, "last_sampled", None) or ([], [])
+        about = {
             "source": error.source,
-            "value": _plain(error.value),
+            "loss": error.loss,
+            "gradient_norm": error.norm,
             "update": error.update,
-            "agent_steps": draw.timestep,
-            "losses": losses,
-            "rows": None if draw.rows is None else draw.rows.tolist(),
-            "environments": None if draw.env_inds is None else draw.env_inds.tolist(),
-            "batch": origin,
+            "agent_steps": model.num_timesteps,
+            "rows": list(map(int, rows)),
+            "environments": list(map(int, envs)),
         }
-        batch_arrays = {} if batch is None else batch._asdict()
-        arrays = {name: value.cpu().numpy() for name, value in batch_arrays.items() if isinstance(value, th.Tensor)}
-        error.post_mortem = _write_post_mortem(model, str(error.update), report, "batch.npz", arrays)
-
-
-@contextlib.contextmanager
-def looking_before_steps(model: "CuReSAC", optimizers: Mapping[str, th.optim.Optimizer | None]) -> Iterator[None]:
-    """Within this context no optimiser steps along gradients that are not finite, whoever calls it.
-
-    The value is read at once, which on a GPU waits for it. The post-mortem knows the gradients, and the batch if the
-    replay buffer remembers it. (Not for good, as copies of an optimiser have no hooks.)
-
-    :param model: The model
-    :param optimizers: Optimisers by the name of what they train; None is left out
-    """
-    guard = Guard()
-
-    def look(name: str, optimizer: th.optim.Optimizer, *_: Any) -> None:
-        guard._start(model._n_updates)
-        try:
-            guard.check(f"{name} loss", None, optimizer)
-        except NonFiniteError as error:
-            rows, env_inds = getattr(model.replay_buffer, "last_sampled", None) or (None, None)
-            draw = Draw(error.update, model.num_timesteps, rows, env_inds)
-            guard._post_mortem(model, error, draw, *_batch_of(model, draw))
-            raise
-
-    with contextlib.ExitStack() as hooks:
-        for name, optimizer in optimizers.items():
-            if optimizer is not None:
-                hooks.callback(optimizer.register_step_pre_hook(partial(look, name)).remove)
-        yield
-
-
-def _write_post_mortem(
-    model: "CuReSAC", name: str, report: dict[str, Any], archive: str, arrays: dict[str, np.ndarray]
-) -> str:
-    """Beside the logs, or among temporary files; without pickle.
-
-    :return: Where it lies
-    """
-    versions = {"sb3_cure": version("sb3_cure"), **get_system_info(print_info=False)[0]}
-    logger = getattr(model, "_logger", None)  # a model that has not learned has none
-    directory = None if logger is None or logger.dir is None or not Path(logger.dir).is_dir() else logger.dir
-    try:
-        folder = Path(tempfile.mkdtemp(prefix=f"post_mortem_{name}_", dir=directory))
-        report = {**report, "config": _settings(model), "versions": versions}
-        (folder / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False))
-        if arrays:
-            np.savez_compressed(folder / archive, **arrays)  # type: ignore[arg-type]
-    except OSError as failure:
-        return f"the logs (a post-mortem could not be written: {failure})"
-    return str(folder)
-
-
-def _error(name: str, check: Check) -> NonFiniteError:
-    if math.isfinite(check.loss):
-        return NonFiniteError(f"gradient of the {name}", check.norm, int(check.update))
-    return NonFiniteError(name, check.loss, int(check.update))
-
-
-def _is_fused_adam(optimizer: th.optim.Optimizer) -> bool:
-    return type(optimizer) in (th.optim.Adam, th.optim.AdamW) and all(g.get("fused") for g in optimizer.param_groups)
-
-
-def _draw(model: "CuReSAC", batch_size: int, random_state: dict[str, Any]) -> Draw:
-    """Rows and environments of the batch that was just sampled."""
-    buffer: ReplayBuffer = model.replay_buffer  # type: ignore[assignment]
-    drawn = getattr(buffer, "last_sampled", None)
-    if drawn is None:
-        # SB3's buffers do not remember: draw again, but stop at the rows. The environments are drawn next.
-        now = np.random.get_state()
-        np.random.set_state(random_state)
-        try:
-            again = copy.copy(buffer)
-            again._get_samples = lambda rows, env=None: rows  # type: ignore[method-assign, assignment, return-value, misc]
-            rows: Any = again.sample(batch_size)
-            if isinstance(rows, np.ndarray):
-                drawn = rows, np.random.randint(0, high=buffer.n_envs, size=(len(rows),))
-        finally:
-            np.random.set_state(now)
-    rows, env_inds = drawn or (None, None)
-    return Draw(model._n_updates, model.num_timesteps, rows, env_inds)
-
-
-def _batch_of(model: "CuReSAC", draw: Draw) -> tuple[ReplayBufferSamples | None, str]:
-    """The batch, as the replay buffer has it now, and where it comes from."""
-    if draw.rows is not None and draw.env_inds is not None:
-        with contextlib.suppress(IndexError):
-            batch = transitions(model.replay_buffer, draw.rows, draw.env_inds, model._vec_normalize_env)  # type: ignore[arg-type]
-            return batch, "read again from the replay buffer; transitions may have been replaced since the update"
-    return None, "not known"
-
-
-def _settings(model: "CuReSAC") -> dict[str, Any]:
-    """Arguments of the constructor: plain ones as they are, others as they print."""
-    names = [*inspect.signature(type(model).__init__).parameters, *inspect.signature(SAC.__init__).parameters]
-    found = {name: getattr(model, name) for name in names if name != "env" and hasattr(model, name)}
-    found["policy"] = f"{model.policy_class.__module__}.{model.policy_class.__qualname__}"
-    return {name: _plain(value) for name, value in found.items()}
-
-
-def _plain(value: Any) -> Any:
-    """What strict JSON can hold."""
-    if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
-        return value
-    return repr(value)
-
-
-# ------------------------------------------------------------------- transitions
-
-
-def warn_of_dark_images(observation_space: spaces.Space, replay_buffer: ReplayBuffer) -> None:
-    """Floats in [0, 1] that an environment returns for a space of uint8 are cast without a word, to black.
-
-    :param observation_space: Observation space of the model
-    :param replay_buffer: What its environments have returned
-    """
-    stored = getattr(replay_buffer, "frames", getattr(replay_buffer, "observations", None))
-    if not is_image_space(observation_space) or not isinstance(stored, np.ndarray):
-        return
-    # What is not written yet is zero. (A row needs several frames, of which the first may be VecFrameStack's zeros.)
-    brightest = int(stored[:1000].max())
-    if brightest <= 1:
-        warnings.warn(
-            f"no pixel of the images so far is brighter than {brightest} of 255, so that the policy sees black: if the "
-            "environment returns floats in [0, 1], return (255 * image).astype(np.uint8) instead.",
-            stacklevel=2,
-        )
-
-
-class TransitionGuard:
-    """Looks at what environments return before it is stored or shown to the policy: all has to be finite as float32.
-
-    With ``skip`` a bad transition is marked in its info (``"bad_transition"``: why), by which replay buffers know never
-    to sample it; finite numbers are stored in its place, and the policy goes on with the last good observation. The
-    transition that starts from such a stand-in is as bad.
-
-    :param skip: Whether bad transitions are left out rather than an error
-    """
-
-    def __init__(self, skip: bool):
-        self.skip = skip
-        #: Whether that could be asked for
-        self.can_skip = True
-        #: How many transitions were left out
-        self.n_bad = 0
-        self._warned: set[str] = set()
-        # The latest observations that were looked at, and of which environments they are stand-ins
-        self._seen: Observations | None = None
-        self._stand_ins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        # Whether the latest observations come from a state, so that only their values tell them
-        self._restored = False
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: What the transitions to come depend on, between two steps: plain values and arrays
-        """
-        seen = self._seen if self._stand_ins.any() else None
-        return {
-            "n_bad": self.n_bad,
-            "warned": sorted(self._warned),
-            "stand_ins": [bool(stand_in) for stand_in in self._stand_ins],
-            # Observations without stand-ins can be looked at again.
-            "seen": {key: value.copy() for key, value in seen.items()} if isinstance(seen, dict) else copy.copy(seen),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Of ``state_dict``; where the policy then does not see the same observations, as after a reset,
-            nothing is a stand-in
-        """
-        self.n_bad = state["n_bad"]
-        self._warned = set(state["warned"])
-        self._stand_ins = np.array(state["stand_ins"], dtype=bool)
-        self._seen, self._restored = state["seen"], True
-
-    def admit_first(self, observations: Observations, original: Observations | None, timestep: int) -> Observations:
-        """
-        :param observations: What the policy is about to see, [n_envs, ...]; news after a reset only
-        :param original: The same before ``VecNormalize``, if there is one
-        :param timestep: Agent steps so far, for the message
-        :return: The same, with zeros in place of what is not finite
-        :raises BadTransitionError: if something is not finite and must not be skipped
-        """
-        if observations is self._seen or (self._restored and _equal(observations, self._seen)):
-            self._seen, self._restored = observations, False
-            return observations
-        self._restored = False
-        bad = _not_finite(observations) | (False if original is None else _not_finite(original))
-        for i in map(int, np.flatnonzero(bad)):
-            self._complain("first observation", i, (_row(observations, i), _row(original, i)), timestep)
-        if bad.any():
-            observations = _replaced(observations, bad, None)
-        self._seen, self._stand_ins = observations, bad
-        return observations
-
-    def admit(
-        self,
-        last_obs: Observations,
-        new_obs: Observations,
-        rewards: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-        timestep: int,
-        normalized: bool = False,
-    ) -> tuple[Observations, np.ndarray, list[dict[str, Any]]]:
-        """
-        :param last_obs: Observations on which the agent acted, [n_envs, ...]
-        :param new_obs: Observations that followed; where an episode ended, the first of the next
-        :param rewards: Rewards, [n_envs]
-        :param dones: Whether the episode ended, [n_envs]
-        :param infos: One dictionary per environment
-        :param timestep: Agent steps so far, for the message
-        :param normalized: Whether ``VecNormalize`` has made them of others that are finite
-        :return: New observations, rewards and infos that are fit to be stored
-        :raises BadTransitionError: if something is not finite and must not be skipped
-        """
-        ends = {int(i): infos[i].get("terminal_observation") for i in np.flatnonzero(dones)}
-        if rewards.dtype == object:  # of worker processes, one of which returned None
-            rewards = rewards.astype(np.float32)
-        bad_rewards, bad_obs = _not_finite(rewards), _not_finite(new_obs)
-        bad_ends = [i for i, end in ends.items() if end is not None and _first_bad(end) is not None]
-        stand_ins = self._stand_ins if last_obs is self._seen else np.zeros(len(dones), dtype=bool)
-        self._seen, self._stand_ins = new_obs, bad_obs
-        if not (bad_ends or (bad_rewards | bad_obs | stand_ins).any()):
-            return new_obs, rewards, infos
-
-        reasons: dict[int, str] = {}
-        for i in range(len(dones)):
-            if stand_ins[i]:
-                reasons[i] = f"environment {i} returned no finite observation before agent step {timestep}"
-            if bad_rewards[i]:
-                reasons[i] = self._complain("reward", i, rewards[i], timestep, normalized)
-            if bad_obs[i]:
-                reason = self._complain("observation", i, _row(new_obs, i), timestep, normalized)
-                if ends.get(i) is None:
-                    reasons[i] = reason
-            if i in bad_ends:
-                reasons[i] = self._complain("terminal observation", i, ends[i], timestep, normalized)
-        self.n_bad += len(reasons)
-        infos = [{**info, "bad_transition": reasons[i]} if i in reasons else info for i, info in enumerate(infos)]
-        for i in bad_ends:
-            infos[i]["terminal_observation"] = _row(last_obs, i)
-        self._seen = _replaced(new_obs, bad_obs, last_obs)
-        return self._seen, np.where(bad_rewards, 0, rewards).astype(rewards.dtype), infos
-
-    def _complain(self, kind: str, env: int, value: Any, timestep: int, normalized: bool = False) -> str:
-        """Raise, or warn of the first of a kind, and return what is wrong."""
-        what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
-        source = "VecNormalize made" if normalized else f"environment {env} returned"
-        reason = f"{source} {what} at agent step {timestep}, but {kind}s must be finite in float32"
-        if not self.skip:
-            fix = "fix the environment"
-            if normalized:
-                fix = "make a new VecNormalize, or load one: its statistics have taken a value that was not finite"
-            elif self.can_skip:
-                fix += ", or leave such transitions out with on_bad_transition='skip'"
-            raise BadTransitionError(reason, "it was not stored", fix)
-        if kind not in self._warned:
-            self._warned.add(kind)
-            warnings.warn(
-                f"{reason}: the transition is left out (on_bad_transition='skip'), and rollout/bad_transitions counts "
-                "this and others; fix the environment.",
-                stacklevel=2,
-            )
-        return reason
-
-
-def _arrays(values: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    """Those in nested dictionaries, by the names on the way."""
-    found: dict[str, np.ndarray] = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            found |= _arrays(value, f"{prefix}{name}.")
-        elif isinstance(value, np.ndarray):
-            found[prefix + name] = value
-    return found
-
-
-def _not_finite(values: Observations) -> npt.NDArray[np.bool_]:
-    """Rows in which a number is not finite, [n]."""
-    if isinstance(values, dict):
-        return np.logical_or.reduce([_not_finite(value) for value in values.values()])
-    if not np.issubdtype(values.dtype, np.floating):
-        return np.zeros(len(values), dtype=bool)
-    return ~np.logical_and.reduce(_is_finite(values.reshape(len(values), -1)), axis=1)
-
-
-def _is_finite(numbers: np.ndarray) -> npt.NDArray[np.bool_]:
-    """As float32, in which rewards are stored and networks compute: 1e39 is not."""
-    with np.errstate(over="ignore"):
-        return np.isfinite(numbers.astype(np.float32, copy=False))
-
-
-def _equal(one: Observations, other: Observations | None) -> bool:
-    if isinstance(one, dict):
-        return isinstance(other, dict) and one.keys() == other.keys() and all(_equal(one[k], other[k]) for k in one)
-    return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
-
-
-def _first_bad(value: Any) -> float | None:
-    """The first number that is not finite in an array, or in nested ones."""
-    if isinstance(value, dict | tuple):
-        found = map(_first_bad, value.values() if isinstance(value, dict) else value)
-        return next((bad for bad in found if bad is not None), None)
-    numbers = np.ravel([] if value is None else value)
-    bad = numbers[~_is_finite(numbers)]
-    return float(bad[0]) if len(bad) > 0 else None
-
-
-def _row(values: Observations | None, i: int) -> Any:
-    if values is None:
-        return None
-    return {key: value[i] for key, value in values.items()} if isinstance(values, dict) else values[i]
-
-
-def _replaced(values: Observations, rows: npt.NDArray[np.bool_], by: Any) -> Any:
-    """A copy with these rows of others, or with zeros in them."""
-    if isinstance(values, dict):
-        return {key: _replaced(value, rows, None if by is None else by[key]) for key, value in values.items()}
-    values = values.copy()
-    values[rows] = 0 if by is None else by[rows]
-    return values
-
-
-def check_actions(actions: np.ndarray, timestep: int) -> None:
-    """
-    :param actions: Actions of one step, [n_envs, ...]
-    :param timestep: Agent steps so far, for the message
-    :raises BadTransitionError: if one is not finite
-    """
-    for i in np.flatnonzero(_not_finite(actions)):
-        raise BadTransitionError(
-            f"the agent chose the action {actions[i]} for environment {i} at agent step {timestep}, but actions must "
-            "be finite",
-            "it was not executed",
-            "check action_noise and the policy's parameters, and load an earlier model if these are not finite",
-        )
-
-
-@contextlib.contextmanager
-def post_mortem_of_a_step(model: "CuReSAC", **seen: Any) -> Iterator[None]:
-    """What is not finite in a step of the environments is found in this context, and its post-mortem written.
-
-    :param model: The model
-    :param seen: What there is of the step: arrays are kept, also those in dictionaries
-    :raises BadTransitionError: which says where the post-mortem lies
-    """
-    try:
-        yield
-    except BadTransitionError as error:
-        report = {"source": error.reason, "agent_steps": model.num_timesteps}
-        error.post_mortem = _write_post_mortem(model, f"step_{model.num_timesteps}", report, "step.npz", _arrays(seen))
+        (path / "report.json").write_text(json.dumps(about, indent=2))
+        arrays = {name: value.cpu().numpy() for name, value in batch._asdict().items() if isinstance(value, th.Tensor)}
+        np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
+        error.crash_report = str(path)
         raise

@@ -47,9 +47,8 @@ def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
     smallest = 4 * n_layers - 1
     if min(height, width) < smallest:
         raise ValueError(
-            f"observations of {height}x{width} pixels are too small for {n_layers} convolutions of 3x3 (the first "
-            f"with stride 2), which need at least {smallest}x{smallest}: use a larger image_size, or fewer layers "
-            "through policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=...))."
+            f"observations of {height}x{width} pixels are too small for {n_layers} convolutions, which need at least "
+            f"{smallest}x{smallest}: use larger images, or fewer layers (n_layers in features_extractor_kwargs)."
         )
     sizes = [(height, width), ((height - 3) // 2 + 1, (width - 3) // 2 + 1)]
     for _ in range(n_layers - 1):
@@ -77,6 +76,18 @@ def preprocess(observations: th.Tensor, observation_space: spaces.Space) -> th.T
 def full_precision(tensor: th.Tensor) -> th.autocast:
     """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
     return th.autocast(tensor.device.type, enabled=False)
+
+
+class FullPrecisionLinear(nn.Linear):
+    """A linear map outside of autocast: in bf16, 1.000 and 1.003 of a vector would be the same number."""
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [B, in_features]
+        :return: fp32, [B, out_features]
+        """
+        with full_precision(inputs):
+            return super().forward(inputs.float())
 
 
 class ConvTranspose2d(nn.ConvTranspose2d):
@@ -111,12 +122,8 @@ class Projection(nn.Module):
 
     def __init__(self, in_dim: int, out_dim: int, tanh: bool = True):
         super().__init__()
-        if out_dim < 3:
-            raise ValueError(
-                f"features_dim is {out_dim}, but LayerNorm leaves of one number a constant and of two only which of "
-                "them is larger, so that nothing is learned: use a features_dim of at least 3, or another "
-                "features_extractor_class."
-            )
+        if out_dim < 3:  # of one number LayerNorm leaves a constant, of two only which of them is larger
+            raise ValueError(f"features_dim is {out_dim}, of which LayerNorm leaves nothing to learn: use at least 3.")
         self.linear = nn.Linear(in_dim, out_dim)
         self.norm = nn.LayerNorm(out_dim)
         self.tanh = tanh

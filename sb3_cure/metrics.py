@@ -4,12 +4,14 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_cure.buffers import Samples, frame_stack_of
 from sb3_cure.policies import CuRePolicy
-from sb3_cure.values import is_integer
+
+#: Updates between two pictures of reconstructions
+RECONSTRUCTION_INTERVAL = 1000
 
 
 class Metrics(KVWriter):
@@ -24,11 +26,14 @@ class Metrics(KVWriter):
         self.latest: dict[str, th.Tensor] = {}
         self._sums: dict[str, th.Tensor] = {}
         self._counts: dict[str, int] = {}
+        self._next_picture = 0
+        self._logger: Logger | None = None
 
     def attach(self, logger: Logger) -> None:
         """
         :param logger: SB3's logger; a new one starts with empty averages, attaching twice changes nothing
         """
+        self._logger = logger
         if self not in logger.output_formats:
             # In the place of another model's, which would write averages of its own under the same names.
             others = [output for output in logger.output_formats if not isinstance(output, Metrics)]
@@ -36,16 +41,33 @@ class Metrics(KVWriter):
             self._sums.clear()
             self._counts.clear()
 
-    def record(self, logger: Logger, values: dict[str, th.Tensor]) -> None:
+    def record(self, values: dict[str, th.Tensor], agent: str = "task") -> None:
         """
-        :param logger: SB3's logger
-        :param values: Scalars by key, detached
+        :param values: Scalars by name
+        :param agent: Whose they are: SB3's names are the task agent's, the curious one's are marked
         """
-        for key, value in values.items():
+        prefix = "train/" if agent == "task" else f"train/{agent}_"
+        for name, value in values.items():
+            key = prefix + name
             self.latest[key] = value = value.detach()
             self._sums[key] = self._sums[key] + value if key in self._sums else value
             self._counts[key] = self._counts.get(key, 0) + 1
-            logger.record(key, value)
+            if self._logger is not None:
+                self._logger.record(key, value)
+
+    def log_reconstructions(self, model: OffPolicyAlgorithm, batch: Samples) -> None:
+        """Now and then, for loggers that keep pictures (TensorBoard).
+
+        :param model: The model
+        :param batch: The samples that it has just learned from
+        """
+        keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
+        if keeps and model._n_updates >= self._next_picture:
+            self._next_picture = model._n_updates + RECONSTRUCTION_INTERVAL
+            strip = reconstruction_strip(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
+            if strip is not None:
+                image = Image(strip, "CHW")
+                model.logger.record("srl/reconstructions", image, exclude=("stdout", "log", "json", "csv"))
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Called by the logger before the formats that write."""
@@ -60,9 +82,7 @@ class Metrics(KVWriter):
 
 
 @th.no_grad()
-def reconstruction_strip(
-    policy: CuRePolicy, batch: ReplayBufferSamples, frame_stack: int, columns: int = 8
-) -> np.ndarray | None:
+def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
     """Newest frames of a few observations above their reconstructions.
 
     :param policy: The policy, whose encoder and SRL head are used
@@ -77,7 +97,7 @@ def reconstruction_strip(
     drawn = policy.srl.reconstruct(policy.encode(observations))
     if drawn is None:
         return None
-    return image_strip(observations, drawn, frame_stack)
+    return image_strip(policy.augmentation.center(observations), drawn, frame_stack)
 
 
 def image_strip(observed: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.ndarray:
@@ -102,24 +122,3 @@ def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
     if channels not in (1, 3):
         channels = 1
     return images[:, -channels:].to(th.uint8)
-
-
-def frame_stack_of(env: VecEnv) -> int:
-    """
-    :param env: Environments
-    :return: Frames per observation, as they and SB3's ``VecFrameStack`` around them tell; 1 where nothing tells
-    """
-    stacked = unwrap_vec_wrapper(env, VecFrameStack)
-    own = told_frame_stack(env) or 1
-    return own if stacked is None else own * stacked.stacked_obs.n_stack
-
-
-def told_frame_stack(env: VecEnv) -> int | None:
-    """
-    :param env: Environments, channels first
-    :return: Frames per observation, as the environments tell in ``frame_stack`` (those of this package do); None where
-        that cannot be meant
-    """
-    told: Any = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else None
-    shape = env.observation_space.shape or ()
-    return int(told) if is_integer(told, 1) and (len(shape) != 3 or shape[0] % told == 0) else None

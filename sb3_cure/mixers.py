@@ -1,56 +1,82 @@
-"""Which actor acts: at every step of every environment the curious one with probability p_c (Algorithm 1)."""
+"""Who acts: the task actor or the curious one (Algorithm 1 of the paper), and for how long."""
+
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from stable_baselines3.common.type_aliases import Schedule
-
-from sb3_cure.values import is_number
 
 
 class CuriousMixer:
     """Draws, per environment and step, whether the curious actor acts.
 
-    :param probability: p_c in [0, 1], or a schedule of the remaining progress (1 at the start, 0 at the end)
-    :param seed: Seed of the mixer's own random stream
-    :raises ValueError: if p_c is outside [0, 1]
+    Each environment redraws who acts (the curious actor with probability p_c) at every reset and with probability 1/L
+    in every other step. L = 1 is the paper's coin. A curious stretch lasts L / (1 - p_c) steps on average, unless the
+    episode ends.
+
+    :param seed: Seed of the mixer's own random stream, so that runs of one seed draw alike whatever else they draw
     """
 
-    def __init__(self, probability: float | Schedule, seed: int | None = None):
-        self.probability = probability
+    def __init__(self, seed: int | None = None):
         self.rng = np.random.default_rng(seed)
+        #: Who acts in each environment, [n_envs]; empty before the first step
+        self.curious: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        #: Where an episode begins with the next step, [n_envs]
+        self.starts: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
         self.n_steps = 0
         self.n_curious = 0
-        self.current_probability(1.0)
+        self.n_bouts = 0
 
-    def current_probability(self, progress_remaining: float) -> float:
-        """
-        :param progress_remaining: 1 at the start of training, 0 at its end
-        :return: p_c now
-        :raises ValueError: if a schedule leaves [0, 1]
-        """
-        schedule = self.probability
-        probability = schedule(progress_remaining) if callable(schedule) else schedule
-        if not is_number(probability, 0, 1):
-            raise ValueError(
-                f"curiosity_prob is {probability!r} (progress remaining {progress_remaining:.2f}), but it is the "
-                "probability p_c with which the curious actor acts: give a number, or a schedule, within [0, 1]."
-            )
-        return float(probability)
-
-    def choose(self, n_envs: int, progress_remaining: float) -> np.ndarray:
+    def choose(self, n_envs: int, probability: float | Schedule, bout: float | str, progress: float) -> np.ndarray:
         """
         :param n_envs: Number of environments
-        :param progress_remaining: 1 at the start of training, 0 at its end
-        :return: Boolean array [n_envs]: True where the curious actor acts
+        :param probability: p_c in [0, 1], or a schedule of the remaining progress
+        :param bout: L >= 1 in agent steps, or ``"episode"``: redraw at resets only
+        :param progress: Remaining progress: 1 at the start of training, 0 at its end
+        :return: Where the curious actor acts, [n_envs]
+        :raises ValueError: if a schedule leaves [0, 1]
         """
-        curious = self.rng.random(n_envs) < self.current_probability(progress_remaining)
+        p = float(probability(progress) if callable(probability) else probability)
+        if not 0 <= p <= 1:
+            raise ValueError(
+                f"curiosity_prob is {p} at a remaining progress of {progress:.2f}, but lies within [0, 1]."
+            )
+        if len(self.curious) != n_envs:
+            self.curious, self.starts = np.zeros(n_envs, dtype=bool), np.ones(n_envs, dtype=bool)
+        before = self.curious & ~self.starts
+        if bout == 1:
+            self.curious = self.rng.random(n_envs) < p
+        else:
+            redraws = self.starts if bout == "episode" else self.starts | (self.rng.random(n_envs) < 1 / float(bout))
+            self.curious = np.where(redraws, self.rng.random(n_envs) < p, self.curious)
+        self.starts = np.zeros(n_envs, dtype=bool)
         self.n_steps += n_envs
-        self.n_curious += int(curious.sum())
-        return curious
+        self.n_curious += int(self.curious.sum())
+        self.n_bouts += int((self.curious & ~before).sum())
+        return self.curious
 
-    def pop_share(self) -> float:
+    def pop_metrics(self) -> dict[str, float]:
         """
-        :return: Share of curious steps since the last call, in [0, 1] (NaN if there were no steps)
+        :return: Share of curious steps since the last call, in [0, 1], and the mean length of curious stretches in
+            agent steps, by their logged names; empty if there were no steps
         """
-        share = self.n_curious / self.n_steps if self.n_steps else float("nan")
-        self.n_steps = self.n_curious = 0
-        return share
+        if self.n_steps == 0:
+            return {}
+        metrics = {"rollout/curious_share": self.n_curious / self.n_steps}
+        if self.n_bouts > 0:
+            metrics["rollout/curious_bout"] = self.n_curious / self.n_bouts
+        self.n_steps = self.n_curious = self.n_bouts = 0
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: All that the draws to come depend on
+        """
+        return {**vars(self), "rng": self.rng.bit_generator.state}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``state_dict``
+        """
+        self.rng.bit_generator.state = state["rng"]
+        vars(self).update({name: value for name, value in state.items() if name != "rng"})

@@ -5,25 +5,26 @@ import copy
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
-from stable_baselines3.common.preprocessing import get_obs_shape, is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.policies import BaseModel, BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.sac.policies import Actor, SACPolicy
+from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-from sb3_cure.curiosity import CuriousReward
-from sb3_cure.encoder_optimizer import EncoderOptimizer
+from sb3_cure.augmentations import make_augmentation
+from sb3_cure.critics import LatentCritic, TwinQ
+from sb3_cure.encoder_update import EncoderUpdate
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
+from sb3_cure.intrinsic import IntrinsicReward, RewardScale
 from sb3_cure.layers import Projection, full_precision, init_weights, preprocess
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
-from sb3_cure.values import check_optimizer_kwargs
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -38,13 +39,7 @@ class TrunkActor(Actor):
         """
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation before squashing, [B, action_dim] each
-        :raises ValueError: if it is given observations, as SB3's actors are
         """
-        if obs.ndim != 2:  # type: ignore[union-attr]
-            raise ValueError(
-                f"the actor got {obs.ndim} dimensions, but it reads the shared encoder's features: call the policy, or "  # type: ignore[union-attr]
-                "sb3_cure.deployment.DeterministicActor(model) for actions of observations."
-            )
         latent = self.latent_pi(self.features_extractor(obs))
         with full_precision(latent):
             latent = latent.float()
@@ -56,7 +51,7 @@ class TrunkActor(Actor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param obs: Trunk features of the encoder, [B, trunk_dim]
-        :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B]
+        :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B, 1]
         """
         mean, log_std, _ = self.get_action_dist_params(obs)
         # What SB3's SquashedDiagGaussianDistribution computes; torch's Normal would read its arguments to check them,
@@ -65,69 +60,106 @@ class TrunkActor(Actor):
             noise = th.randn_like(mean)
             actions = th.tanh(mean + noise * log_std.exp())
             log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - log_std
-            return actions, (log_prob - th.log(1 - actions.square() + EPSILON)).sum(dim=1)
+            return actions, (log_prob - th.log(1 - actions.square() + EPSILON)).sum(dim=1, keepdim=True)
 
 
-class LatentCritic(ContinuousCritic):
-    """SAC's critics on the latents of the shared encoder, which they do not own."""
+class ActorCritic(nn.Module):
+    """One agent on the shared encoder: actor, critics, target critics and temperature, with their optimisers.
 
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+    :param actor: The actor, with its optimiser
+    :param critic: The critics, with their optimiser
+    """
+
+    def __init__(self, actor: TrunkActor, critic: LatentCritic):
+        super().__init__()
+        self.actor = actor
+        self.critic = critic
+        self.critic_target = copy.deepcopy(critic).requires_grad_(False).eval()
+        #: Logarithm of the learned temperature, [1], and its optimiser; None where it is fixed
+        self.log_ent_coef: th.Tensor | None = None
+        self.ent_coef_optimizer: th.optim.Optimizer | None = None
+        #: The fixed temperature, []
+        self.ent_coef_tensor: th.Tensor | None = None
+
+    def set_temperature(self, ent_coef: str | float, lr: float, device: th.device) -> None:
+        """Make a temperature of its own, as SB3's SAC does.
+
+        :param ent_coef: ``"auto"``, ``"auto_<initial value>"``, or a fixed number
+        :param lr: Learning rate
+        :param device: Where to put it
         """
-        :param obs: Latents, [B, features_dim]
-        :param actions: [B, action_dim], in [-1, 1]
-        :return: Q values of each critic, [B, 1]
+        if isinstance(ent_coef, str) and ent_coef.startswith("auto"):
+            initial = float(ent_coef.split("_")[1]) if "_" in ent_coef else 1.0
+            self.adopt_temperature(th.full((1,), initial, device=device).log().requires_grad_(True), lr)
+        else:
+            self.ent_coef_tensor = th.tensor(float(ent_coef), device=device)
+
+    def adopt_temperature(self, log_ent_coef: th.Tensor, lr: float) -> None:
+        """Take a learned temperature, with the reference's optimiser (SAC-AE: beta1 = 0.5).
+
+        :param log_ent_coef: Logarithm of the temperature, [1]
+        :param lr: Learning rate
         """
-        inputs = th.cat([obs, actions], dim=1)
-        return tuple(self._q_value(q_net, inputs) for q_net in self.q_networks)
+        self.log_ent_coef = log_ent_coef
+        self.ent_coef_optimizer = th.optim.Adam([log_ent_coef], lr=lr, betas=(0.5, 0.999), fused=True)
 
-    @staticmethod
-    def _q_value(q_net: nn.Module, inputs: th.Tensor) -> th.Tensor:
-        *hidden, output = q_net.children()
-        for layer in hidden:
-            inputs = layer(inputs)
-        with full_precision(inputs):
-            return output(inputs.float())
+    def temperature(self) -> th.Tensor:
+        """
+        :return: Temperature alpha, detached, [1] or []
+        """
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()  # type: ignore[return-value]
+
+    def train(self, mode: bool = True) -> "ActorCritic":
+        """
+        :param mode: Whether layers behave as in training; those of the target critics never do
+        :return: self
+        """
+        super().train(mode)
+        self.critic_target.train(False)
+        return self
 
 
-class CuRePolicy(SACPolicy):
-    """All networks of CuReSAC and their optimisers.
+class CuRePolicy(BasePolicy):
+    """All networks of CuRe and their optimisers.
 
-    ``encoder`` is trained by the SRL head and by the critics; actors see its trunk's features detached. With
-    ``curious=True`` there is a second actor-critic. Names: ``encoder``, ``encoder_target``, ``srl``, ``actor``,
-    ``critic``, ``critic_target``, ``curious_actor``, ``curious_critic``, ``curious_critic_target``, ``curiosity``
-    (scale and running statistics of the curious reward), ``encoder_optimizer``.
+    ``encoder`` (with its moving average ``encoder_target``) is trained by the SRL head ``srl`` and by the critics;
+    actors see its trunk's features detached. ``task`` is the task's actor-critic, ``curious`` the curious one or None;
+    ``actor``, ``critic`` and ``critic_target`` are the task's. ``intrinsic`` computes the intrinsic reward, ``scale``
+    scales it. ``augmentation`` says what the encoder sees, ``encoder_update`` how it is stepped.
 
     :param observation_space: Observation space (channels-first images, or vectors)
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden layers of actors and critics (paper: 1024; two of them in SAC-AE)
     :param activation_fn: Activation function
-    :param use_sde: Accepted because SB3 passes it; must be False
+    :param use_sde: Accepted because SB3 passes it
     :param features_extractor_class: ``PixelEncoder``, ``VectorEncoder`` or any SB3 ``BaseFeaturesExtractor``
     :param features_extractor_kwargs: Its arguments
-    :param normalize_images: Must be True: heads and encoder read images in 0-255
     :param optimizer_class: Optimiser of everything, ``th.optim.Adam`` by default
     :param optimizer_kwargs: Its arguments but for the learning rate
-    :param n_critics: Number of critics of each agent
-    :param share_encoder: Must be True; it asks for this policy where neither SRL nor curiosity does
+    :param share_encoder: Asks for this policy where neither SRL nor curiosity does
     :param srl_class: Class of the SRL head, or None
     :param srl_kwargs: Its arguments
-    :param curious: Whether there is a second, curious actor-critic
-    :param curiosity_kwargs: Arguments of ``CuriousReward``
+    :param augmentation: ``"auto"`` (what the head asks for), ``"shift"``, ``"crop"`` or None
+    :param augmentation_kwargs: Its arguments
+    :param intrinsic_class: Class of the intrinsic reward, or None
+    :param intrinsic_kwargs: Its arguments
+    :param curious: Whether there is a curious actor-critic
     :param encoder_sources: Which losses train the encoder
-    :param update: ``"sequential"`` or ``"joint"``, see ``EncoderOptimizer``
-    :param acting: Who acts in ``predict``: ``"actor"`` or ``"curious_actor"``
+    :param update: ``"sequential"`` or ``"joint"``, see ``EncoderUpdate``
+    :param default_agent: Who acts in ``predict``: ``"task"`` or ``"curious"``
+    :param critic_kwargs: Arguments of the critics: ``n_critics``, and TQC's ``n_quantiles``
     """
+
+    critics: ClassVar[type[TwinQ]] = TwinQ
+    #: By default for vectors or for images
+    default_encoder: ClassVar[type[BaseFeaturesExtractor]] = PixelEncoder
 
     encoder: Encoder
     encoder_target: Encoder
     srl: SRLHead | None
-    actor: TrunkActor
-    critic: LatentCritic
-    critic_target: LatentCritic
-    curious_actor: TrunkActor
-    curious_critic: LatentCritic
-    curious_critic_target: LatentCritic
+    intrinsic: IntrinsicReward | None
+    curious: ActorCritic | None
 
     def __init__(
         self,
@@ -137,130 +169,186 @@ class CuRePolicy(SACPolicy):
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         use_sde: bool = False,
-        features_extractor_class: type[BaseFeaturesExtractor] = PixelEncoder,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
-        normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
-        n_critics: int = 2,
         share_encoder: bool = True,
+        *,
         srl_class: type[SRLHead] | None = None,
         srl_kwargs: dict[str, Any] | None = None,
+        augmentation: str | None = "auto",
+        augmentation_kwargs: dict[str, Any] | None = None,
+        intrinsic_class: type[IntrinsicReward] | None = None,
+        intrinsic_kwargs: dict[str, Any] | None = None,
         curious: bool = False,
-        curiosity_kwargs: dict[str, Any] | None = None,
         encoder_sources: tuple[str, ...] = ("task",),
         update: str = "joint",
-        acting: str = "actor",
+        default_agent: str = "task",
+        **critic_kwargs: Any,
     ):
-        if not (normalize_images and share_encoder) or use_sde:
-            raise ValueError(
-                f"policy_kwargs got normalize_images={normalize_images}, share_encoder={share_encoder}, "
-                f"use_sde={use_sde}, but the shared encoder reads images in 0-255 and has no gSDE: leave them out, or "
-                "use srl=None and curiosity=None, which is SB3's own SAC."
-            )
-        # SACPolicy builds within its constructor: what _build needs comes first.
-        self._blueprint: dict[str, Any] = dict(
-            srl_class=srl_class,
-            srl_kwargs=srl_kwargs or {},
-            curious=curious,
-            curiosity_kwargs=curiosity_kwargs or {},
-            encoder_sources=encoder_sources,
-            update=update,
-            acting=acting,
-        )
         super().__init__(
             observation_space,
             action_space,
-            lr_schedule,
-            [1024, 1024] if net_arch is None else net_arch,
-            activation_fn,
-            features_extractor_class=features_extractor_class,
-            features_extractor_kwargs=features_extractor_kwargs,
+            features_extractor_class or self.default_encoder,
+            features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
-            n_critics=n_critics,
+            squash_output=True,
         )
-
-    def _build(self, lr_schedule: Schedule) -> None:
-        blueprint = self._blueprint
+        self.net_arch = [1024, 1024] if net_arch is None else net_arch
+        self.activation_fn = activation_fn
+        self.critic_kwargs = {"n_critics": 2, **critic_kwargs}
+        #: Who acts in ``predict``
+        self.default_agent = default_agent
         if self.optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & self.optimizer_kwargs.keys():
             # One pass over memory per parameter instead of a dozen; the same update.
             self.optimizer_kwargs = {"fused": True, **self.optimizer_kwargs}
         self.learning_rate = lr_schedule(1)
-        self._build_encoder(blueprint["srl_class"], blueprint["srl_kwargs"])
-        self.actor, self.critic, self.critic_target = self._make_actor_critic()
-        # Always there, as the same buffers then travel with every archive; it costs three numbers.
-        self.curiosity = CuriousReward(**blueprint["curiosity_kwargs"])
-        self._acting = blueprint["acting"]
-        self.remove_curious_agent()
-        if blueprint["curious"]:
-            self.add_curious_agent()
-        self.encoder_optimizer = EncoderOptimizer(
-            self.encoder,
-            blueprint["encoder_sources"],
-            blueprint["update"],
-            self.optimizer_class,
-            lr=self.learning_rate,
-            **self.optimizer_kwargs,
+        # What `_get_constructor_parameters` gives back
+        self._choices: dict[str, Any] = dict(
+            srl_class=srl_class,
+            srl_kwargs=srl_kwargs,
+            augmentation=augmentation,
+            augmentation_kwargs=augmentation_kwargs,
+            intrinsic_class=intrinsic_class,
+            intrinsic_kwargs=intrinsic_kwargs,
+            encoder_sources=encoder_sources,
+            update=update,
+        )
+        if augmentation == "auto":
+            augmentation = None if srl_class is None else srl_class.choose_augmentation(observation_space)
+        self.augmentation = make_augmentation(augmentation, observation_space, **(augmentation_kwargs or {}))
+        self._build_encoder(srl_class, srl_kwargs or {})
+        self.task = self._make_actor_critic()
+        self.curious = self.intrinsic = None
+        # Always there, as the same buffers then travel with every archive; it costs two numbers.
+        self.scale = RewardScale()
+        if intrinsic_class is not None:
+            self._build_intrinsic(intrinsic_class, intrinsic_kwargs or {})
+        if curious:
+            self.curious = self._make_actor_critic()
+        self.encoder_update = EncoderUpdate(
+            self.encoder, encoder_sources, update, optimizer_class, lr=self.learning_rate, **self.optimizer_kwargs
         )
 
     def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
-        space = self.observation_space
-        defaults: dict[str, Any] = {}
-        if srl_class is not None:
-            space, defaults = srl_class.configure_encoder(self.observation_space, **srl_kwargs)
-        if not issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
-            defaults = {}
-        self.encoder_space = space
-        kwargs = {**defaults, **self.features_extractor_kwargs}
-        self.encoder = make_encoder(self.features_extractor_class, space, **kwargs)
+        kwargs = self.features_extractor_kwargs
+        if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
+            kwargs = {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
+        self.encoder = make_encoder(self.features_extractor_class, self.augmentation.view_space, **kwargs)
         self.encoder_target = copy.deepcopy(self.encoder).requires_grad_(False)
         self.srl = None
-        head_seed = int(th.randint(2**62, ()))
+        seed = int(th.randint(2**62, ()))
         if srl_class is not None:
-            # By random numbers of its own, so that under every head the other networks of a seed begin alike.
-            with th.random.fork_rng(devices=()):
-                th.default_generator.manual_seed(head_seed)
+            with _seeded(seed):
                 self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
-            check_optimizer_kwargs(f"{srl_class.__name__}.optimizer_kwargs", self.srl.optimizer_kwargs)
-            self.srl.bind_target_encoder(self.encoder_target)
+            self.srl.bind(self.encoder_target, self.augmentation)
             # A head may hold the encoder as a part of its own: it is the encoder's optimiser that trains it.
             shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))
             parameters = [parameter for parameter in self.srl.parameters() if id(parameter) not in shared]
             # A head without parameters (say, one that scores latents) has nothing to optimise.
             self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None
+        self._intrinsic_seed = seed + 1
 
-    def _make_actor_critic(self) -> tuple[TrunkActor, LatentCritic, LatentCritic]:
+    def _build_intrinsic(self, intrinsic_class: type[IntrinsicReward], kwargs: dict[str, Any]) -> None:
+        with _seeded(self._intrinsic_seed):
+            self.intrinsic = intrinsic_class(
+                self.observation_space,
+                self.action_space,  # type: ignore[arg-type]
+                self.encoder.features_dim,
+                **kwargs,
+            )
+        parameters = list(self.intrinsic.parameters())
+        self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
+
+    def _make_actor_critic(self) -> ActorCritic:
         encoder = self.encoder
+        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
         tanh = getattr(encoder.projection, "tanh", True)
         actor = TrunkActor(
-            **self.actor_kwargs,  # type: ignore[arg-type]
-            features_extractor=Projection(encoder.trunk_dim, encoder.features_dim, tanh),
-            features_dim=encoder.features_dim,
+            self.observation_space,
+            self.action_space,  # type: ignore[arg-type]
+            actor_arch,
+            Projection(encoder.trunk_dim, encoder.features_dim, tanh),
+            encoder.features_dim,
+            activation_fn=self.activation_fn,
         )
-        critic = LatentCritic(
-            **self.critic_kwargs,  # type: ignore[arg-type]
-            features_extractor=nn.Identity(),  # type: ignore[arg-type]
-            features_dim=encoder.features_dim,
+        action_dim = get_action_dim(self.action_space)
+        critic = self.critics.make(
+            encoder.features_dim, action_dim, critic_arch, self.activation_fn, **self.critic_kwargs
         )
-        init_weights(actor).to(self.device)
-        init_weights(critic).to(self.device)
-        target = copy.deepcopy(critic).requires_grad_(False)
-        target.set_training_mode(False)
+        agent = ActorCritic(init_weights(actor), init_weights(critic)).to(self.device)
         actor.optimizer = self._make_optimizer(actor.parameters())
         critic.optimizer = self._make_optimizer(critic.parameters())
-        return actor, critic, target
+        return agent
 
     def _make_optimizer(self, parameters: Any, **kwargs: Any) -> th.optim.Optimizer:
         return self.optimizer_class(parameters, lr=self.learning_rate, **{**self.optimizer_kwargs, **kwargs})  # type: ignore[call-arg]
 
-    def add_curious_agent(self) -> None:
-        """Build the second actor-critic (with fresh weights)."""
-        self.curious_actor, self.curious_critic, self.curious_critic_target = self._make_actor_critic()
+    def add_curious_agent(self, intrinsic_class: type[IntrinsicReward], kwargs: dict[str, Any]) -> None:
+        """Build the curious actor-critic and its reward, with fresh weights.
 
-    def remove_curious_agent(self) -> None:
-        """Drop the second actor-critic."""
-        self.curious_actor = self.curious_critic = self.curious_critic_target = None  # type: ignore[assignment]
+        :param intrinsic_class: Class of the reward
+        :param kwargs: Its arguments
+        """
+        if self.intrinsic is None:
+            self._build_intrinsic(intrinsic_class, kwargs)
+        self.curious = self._make_actor_critic()
+
+    @property
+    def actor(self) -> TrunkActor:
+        """The task's actor."""
+        return self.task.actor
+
+    @property
+    def critic(self) -> LatentCritic:
+        """The task's critics."""
+        return self.task.critic
+
+    @property
+    def critic_target(self) -> LatentCritic:
+        """The task's target critics."""
+        return self.task.critic_target
+
+    @property
+    def agents(self) -> dict[str, ActorCritic]:
+        """Actor-critics by name: ``"task"``, and ``"curious"`` if there is one."""
+        return {"task": self.task} if self.curious is None else {"task": self.task, "curious": self.curious}
+
+    def _owners(self) -> dict[str, Any]:
+        """What has an optimiser that follows the learning rate, by the name that a model knows it by."""
+        owners: dict[str, Any] = {"actor": self.actor, "critic": self.critic}
+        owners |= {"policy.srl": self.srl, "policy.intrinsic": self.intrinsic}
+        if self.curious is not None:
+            owners |= {"policy.curious.actor": self.curious.actor, "policy.curious.critic": self.curious.critic}
+        return {name: owner for name, owner in owners.items() if owner is not None and owner.optimizer is not None}
+
+    def set_learning_rate(self, learning_rate: float, temperature_factor: float) -> None:
+        """One rate for everything; the temperatures follow it at a fixed ratio, so that a zero freezes all.
+
+        :param learning_rate: Of everything but the temperatures
+        :param temperature_factor: Theirs as a multiple of it
+        """
+        self.encoder_update.learning_rate = learning_rate
+        for owner in self._owners().values():
+            update_learning_rate(owner.optimizer, learning_rate)
+        for agent in self.agents.values():
+            if agent.ent_coef_optimizer is not None:
+                update_learning_rate(agent.ent_coef_optimizer, learning_rate * temperature_factor)
+
+    def saved_names(self) -> tuple[list[str], list[str]]:
+        """What is saved of a model beside the base class's.
+
+        :return: Names of what has a state dict, and of tensors
+        """
+        state_dicts = ["policy.encoder_update"]
+        state_dicts += [f"{name}.optimizer" for name in self._owners() if name.startswith("policy.")]
+        if self.curious is None:
+            return state_dicts, []
+        if self.curious.log_ent_coef is None:
+            return state_dicts, ["policy.curious.ent_coef_tensor"]
+        return [*state_dicts, "policy.curious.ent_coef_optimizer"], ["policy.curious.log_ent_coef"]
 
     def compile_networks(self) -> None:
         """Run what is not compiled yet through torch.compile in training mode: encoders, projections and the head's
@@ -269,47 +357,32 @@ class CuRePolicy(SACPolicy):
         modules = [
             part for encoder in (self.encoder, self.encoder_target) for part in (encoder.trunk, encoder.projection)
         ]
-        modules += [actor.features_extractor for actor in (self.actor, self.curious_actor) if actor]
+        modules += [agent.actor.features_extractor for agent in self.agents.values()]
         modules += [] if self.srl is None else list(self.srl.children())
         for module in modules:
             if module._compiled_call_impl is None:
                 compile_while_training(module, self)
 
-    def preprocess(self, observations: th.Tensor) -> th.Tensor:
+    def preprocess(self, views: th.Tensor) -> th.Tensor:
         """
-        :param observations: What the encoder is to see (after ``srl.augment`` or ``srl.center``), images in 0-255
+        :param views: What the encoder is to see, images in 0-255
         :return: The encoder's input: images in [0, 1]
         """
-        return preprocess(observations, self.encoder_space)
+        return preprocess(views, self.augmentation.view_space)
 
     def augment(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Randomly augmented encoder inputs, as in training
         """
-        return self.preprocess(self._changed("augment", observations))
+        return self.preprocess(self.augmentation(observations))
 
     def center(self, observations: th.Tensor) -> th.Tensor:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Encoder inputs without randomness, as when acting
         """
-        return self.preprocess(self._changed("center", observations))
-
-    def _changed(self, method: str, observations: th.Tensor) -> th.Tensor:
-        """What the head makes of observations, if it is what the encoder was built for."""
-        if self.srl is None:
-            return observations
-        changed: th.Tensor = getattr(self.srl, method)(observations)
-        built_for = get_obs_shape(self.encoder_space)
-        # Observations that were wrong before the head saw them are not its fault.
-        if changed.shape[1:] != built_for and observations.shape[1:] == get_obs_shape(self.observation_space):
-            raise ValueError(
-                f"{type(self.srl).__name__}.{method} made observations of shape {tuple(changed.shape[1:])} of those of "
-                f"shape {tuple(observations.shape[1:])}, but the encoder was built for {built_for}: return that shape, "
-                "or name another one in configure_encoder."
-            )
-        return changed
+        return self.preprocess(self.augmentation.center(observations))
 
     def encode(self, observations: th.Tensor) -> th.Tensor:
         """
@@ -318,54 +391,53 @@ class CuRePolicy(SACPolicy):
         """
         return self.encoder(self.center(observations))
 
-    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
-        """SB3's, which would divide images that are floats by 255 once more.
-
-        :param observation: One observation or a batch
-        :return: The batch as a tensor, and whether it was a batch
-        :raises ValueError: if it is not made of numbers, or of floats where images are bytes
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
-        dtype = None if isinstance(observation, dict) else np.asarray(observation).dtype
-        images = is_image_space(self.observation_space)
-        if dtype is None or not np.issubdtype(dtype, np.integer if images else np.number):
-            given = "a dictionary" if dtype is None else f"values of type {dtype}"
-            raise ValueError(
-                f"the observation has {given}, but the policy reads {self.observation_space}: give it as the "
-                "environment returns it."
-            )
-        return super().obs_to_tensor(observation)
+        :param observation: [B, *shape]
+        :param deterministic: Whether to return the mean action
+        :return: Actions in [-1, 1], [B, action_dim]
+        """
+        return self._predict(observation, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        actor = getattr(self, self._acting)
+        actor = self.agents[self.default_agent].actor
         return actor(self.encoder.trunk(self.center(observation)), deterministic)  # type: ignore[arg-type]
 
     @contextlib.contextmanager
-    def acting(self, actor: str) -> Iterator[None]:
-        """Within this context ``predict`` asks the given actor.
+    def acting(self, agent: str) -> Iterator[None]:
+        """Within this context ``predict`` asks the given agent.
 
-        :param actor: ``"actor"`` or ``"curious_actor"``
+        :param agent: ``"task"`` or ``"curious"``
         """
-        previous, self._acting = self._acting, actor
+        previous, self.default_agent = self.default_agent, agent
         try:
             yield
         finally:
-            self._acting = previous
+            self.default_agent = previous
 
     def set_training_mode(self, mode: bool) -> None:
         """
         :param mode: Whether layers that differ between training and evaluation behave as in training
         """
         self.train(mode)
-        for target in (self.encoder_target, self.critic_target, self.curious_critic_target):
-            if target is not None:
-                target.train(False)
+        self.encoder_target.train(False)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        for key in ("log_std_init", "use_expln", "clip_mean"):
-            del data[key]
-        data.update(self._blueprint, curious=self.curious_actor is not None)
-        return data
+        del data["normalize_images"]
+        return data | dict(
+            lr_schedule=self._dummy_schedule,
+            net_arch=self.net_arch,
+            activation_fn=self.activation_fn,
+            features_extractor_class=self.features_extractor_class,
+            features_extractor_kwargs=self.features_extractor_kwargs,
+            optimizer_class=self.optimizer_class,
+            optimizer_kwargs=self.optimizer_kwargs,
+            curious=self.curious is not None,
+            default_agent=self.default_agent,
+            **self._choices,
+            **self.critic_kwargs,
+        )
 
 
 class CnnPolicy(CuRePolicy):
@@ -375,17 +447,15 @@ class CnnPolicy(CuRePolicy):
 class MlpPolicy(CuRePolicy):
     """``CuRePolicy`` for vectors: the same but for the encoder's default class."""
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        lr_schedule: Schedule,
-        features_extractor_class: type[BaseFeaturesExtractor] = VectorEncoder,
-        **kwargs: Any,
-    ):
-        super().__init__(
-            observation_space, action_space, lr_schedule, features_extractor_class=features_extractor_class, **kwargs
-        )
+    default_encoder = VectorEncoder
+
+
+@contextlib.contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Random numbers of its own, so that under every head and reward the other networks of a seed begin alike."""
+    with th.random.fork_rng(devices=()):
+        th.default_generator.manual_seed(seed)
+        yield
 
 
 def encoder_of(policy: BasePolicy) -> tuple[nn.Module, Callable[[th.Tensor], th.Tensor]] | None:

@@ -6,12 +6,9 @@ import warnings
 from typing import Any
 
 import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
-
-from sb3_cure.values import is_one_of
-
-PRECISIONS = ("auto", "fp32", "bf16")
-COMPILE = ("auto", True, False)
 
 #: Why ``compile="auto"`` is eager
 NOT_COMPILED = {
@@ -28,19 +25,15 @@ def _has_fast_bf16(device: th.device) -> bool:
     return device.type == "cpu" and supported is not None and supported()
 
 
-def resolve_precision(precision: str, device: th.device) -> str:
+def resolve_precision(precision: str, device: th.device, observation_space: spaces.Space) -> str:
     """
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``
     :param device: Device of the networks
-    :return: ``"fp32"`` or ``"bf16"``; auto chooses bf16 where the device computes it natively
-    :raises ValueError: if the name is unknown
+    :param observation_space: Observation space
+    :return: ``"fp32"`` or ``"bf16"``; auto chooses bf16 for images, where the device computes it natively
     """
-    if not is_one_of(precision, PRECISIONS):
-        raise ValueError(
-            f"precision is {precision!r}, but it must be one of {', '.join(map(repr, PRECISIONS))}: choose one of them."
-        )
     if precision == "auto":
-        return "bf16" if _has_fast_bf16(device) else "fp32"
+        return "bf16" if is_image_space(observation_space) and _has_fast_bf16(device) else "fp32"
     return precision
 
 

@@ -5,14 +5,12 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
-from sb3_cure.augmentations import random_shift
+from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
 from sb3_cure.layers import ConvTranspose2d, conv_sizes, full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
-from sb3_cure.values import is_integer, is_number, is_one_of
 
 
 class PixelDecoder(nn.Module):
@@ -105,12 +103,10 @@ class RAE(SRLHead):
     :param latent_penalty: lambda_z, on half the squared norm of the latents
     :param decoder_weight_decay: lambda_theta, applied by the decoder's optimiser
     :param bits: Bits that are left of each pixel's 8
-    :param augmentation: ``"none"`` as in SAC-AE and the CuRe paper; ``"shift"``: the encoder sees randomly shifted
-        images, as in DrQ, and the decoder draws the unshifted ones
-    :param pad: Largest shift, pixels
     """
 
     warmup_updates = 1000
+    mixed_precision = True
 
     def __init__(
         self,
@@ -119,60 +115,37 @@ class RAE(SRLHead):
         latent_penalty: float = 1e-6,
         decoder_weight_decay: float = 1e-7,
         bits: int = 5,
-        augmentation: str = "none",
-        pad: int = 4,
     ):
         super().__init__(encoder, observation_space)
-        if not is_integer(bits, 1) or bits > 8:
-            raise ValueError(f"srl_kwargs got bits={bits!r}, but a pixel has 8: give a whole number from 1 to 8.")
-        if not (is_number(latent_penalty, low=0) and is_number(decoder_weight_decay, low=0)):
-            raise ValueError(
-                f"srl_kwargs got latent_penalty={latent_penalty!r} and decoder_weight_decay={decoder_weight_decay!r}, "
-                "but both are penalties: give numbers >= 0."
-            )
-        self.pixels = is_image_space(observation_space)
-        if not is_one_of(augmentation, ("none", "shift")) or (augmentation == "shift" and not self.pixels):
-            raise ValueError(
-                f"srl_kwargs got augmentation={augmentation!r} for observations of shape {observation_space.shape}, "
-                "but srl='rae' knows 'none', and for images 'shift': choose one of them."
-            )
-        if not is_integer(pad, 1):
-            raise ValueError(f"srl_kwargs got pad={pad!r}, but a shift needs at least 1 pixel: change pad.")
-        self.shifts = augmentation == "shift"
-        self.pad = pad
+        if not 1 <= bits <= 8:
+            raise ValueError(f"bits is {bits}, but a pixel has 8: give a whole number from 1 to 8.")
         self.latent_penalty = latent_penalty
         self.optimizer_kwargs = {"weight_decay": decoder_weight_decay}
         self.bits = bits
+        self.pixels = is_image_space(encoder.view_space)
         self.decoder: nn.Module
         if self.pixels:
             self.decoder = PixelDecoder(
                 encoder.features_dim,
-                observation_space.shape,  # type: ignore[arg-type]
+                encoder.view_space.shape,  # type: ignore[arg-type]
                 # Not every features extractor has these; SAC-AE's own sizes otherwise.
                 getattr(encoder, "n_filters", 32),
                 getattr(encoder, "n_layers", 4),
             )
         else:
-            self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(observation_space))
+            self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(encoder.view_space))
 
-    def augment(self, observations: th.Tensor) -> th.Tensor:
-        """
-        :param observations: [B, *shape], images in 0-255
-        :return: The same, with ``augmentation="shift"`` randomly shifted
-        """
-        return random_shift(observations, self.pad) if self.shifts else observations
-
-    def target(self, observations: th.Tensor, dither: bool) -> th.Tensor:
+    def target(self, views: th.Tensor, dither: bool) -> th.Tensor:
         """What the decoder is to draw.
 
-        :param observations: [B, *shape], images in 0-255
+        :param views: What the encoder saw, [B, *view shape], images in 0-255
         :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
         :return: Images in [-0.5, 0.5], [B, C, H, W]; flat vectors as they are, [B, out_dim]
         """
         if not self.pixels:
-            return self.preprocess(observations).flatten(1)
+            return self.preprocess(views).flatten(1)
         # NHWC, as the decoder writes: reading two memory orders at once is far slower than one copy of bytes.
-        images = observations.contiguous(memory_format=th.channels_last)
+        images = views.contiguous(memory_format=th.channels_last)
         # In units of 1/256 of a quantisation step, centred: half the bits of 16 are for the steps, half for the noise.
         levels = th.bitwise_right_shift(images, 8 - self.bits).to(th.int16).sub_(2 ** (self.bits - 1)).mul_(256)
         middle = 128.0
@@ -181,25 +154,26 @@ class RAE(SRLHead):
             middle = 0.5
         return levels.float().add_(middle).div_(256 * 2**self.bits)
 
-    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Eq. 2 of the paper; the weight decay of the decoder is applied by its optimiser.
 
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
+        :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, [B]
         """
-        error = self._squared_error(self.target(batch.observations, dither=True), latents)
+        error = self._squared_error(self.target(batch.views, dither=True), latents)
         penalty = 0.5 * latents.square().sum(dim=1).mean()
         return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
 
-    def error(self, batch: ReplayBufferSamples, latents: th.Tensor) -> th.Tensor:
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
         """Mean squared error per observation against the target without noise.
 
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
         :return: [B]
         """
-        return self._squared_error(self.target(batch.observations, dither=False), latents).detach()
+        return self._squared_error(self.target(batch.views, dither=False), latents).detach()
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         """

@@ -4,9 +4,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
+from sb3_cure.augmentations import Augmentation
+from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
 from sb3_cure.layers import preprocess
 
@@ -15,7 +16,7 @@ class SRLOutput(NamedTuple):
     """What a head says of a batch.
 
     :param loss: Scalar to minimise; its gradient reaches the head and, through the latents, the encoder
-    :param error: SRL error of each sample, [B], detached, finite, >= 0: the raw material of the curious reward
+    :param error: SRL error of each sample, [B], detached, finite, >= 0: the raw material of the paper's curious reward
     """
 
     loss: th.Tensor
@@ -25,16 +26,20 @@ class SRLOutput(NamedTuple):
 class SRLHead(nn.Module):
     """Base class of SRL heads. Subclass it, implement ``loss``, and pass the class: ``CuReSAC(..., srl=MyHead)``.
 
-    A head owns its parameters (trained by its loss alone) but not the encoder, whose latents it is given. ``batch`` is
-    always SB3's ``ReplayBufferSamples`` with observations as stored: images unscaled in 0-255.
+    A head owns its parameters (trained by its loss alone) but not the encoder, whose latents it is given.
 
-    :param encoder: The shared encoder; read ``encoder.features_dim``. Only the latents that ``loss`` is given
-        carry its gradient to the encoder; what else is encoded with it counts as constant
+    :param encoder: The shared encoder; read ``encoder.features_dim`` and ``encoder.view_space``. Only the latents that
+        ``loss`` is given carry its gradient to the encoder; what else is encoded with it counts as constant
     :param observation_space: Space of the stored observations
     """
 
     #: Gradient steps in one burst after the random warm-up, unless ``warmup_updates`` says otherwise
     warmup_updates: ClassVar[int] = 0
+    #: Whether ``loss`` gets the latents of the next observations, with their gradient, as a third argument
+    needs_next_latents: ClassVar[bool] = False
+    #: Whether ``loss`` runs under autocast where the agent computes in bf16. A head that says so computes its error in
+    #: fp32 (``sb3_cure.layers.full_precision``): of bf16's eight bits little would be left once it is standardised
+    mixed_precision: ClassVar[bool] = False
     #: Optimiser of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
     #: Extra arguments (but the learning rate) of the optimiser of the head's own parameters, e.g. weight decay
@@ -46,19 +51,26 @@ class SRLHead(nn.Module):
         self.optimizer_kwargs = {}
         # In tuples, so that the encoders are not registered as parts of the head: it does not train or save them.
         self._encoder = (encoder,)
-        self._target_encoder = (encoder,)
+        self.bind(encoder, Augmentation(observation_space))
 
     @classmethod
-    def configure_encoder(
-        cls, observation_space: spaces.Space, **srl_kwargs: Any
-    ) -> tuple[spaces.Space, dict[str, Any]]:
-        """What this head wants of the encoder, asked before the encoder exists.
+    def choose_augmentation(cls, observation_space: spaces.Space) -> str | None:
+        """What ``augmentation="auto"`` means with this head.
 
         :param observation_space: Space of the stored observations
-        :param srl_kwargs: The head's arguments
-        :return: The space that the encoder sees (smaller if the head crops), and default arguments for ``PixelEncoder``
+        :return: ``"shift"``, ``"crop"`` or None
         """
-        return observation_space, {}
+        return None
+
+    @classmethod
+    def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
+        """What this head wants of the encoder, asked before the encoder exists.
+
+        :param augmentation: What the encoder will see
+        :param srl_kwargs: The head's arguments
+        :return: Default arguments of ``PixelEncoder`` or ``VectorEncoder``
+        """
+        return {}
 
     @property
     def encoder(self) -> Encoder:
@@ -70,57 +82,48 @@ class SRLHead(nn.Module):
         """The encoder's moving average (momentum encoder); never trained by gradients."""
         return self._target_encoder[0]
 
-    def bind_target_encoder(self, target_encoder: Encoder) -> None:
+    def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:
         """Called once by the policy.
 
         :param target_encoder: The moving average of the encoder
+        :param augmentation: The policy's
         """
         self._target_encoder = (target_encoder,)
+        #: Draws another view of stored observations: ``self.augment(batch.observations)``
+        self.augment = augmentation
 
-    def preprocess(self, observations: th.Tensor) -> th.Tensor:
+    def preprocess(self, views: th.Tensor) -> th.Tensor:
         """
-        :param observations: Observations after ``augment`` or ``center``, [B, *shape], images in 0-255
+        :param views: Views of observations, [B, *view shape], images in 0-255
         :return: The encoder's input: images in [0, 1]
         """
-        return preprocess(observations, self.observation_space)
+        return preprocess(views, self.encoder.view_space)
 
-    def augment(self, observations: th.Tensor) -> th.Tensor:
-        """What the encoder sees in training; the identity unless a head augments.
-
-        :param observations: [B, *shape], images in 0-255
-        :return: [B, *encoder shape], images in 0-255
-        """
-        return observations
-
-    def center(self, observations: th.Tensor) -> th.Tensor:
-        """The deterministic counterpart of ``augment``, used to act and to measure.
-
-        :param observations: [B, *shape], images in 0-255
-        :return: [B, *encoder shape], images in 0-255
-        """
-        return observations
-
-    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """The training loss. It may be noisy and may use the other samples of the batch.
 
-        :param batch: Samples of the replay buffer
-        :param latents: The encoder's output for ``augment(batch.observations)``, [B, encoder.features_dim]
+        :param batch: Samples of the replay buffer; ``batch.views`` is what the encoder saw
+        :param latents: The encoder's output for ``batch.views``, fp32, [B, encoder.features_dim]
+        :param next_latents: The same for views of the next observations, if ``needs_next_latents``
         :return: Loss (scalar) and error per sample ([B], detached)
         """
         raise NotImplementedError(f"{type(self).__name__} must implement loss(batch, latents) -> SRLOutput")
 
-    def error(self, batch: ReplayBufferSamples, latents: th.Tensor) -> th.Tensor:
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
         """The noise-free error, for measuring and plotting; by default that of ``loss``.
 
-        :param batch: Samples of the replay buffer
-        :param latents: The encoder's output for ``center(batch.observations)``, [B, encoder.features_dim]
+        :param batch: Samples of the replay buffer; ``batch.views`` are the centred ones
+        :param latents: The encoder's output for ``batch.views``, [B, encoder.features_dim]
         :return: Error per sample, [B]
         """
-        return SRLOutput(*self.loss(batch, latents)).error
+        return self.loss(batch, latents).error
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
         """
         :param latents: [B, encoder.features_dim]
-        :return: Observations [B, *shape] (images in 0-255), or None if the head does not decode
+        :return: Views [B, *view shape] (images in 0-255), or None if the head does not decode
         """
         return None
+
+    def after_step(self) -> None:
+        """Called after each update in which the head learned: the place of moving averages of its own."""

@@ -2,18 +2,20 @@
 
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.augmentations import center_crop, random_crop, random_shift
+from sb3_cure.augmentations import Augmentation, RandomCrop
+from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
+from sb3_cure.layers import full_precision
 from sb3_cure.srl.base import SRLHead, SRLOutput
-from sb3_cure.values import is_integer, is_one_of
+
+#: Side of CURL's crops, pixels, which decides whether ``augmentation="auto"`` crops or shifts
+CROP_SIZE = 84
 
 
 class CURL(SRLHead):
@@ -21,36 +23,19 @@ class CURL(SRLHead):
 
     The similarity is bilinear, q^T W k; keys come from the momentum encoder. (In the paper's eq. 3 the negatives
     lack an exp and the sign is that of a likelihood; what is meant, and done here, is cross-entropy on the diagonal.)
+    With ``augmentation="auto"`` observations larger than 84 pixels are cropped, as in CURL, and latents have no tanh;
+    others are shifted, as in DrQ.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images
-    :param augmentation: ``"crop"`` as in CURL: random squares of ``crop_size`` from larger observations (rendered at
-        100 px), the central one to act, latents without tanh; ``"shift"``: pad and shift as in DrQ, at any size;
-        ``"auto"``: crop when observations are larger than ``crop_size``, else shift
-    :param crop_size: Side of the crops, pixels
-    :param pad: Largest shift, pixels
     :param bank_size: How many stored observations serve as fixed negatives in ``error``
-    :raises ValueError: if observations are no images or too small to crop
+    :raises ValueError: if observations are no images
     """
 
-    def __init__(
-        self,
-        encoder: Encoder,
-        observation_space: spaces.Space,
-        augmentation: str = "auto",
-        crop_size: int = 84,
-        pad: int = 4,
-        bank_size: int = 64,
-    ):
+    mixed_precision = True
+
+    def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64):
         super().__init__(encoder, observation_space)
-        if not (is_integer(pad, 1) and is_integer(bank_size, 1)):
-            raise ValueError(
-                f"srl_kwargs got pad={pad!r} and bank_size={bank_size!r}, but each must be at least 1: change "
-                "srl_kwargs."
-            )
-        self.crops = self._resolve(observation_space, augmentation, crop_size) == "crop"
-        self.crop_size = crop_size
-        self.pad = pad
         # CURL starts W uniform in [0, 1).
         self.W = nn.Parameter(th.rand(encoder.features_dim, encoder.features_dim))
         # The first observations of training, kept as the negatives of `error`: within a batch they would change with
@@ -65,84 +50,50 @@ class CURL(SRLHead):
     def _forget_fill_level(head: nn.Module, incompatible_keys: object) -> None:
         head._n_banked = None  # type: ignore[assignment]
 
-    @staticmethod
-    def _resolve(observation_space: spaces.Space, augmentation: str, crop_size: int) -> str:
+    @classmethod
+    def choose_augmentation(cls, observation_space: spaces.Space) -> str:
+        """
+        :param observation_space: Space of the stored observations
+        :return: ``"crop"`` for images of more than 84 pixels, else ``"shift"``
+        :raises ValueError: if observations are no images, of which there are no two views
+        """
         if not is_image_space(observation_space):
             raise ValueError(
-                f"srl='curl' got observations {observation_space}, but it learns from two crops of one image and "
-                "vectors have none: use srl='rae', or a head of your own, with 'MlpPolicy'."
+                f"srl='curl' compares two views of one image, but observations are {observation_space}: use srl='rae', "
+                "or a head of your own."
             )
-        size = min(observation_space.shape[1:])  # type: ignore[index]
-        if not is_integer(crop_size, 0):
-            raise ValueError(f"srl_kwargs got crop_size={crop_size!r}, but it counts pixels: give a whole number.")
-        if augmentation == "auto":
-            augmentation = "crop" if size > crop_size else "shift"
-        if not is_one_of(augmentation, ("crop", "shift")):
-            raise ValueError(
-                f"srl_kwargs got augmentation={augmentation!r}, but srl='curl' knows 'crop', 'shift' and 'auto': "
-                "choose one of them."
-            )
-        if augmentation == "crop" and not 1 <= crop_size < size:
-            raise ValueError(
-                f"srl_kwargs got augmentation='crop' with crop_size={crop_size} for observations of {size} pixels, but "
-                "crops must have at least 1 pixel and be smaller than the observation: render larger (CURL: "
-                "image_size=100), set another crop_size, or use augmentation='shift'."
-            )
-        return augmentation
+        return "crop" if min(observation_space.shape[1:]) > CROP_SIZE else "shift"  # type: ignore[index]
 
     @classmethod
-    def configure_encoder(
-        cls,
-        observation_space: spaces.Space,
-        augmentation: str = "auto",
-        crop_size: int = 84,
-        **srl_kwargs: Any,
-    ) -> tuple[spaces.Space, dict[str, Any]]:
-        """The encoder sees the crop, and without a tanh, as in CURL's code; after a shift it sees all, with one.
-
-        :param observation_space: Space of the stored observations
-        :param augmentation: As in the constructor
-        :param crop_size: As in the constructor
-        :param srl_kwargs: The rest of the head's arguments
-        :return: The space that the encoder sees, and default arguments for ``PixelEncoder``
+    def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
         """
-        if cls._resolve(observation_space, augmentation, crop_size) == "shift":
-            return observation_space, {}
-        shape = (observation_space.shape[0], crop_size, crop_size)  # type: ignore[index]
-        return spaces.Box(0, 255, shape, np.uint8), {"tanh": False}
-
-    def augment(self, observations: th.Tensor) -> th.Tensor:
-        """Random crop or shift, the same for all frames of one observation.
-
-        :param observations: [B, C, H, W], 0-255
-        :return: [B, C, crop_size, crop_size], or [B, C, H, W] with shifts
+        :param augmentation: What the encoder will see
+        :param srl_kwargs: The head's arguments
+        :return: Latents of crops without tanh, as in CURL's code
+        :raises ValueError: if there is no augmentation
         """
-        return self._augment(observations)
+        if type(augmentation) is Augmentation:
+            raise ValueError("srl='curl' compares two random views, but augmentation is None: use 'shift' or 'crop'.")
+        return {"tanh": False} if isinstance(augmentation, RandomCrop) else {}
 
-    def center(self, observations: th.Tensor) -> th.Tensor:
-        """Centre crop, or with shifts the whole image.
-
-        :param observations: [B, C, H, W], 0-255
-        :return: [B, C, crop_size, crop_size], or [B, C, H, W] with shifts
-        """
-        return center_crop(observations, self.crop_size) if self.crops else observations
-
-    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Eq. 3: cross-entropy of finding each anchor's own key among the keys of the batch.
 
         :param batch: Samples of the replay buffer
         :param latents: Anchors q, [B, features_dim]
+        :param next_latents: Unused
         :return: Loss, and the cross-entropy of each anchor, [B]
         """
         self._fill_bank(batch.observations)
-        keys = self._keys(self._augment(batch.observations))
+        keys = self._keys(self.augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
-        # Row maxima are subtracted inside cross_entropy.
-        error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
+        with full_precision(keys):
+            # Row maxima are subtracted inside cross_entropy.
+            error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
         return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()
-    def error(self, batch: ReplayBufferSamples, latents: th.Tensor) -> th.Tensor:
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
         """Cross-entropy of each anchor against its own key and the fixed bank; crops from a fixed seed.
 
         Does not depend on the other samples of the batch. A head that has not been trained has an empty bank: the
@@ -154,16 +105,15 @@ class CURL(SRLHead):
         """
         negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         # The same offset for all, drawn for them as one image of many channels: neither batch size nor order matters.
-        views = self._augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
+        views = self.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
-        weighted = latents.float() @ self.W
-        logits = (weighted * own).sum(dim=1, keepdim=True)
-        if len(negatives) > 0:
-            bank = self._keys(self._augment(negatives, th.Generator().manual_seed(1)))
-            logits = th.cat([logits, weighted @ bank.T], dim=1)
-        first = th.zeros(len(logits), dtype=th.long, device=logits.device)
-        # Rounding can leave less than 0, or a -0.0.
-        return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
+        bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
+        with full_precision(own):
+            weighted = latents.float() @ self.W
+            logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
+            first = th.zeros(len(logits), dtype=th.long, device=logits.device)
+            # Rounding can leave less than 0, or a -0.0.
+            return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
 
     @th.no_grad()
     def set_bank(self, observations: th.Tensor) -> None:
@@ -182,11 +132,6 @@ class CURL(SRLHead):
                 f"of shape {tuple(bank.shape[1:])}: choose fewer, or another srl_kwargs=dict(bank_size=...)."
             )
         self._write_bank(0, observations)
-
-    def _augment(self, observations: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
-        if self.crops:
-            return random_crop(observations, self.crop_size, generator)
-        return random_shift(observations, self.pad, generator)
 
     @th.no_grad()
     def _keys(self, views: th.Tensor) -> th.Tensor:

@@ -1,0 +1,103 @@
+"""CuRe's own arguments: types, ranges and choices as one table, and what does not go together.
+
+SB3's own arguments are SB3's to check.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.srl import SRLHead, get_srl_class
+
+Rate = Annotated[float, Field(ge=0, le=1)]
+Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+# A schedule of the remaining progress
+Schedule = Callable[[float], float]
+
+
+class CuReArguments(BaseModel):
+    """Types, ranges and choices; defaults are the constructor's."""
+
+    model_config = ConfigDict(from_attributes=True, arbitrary_types_allowed=True, extra="forbid")
+
+    srl: str | type[SRLHead] | None
+    srl_kwargs: dict[str, Any]
+    srl_schedule: Literal["simultaneous", "alternating"]
+    srl_period: Count
+    intrinsic: str | type[IntrinsicReward]
+    intrinsic_kwargs: dict[str, Any]
+    curiosity: Literal["separate", "bonus", "random"] | None
+    curiosity_prob: Rate | Schedule
+    curiosity_bout: Annotated[float, Field(ge=1)] | Literal["episode"]
+    curiosity_beta: Factor
+    curiosity_gamma: Rate
+    curiosity_ent_coef: str | Factor | None
+    curiosity_episodic: StrictBool
+    normalize_curiosity: StrictBool
+    curiosity_target: Literal["observation", "next_observation"]
+    curiosity_encoder_grad: StrictBool
+    task: StrictBool
+    augmentation: Literal["auto", "shift", "crop"] | None
+    augmentation_kwargs: dict[str, Any]
+    warmup_updates: Annotated[int, Field(ge=0)] | None
+    actor_update_interval: Count
+    encoder_tau: Rate
+    ent_coef_lr_factor: Factor
+    update: Literal["joint", "sequential"]
+    precision: Literal["auto", "fp32", "bf16"]
+    compile: Literal["auto"] | StrictBool
+    overlap: StrictBool
+    on_bad_transition: Literal["raise", "skip"]
+
+
+def check_arguments(model: Any) -> None:
+    """
+    :param model: A CuRe model, its arguments set
+    :raises ValueError: for the first that cannot work, in one sentence
+    """
+    try:
+        CuReArguments.model_validate(model)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{first['loc'][0]} is {first['input']!r}: {first['msg'].lower()}.") from None
+    _check_combinations(model)
+
+
+def _check_combinations(model: Any) -> None:
+    """What would train something else than what was asked for, without a word."""
+    reward, curious = get_intrinsic_class(model.intrinsic), model.curiosity in ("separate", "bonus")
+    if model.srl is None and model.srl_kwargs:
+        raise ValueError(f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.")
+    if model.srl is not None:
+        get_srl_class(model.srl)
+    if curious and reward.needs_srl and model.srl is None:
+        raise ValueError(
+            f"curiosity={model.curiosity!r} is rewarded by intrinsic={model.intrinsic!r}, which is the error of an SRL "
+            "head, but srl is None: choose srl='rae', srl='curl' or a head of your own, or set curiosity=None."
+        )
+    if not model.task and model.curiosity not in ("separate", "random"):
+        raise ValueError(f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.")
+    if model.curiosity == "separate" and model.curiosity_gamma == 0 and model.curiosity_target == "observation":
+        raise ValueError(
+            "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
+            "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0."
+        )
+    if model.n_steps > 1 and curious:
+        raise ValueError(
+            f"n_steps={model.n_steps} sums the task's rewards over steps, but the intrinsic reward is one of single "
+            "steps: set n_steps=1, or curiosity=None."
+        )
+    if model.use_sde and not model.everything_off:
+        raise ValueError("use_sde=True explores by noise of one actor's own features: it needs srl=curiosity=None.")
+    space = model.observation_space
+    shape = space.shape or ()
+    if len(shape) == 3 and not is_image_space(space, check_channels=False) and not model.everything_off:
+        raise ValueError(
+            f"images arrive as {space.dtype}, but the encoder and the replay buffer take uint8 in [0, 255]: return "
+            f"(255 * image).astype({np.uint8.__name__}), and use VecNormalize with norm_obs=False."
+        )

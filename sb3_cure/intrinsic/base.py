@@ -1,0 +1,98 @@
+"""The contract between the agent and an intrinsic reward, and how rewards are scaled."""
+
+from typing import ClassVar
+
+import torch as th
+from gymnasium import spaces
+from torch import nn
+
+from sb3_cure.buffers import Samples
+
+
+class IntrinsicReward(nn.Module):
+    """What the curious agent is rewarded for. Subclass it, implement ``loss``, and pass the class as ``intrinsic=``.
+
+    The reward is computed afresh for each sampled batch, so that it is never stale. Targets, statistics and memories
+    belong into buffers, which are saved; random numbers come from a generator of its own, so that runs of one seed
+    that differ in their reward alone draw alike elsewhere.
+
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    :param features_dim: Size of the latents
+    """
+
+    #: Whether the reward is made of the SRL error, so that ``srl=None`` is refused
+    needs_srl: ClassVar[bool] = False
+    #: Whether the reward reads latents and next latents; they are None otherwise
+    needs_latents: ClassVar[bool] = False
+    #: Whether the latents keep their graph, so that this loss trains the encoder, too
+    trains_encoder: ClassVar[bool] = False
+    #: Optimiser of the reward's own parameters, set by the policy; None if it has none
+    optimizer: th.optim.Optimizer | None = None
+
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, features_dim: int):
+        super().__init__()
+
+    def loss(
+        self,
+        batch: Samples,
+        latents: th.Tensor | None,
+        next_latents: th.Tensor | None,
+        srl_error: th.Tensor | None,
+    ) -> tuple[th.Tensor | None, th.Tensor]:
+        """The reward of a batch, as it is before the step that the loss then makes.
+
+        :param batch: The true transitions
+        :param latents: The online encoder's latents of the centred views, fp32, [B, features_dim]
+        :param next_latents: The same of the next observations, [B, features_dim]
+        :param srl_error: SRL error of each sample, detached, [B]; None without SRL
+        :return: Loss of the reward's own parameters (None if it has none), and the reward, detached, [B]
+        """
+        raise NotImplementedError
+
+
+class RewardScale(nn.Module):
+    """r = beta * reward, by default standardised: minus the mean of the batch, divided by a running deviation.
+
+    The paper uses the bare error. Errors of an autoencoder are of order 1e-3, far below the entropy bonus of SAC, so
+    that an un-normalised curious policy stays close to random. The mean is the batch's own, because a running one lags
+    behind errors that fall while the head learns. The deviation is an exponential average over updates.
+
+    :param decay: Weight of the past in the running deviation, per update
+    :param clip: Standardised rewards are clipped to [-clip, clip]
+    """
+
+    variance: th.Tensor
+    weight: th.Tensor
+
+    def __init__(self, decay: float = 0.99, clip: float = 5.0):
+        super().__init__()
+        self.decay = decay
+        self.clip = clip
+        self.register_buffer("variance", th.zeros(()))
+        self.register_buffer("weight", th.zeros(()))
+
+    @th.no_grad()
+    def forward(self, reward: th.Tensor, beta: float, normalize: bool, center: bool) -> th.Tensor:
+        """
+        :param reward: Raw reward of each sample, [B]
+        :param beta: Factor of the reward, beta in the paper
+        :param normalize: Whether to standardise; False is the paper's letter
+        :param center: Whether the mean is subtracted when standardising; not for a bonus on top of a task's reward,
+            which would make long episodes neither better nor worse
+        :return: Scaled reward, [B, 1]
+        """
+        if normalize:
+            mean = reward.mean()
+            variance = (reward - mean).square().mean()
+            # A spread below a thousandth of the rewards' size is rounding: rewards that are all alike earn nothing.
+            variance = th.maximum(variance, 1e-6 * reward.square().mean())
+            finite = variance.isfinite()
+            self.variance.copy_(th.where(finite, self.variance.lerp(variance, 1 - self.decay), self.variance))
+            # The average starts at zero: its total weight undoes that bias, as Adam does for its moments.
+            self.weight.copy_(
+                th.where(finite, self.weight.lerp(th.ones_like(self.weight), 1 - self.decay), self.weight)
+            )
+            deviation = (self.variance / self.weight.clamp(min=1e-8)).sqrt() + 1e-8
+            reward = ((reward - mean if center else reward) / deviation).clamp(-self.clip, self.clip)
+        return beta * reward.unsqueeze(1)
