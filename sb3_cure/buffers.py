@@ -43,7 +43,7 @@ class Samples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor | None = None
-    views: th.Tensor | None = None
+    views: th.Tensor = None  # type: ignore[assignment]
 
 
 #: Keys of ``info`` that mark a transition which is never to be sampled: ``FaultTolerantSubprocVecEnv`` sets

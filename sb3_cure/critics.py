@@ -55,7 +55,7 @@ class LatentCritic(nn.Module):
         return th.stack([_first_and_last_in_fp32(network, inputs) for network in self.q_networks], dim=1)
 
 
-def _first_and_last_in_fp32(network: nn.Sequential, inputs: th.Tensor) -> th.Tensor:
+def _first_and_last_in_fp32(network: Any, inputs: th.Tensor) -> th.Tensor:
     """Of bf16's eight bits, actions of .500 and .501 are the same; and values need more than eight."""
     first, *hidden, last = network if len(network) > 1 else (nn.Identity(), *network)
     with full_precision(inputs):

@@ -435,8 +435,8 @@ class CuRe(OffPolicyAlgorithm):
         for _ in range(gradient_steps):
             learns_srl, learns_rl = self._phase()
             for _ in range(2 if self.srl_schedule == "alternating" else 1):
-                batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                batch = Samples(*batch, views=self.policy.augmentation(batch.observations))  # type: ignore[arg-type]
+                sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                batch = Samples(**sampled._asdict(), views=self.policy.augmentation(sampled.observations))
                 self._guard.begin(self._n_updates)
                 with crash_report(self, batch):
                     self._gradient_step(batch, learns_srl, learns_rl)

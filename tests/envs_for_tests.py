@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cure import CuReSAC
 
@@ -150,8 +151,8 @@ def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
         "srl": policy.srl,
         "actor": policy.actor,
         "critic": policy.critic,
-        "curious actor": policy.curious_actor,
-        "curious critic": policy.curious_critic,
+        "curious actor": policy.curious.actor,
+        "curious critic": policy.curious.critic,
     }
     found: dict[str, th.Tensor] = {}
 
@@ -160,7 +161,7 @@ def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
         return step(*arguments)
 
     optimizers = {name: owner.optimizer for name, owner in owners.items() if name != "encoder"}
-    optimizers["encoder"] = policy.encoder_optimizer.optimizers["joint"]
+    optimizers["encoder"] = policy.encoder_update.optimizers["joint"]
     for name, optimizer in optimizers.items():
         optimizer.step = functools.partial(keep, name, list(owners[name].parameters()), optimizer.step)
     th.manual_seed(seed)
@@ -175,7 +176,7 @@ def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
 def state_of(model: SAC) -> dict[str, Any]:
     """A copy of all that learning changes: networks, optimisers, temperatures."""
     _, variables = model._get_torch_save_params()
-    return copy.deepcopy({**model.get_parameters(), **{name: getattr(model, name) for name in variables}})
+    return copy.deepcopy({**model.get_parameters(), **{name: recursive_getattr(model, name) for name in variables}})
 
 
 def differences(first: Any, second: Any, path: str = "") -> list[str]:

@@ -1175,7 +1175,7 @@ def test_pretrain_needs_a_curious_agent_that_can_learn(kwargs: dict[str, Any], s
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=None, **kwargs)
     with pytest.raises(ValueError, match=sentence):
         model.pretrain(20, collector="curious")
-    assert model.policy.curious_actor is None
+    assert model.policy.curious.actor is None
     assert model.pretrain(20, collector="random").learn(20).num_timesteps == 20
 
 

@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvW
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions
-from sb3_cure.encoder_optimizer import EncoderOptimizer
+from sb3_cure.encoder_update import EncoderOptimizer
 from sb3_cure.guards import BadTransitionError, Guard, NonFiniteError, TransitionGuard
 from sb3_cure.serialization import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -112,12 +112,12 @@ def bad_head(model: CuReSAC, loss: float = 1.0, error: float = 1.0) -> Any:
 
 
 def bad_pull(model: CuReSAC, name: str, value: float) -> Any:
-    pull = model.policy.encoder_optimizer.pull
+    pull = model.policy.encoder_update.pull
 
     def wrong(source: str, latents: th.Tensor, gradient: th.Tensor) -> None:
         pull(source, latents, gradient * value if source == name else gradient)
 
-    return patched(model.policy.encoder_optimizer, "pull", wrong)
+    return patched(model.policy.encoder_update, "pull", wrong)
 
 
 @contextlib.contextmanager
@@ -141,7 +141,7 @@ def sources(model: CuReSAC) -> dict[str, Any]:
         "gradient of the SRL loss": lambda v: bad_gradient(first(policy.srl), v),
     }
     agents = {"task": (policy.actor, policy.critic, model.log_ent_coef)}
-    agents["curious"] = (policy.curious_actor, policy.curious_critic, model.curious_log_ent_coef)
+    agents["curious"] = (policy.curious.actor, policy.curious.critic, model.policy.curious.log_ent_coef)
     for i, (name, (actor, critic, log_ent_coef)) in enumerate(agents.items()):
         found |= {
             f"{name} critic's loss": functools.partial(bad_output, critic, call=0),
@@ -231,14 +231,14 @@ def test_a_bad_first_loss_leaves_everything_as_it_was(
     model = trained(OwnHead, update)
     monkeypatch.setattr(model._guard, "deferred", deferred)
     before = state_of(model)
-    totals = model.policy.encoder_optimizer.weights
-    sizes = {k: v / totals[k] for k, v in before["policy.encoder_optimizer"]["mean_squares"].items() if totals[k] > 0}
+    totals = model.policy.encoder_update.weights
+    sizes = {k: v / totals[k] for k, v in before["policy.encoder_update"]["mean_squares"].items() if totals[k] > 0}
     with bad_head(model, loss=NAN), pytest.raises(NonFiniteError):
         model.train(1, 8)
         model._guard.report(model)
     after = state_of(model)
     # While deferred the gradients' running sizes are brought forward by themselves: what they say stays.
-    encoder_before, encoder_after = before.pop("policy.encoder_optimizer"), after.pop("policy.encoder_optimizer")
+    encoder_before, encoder_after = before.pop("policy.encoder_update"), after.pop("policy.encoder_update")
     assert differences(before, after) == []
     for name, optimizer in encoder_before["optimizers"].items():
         assert differences(optimizer["state"], encoder_after["optimizers"][name]["state"]) == []
@@ -322,7 +322,7 @@ def test_good_updates_are_the_same_however_they_are_guarded(update: str) -> None
     states = []
     for guard in (Off(), Guard(), Guard(deferred=True)):
         model = tiny_model("CnnPolicy", PixelBox(size=24), srl="rae", update=update)
-        model._guard = model.policy.encoder_optimizer.guard = guard
+        model._guard = model.policy.encoder_update.guard = guard
         states.append(state_of(model.learn(22)))
     assert differences(states[0], states[1]) == []
     assert differences(states[0], states[2]) == []
@@ -863,4 +863,4 @@ def test_an_interrupted_update_pulls_at_no_later_one(monkeypatch: pytest.MonkeyP
         patch.setattr(EncoderOptimizer, "step", interrupted)
         model.pretrain(20, "curious")
     model.learn(11)  # one update
-    assert model.policy.encoder_optimizer.shares.keys() == {"srl", "task"}
+    assert model.policy.encoder_update.shares.keys() == {"srl", "task"}

@@ -220,7 +220,7 @@ def test_net_arch(extras: dict[str, Any], net_arch: list[int] | dict[str, list[i
 
     agents = [(model.policy.actor, model.policy.critic)]
     if extras is ON:
-        agents.append((model.policy.curious_actor, model.policy.curious_critic))
+        agents.append((model.policy.curious.actor, model.policy.curious.critic))
     for actor, critic in agents:
         assert widths(actor.latent_pi) == hidden["pi"]
         assert widths(actor.mu, actor.log_std) == [2, 2]
@@ -234,8 +234,8 @@ def test_custom_optimizer(extras: dict[str, Any]) -> None:
     policy = tiny_model("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs, **extras).learn(13).policy
     optimizers = [policy.actor.optimizer, policy.critic.optimizer]
     if extras is ON:
-        optimizers += [policy.curious_actor.optimizer, policy.curious_critic.optimizer]
-        optimizers += policy.encoder_optimizer.optimizers.values()
+        optimizers += [policy.curious.actor.optimizer, policy.curious.critic.optimizer]
+        optimizers += policy.encoder_update.optimizers.values()
         assert len(optimizers) == 5
         # The head has a weight decay of its own.
         assert type(policy.srl.optimizer) is th.optim.AdamW
@@ -258,7 +258,7 @@ def test_adams_own_arguments(extras: dict[str, Any]) -> None:
 def test_temperature(extras: dict[str, Any], ent_coef: str | float, initial: float) -> None:
     """Learned temperatures start where they are told and move; a fixed one stays and has no optimiser."""
     model = tiny_model("MlpPolicy", VectorBox(), ent_coef=ent_coef, **extras)
-    logs = [model.log_ent_coef] + ([model.curious_log_ent_coef] if extras is ON else [])
+    logs = [model.log_ent_coef] + ([model.policy.curious.log_ent_coef] if extras is ON else [])
     if isinstance(ent_coef, str):
         assert [log.exp().item() for log in logs] == pytest.approx([initial] * len(logs))
         before = [log.clone() for log in logs]
@@ -267,7 +267,7 @@ def test_temperature(extras: dict[str, Any], ent_coef: str | float, initial: flo
     else:
         model.learn(14)
         assert logs == [None] * len(logs)
-        assert model.ent_coef_optimizer is None and model.curious_ent_coef_optimizer is None
+        assert model.ent_coef_optimizer is None
         assert model.ent_coef_tensor.item() == pytest.approx(initial)
 
 
@@ -298,21 +298,6 @@ def test_train_freq(extras: dict[str, Any]) -> None:
         assert isinstance(model.train_freq, TrainFreq)
         model.learn(total)
         assert (model.num_timesteps, model._n_updates) == (total, updates), (train_freq, gradient_steps, n_envs)
-
-
-@both_modes
-def test_bad_train_freq_is_refused(extras: dict[str, Any]) -> None:
-    """Unknown units and fractions are refused, and episodes with several environments, before ``learn``."""
-    for train_freq in ((4, "steps"), ("1", "episode"), "step"):
-        with pytest.raises(ValueError):
-            tiny_model("MlpPolicy", VectorBox(), train_freq=train_freq, **extras)
-    with pytest.raises(ValueError, match="with 2 environments, but episodes are counted in a single one"):
-        tiny_model("MlpPolicy", vec_env(2), train_freq=(1, "episode"), **extras)
-    file = io.BytesIO()
-    tiny_model("MlpPolicy", VectorBox(), train_freq=(1, "episode"), **extras).save(file)
-    with pytest.raises(ValueError, match=r"train_freq is \(1, 'episode'\) with 2 environments, but episodes"):
-        CuReSAC.load(file, env=vec_env(2))
-    assert CuReSAC.load(file, env=vec_env(2), train_freq=1).learn(12).num_timesteps == 12
 
 
 @both_modes
@@ -352,7 +337,7 @@ def test_predict(extras: dict[str, Any], curious: bool) -> None:
     model = tiny_model("MlpPolicy", VectorBox(low=-1.0, high=3.0), **extras)
     predict = model.predict_curious if curious else model.predict
     # Wide distributions, so that draws come close to the bounds
-    nn.init.constant_((model.policy.curious_actor if curious else model.actor).log_std.bias, 3.0)
+    nn.init.constant_((model.policy.curious.actor if curious else model.actor).log_std.bias, 3.0)
     batch = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
     actions, state = predict(batch, deterministic=True)
     assert actions.shape == (50, 2) and state is None
@@ -372,7 +357,7 @@ def test_predict(extras: dict[str, Any], curious: bool) -> None:
 def test_no_curious_policy_without_curiosity() -> None:
     """Asking SB3's own SAC for a curious action is refused with a sentence."""
     model = tiny_model("MlpPolicy", VectorBox(), **OFF)
-    with pytest.raises(ValueError, match="predict_curious was called with curiosity=None"):
+    with pytest.raises(ValueError, match="only curiosity='separate' trains a curious policy"):
         model.predict_curious(model.observation_space.sample())
 
 
@@ -380,7 +365,7 @@ def test_no_curious_policy_without_curiosity() -> None:
 def test_environment_by_name(extras: dict[str, Any]) -> None:
     """A Gymnasium id is made, monitored and vectorised."""
     model = tiny_model("MlpPolicy", "Pendulum-v1", **extras)
-    assert isinstance(model.env, DummyVecEnv) and model.env.env_is_wrapped(Monitor) == [True]
+    assert isinstance(model.get_env(), DummyVecEnv) and model.env.env_is_wrapped(Monitor) == [True]
     model.learn(12)
     assert np.abs(model.predict(model.observation_space.sample())[0]) <= 2
     assert (model._n_updates, model.replay_buffer.size()) == (2, 12)
@@ -414,8 +399,8 @@ def test_get_and_set_parameters(extras: dict[str, Any]) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     model.learn(20)
     moved = {name.split("[")[0].lstrip(".") for name in differences(before, state_of(model))}
-    for module in ("actor.mu", "critic.qf0", "critic.qf1", "critic_target.qf0"):
-        assert any(f"policy.{module}" in name for name in moved), module
+    for module in ("actor.mu", "critic.q", "critic_target.q"):
+        assert any(module in name for name in moved), module
     assert not np.array_equal(actions, model.predict(observations, deterministic=True)[0])
     model.set_parameters(saved)
     np.testing.assert_array_equal(actions, model.predict(observations, deterministic=True)[0])
@@ -432,7 +417,7 @@ def test_set_parameters_exact_match(extras: dict[str, Any]) -> None:
     for name in other:
         with pytest.raises(ValueError, match="do not match"):
             model.set_parameters({key: value for key, value in other.items() if key != name})
-    key = "actor.mu.weight"
+    key = "actor.mu.weight" if extras is OFF else "task.actor.mu.weight"
     part = {"policy": {key: th.full_like(other["policy"][key], 0.125)}}
     before = state_of(model)
     model.set_parameters(part, exact_match=False)
@@ -664,7 +649,9 @@ def test_n_step_returns(extras: dict[str, Any], monkeypatch: pytest.MonkeyPatch)
     with th.no_grad():
         inputs = batch.observations if extras is OFF else model.policy.encode(batch.observations)
         target = batch.rewards + batch.discounts * 10
-        expected = sum(0.5 * (q - target).square().mean() for q in model.critic(inputs, batch.actions))
+        values = model.critic(inputs, batch.actions)
+        values = values if extras is OFF else values.unbind(dim=1)
+        expected = sum(0.5 * (q - target).square().mean() for q in values)
     assert float(model.logger.name_to_value["train/critic_loss"]) == pytest.approx(expected.item(), rel=1e-5)
 
 
@@ -712,10 +699,10 @@ def test_learning_rate_schedule(extras: dict[str, Any]) -> None:
     optimizers = [policy.actor.optimizer, policy.critic.optimizer]
     temperatures = [model.ent_coef_optimizer]
     if extras is ON:
-        optimizers += [policy.curious_actor.optimizer, policy.curious_critic.optimizer, policy.srl.optimizer]
-        temperatures.append(model.curious_ent_coef_optimizer)
+        optimizers += [policy.curious.actor.optimizer, policy.curious.critic.optimizer, policy.srl.optimizer]
+        temperatures.append(model.policy.curious.ent_coef_optimizer)
         # The encoder's one step stands for those of three losses.
-        (joint,) = policy.encoder_optimizer.optimizers.values()
+        (joint,) = policy.encoder_update.optimizers.values()
         assert joint.param_groups[0]["lr"] == pytest.approx(5e-3 * 3**0.5)
     ratio = 0.1 if extras is ON else 1.0
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers] == [5e-3] * len(optimizers)

@@ -87,12 +87,12 @@ def moved(model: CuReSAC, step: Callable[[], Any]) -> set[str]:
     step()
     after = state_of(model)
     names = {name.split(".")[1] for name in differences(before["policy"], after["policy"])}
-    temperatures = ("log_ent_coef", "curious_log_ent_coef")
+    temperatures = ("log_ent_coef", "policy.curious.log_ent_coef")
     return names | {key for key in temperatures if differences(before.get(key), after.get(key))}
 
 
 TASK = {"actor", "critic", "critic_target", "log_ent_coef"}
-CURIOUS = {"curious_actor", "curious_critic", "curious_critic_target", "curious_log_ent_coef"}
+CURIOUS = {"curious_actor", "curious_critic", "curious_critic_target", "policy.curious.log_ent_coef"}
 #: Running statistics of the curious reward
 STATISTICS = {"curiosity"}
 
@@ -165,7 +165,7 @@ def test_actors_and_targets_keep_to_the_clock_of_updates(update: str) -> None:
         names = moved(model, lambda: model.train(1, batch_size=8))
         expected = {"encoder", "srl", "critic", "curious_critic", *STATISTICS}
         if n_updates % 2 == 0:
-            expected |= {"actor", "curious_actor", "log_ent_coef", "curious_log_ent_coef"}
+            expected |= {"actor", "curious_actor", "log_ent_coef", "policy.curious.log_ent_coef"}
         if n_updates % 3 == 0:
             expected |= {"encoder_target", "critic_target", "curious_critic_target"}
         assert names == expected
@@ -214,8 +214,8 @@ def acting_model(env: gym.Env | VecEnv, **kwargs: Any) -> CuReSAC:
     """Collects without updates; the task actor does -1, the curious one +1, so that the buffer tells who acted."""
     model = tiny_model("CnnPolicy", env, gradient_steps=0, **kwargs)
     fix_action(model.policy.actor, -1)
-    if model.policy.curious_actor is not None:
-        fix_action(model.policy.curious_actor, 1)
+    if model.policy.curious.actor is not None:
+        fix_action(model.policy.curious.actor, 1)
     return model
 
 
@@ -231,10 +231,10 @@ def test_probability_0_never_asks_the_curious_actor() -> None:
         raise AssertionError("the curious actor was asked")
 
     # `forward` is how actors act; updates call `action_log_prob`.
-    model.policy.curious_actor.forward = forbidden
+    model.policy.curious.actor.forward = forbidden
     fix_action(model.policy.actor, -1)
     names = moved(model, lambda: model.learn(14))
-    assert names >= {"curious_actor", "curious_critic", "curious_log_ent_coef"}
+    assert names >= {"curious_actor", "curious_critic", "policy.curious.log_ent_coef"}
     with pytest.raises(AssertionError, match="was asked"):
         model.predict_curious(model.observation_space.sample())
 
@@ -313,7 +313,7 @@ def test_random_second_actor_is_uniform() -> None:
     """``curiosity="random"``: uniform within the bounds of the actions, and nothing is trained for it."""
     env = RecordingBox(low=-1.0, high=3.0)
     model = acting_model(env, curiosity="random", curiosity_prob=1.0)
-    assert model.policy.curious_actor is None
+    assert model.policy.curious.actor is None
     model.learn(500)
     actions = np.array(env.actions[10:]).ravel()
     counts, _ = np.histogram(actions, bins=8, range=(-1, 3))
@@ -334,7 +334,7 @@ def test_random_second_actor_mixes() -> None:
 def test_bonus_has_one_actor() -> None:
     """``curiosity="bonus"``: there is no second actor, whatever p_c is."""
     model = acting_model(PixelBox(), curiosity="bonus", curiosity_prob=1.0)
-    assert model.policy.curious_actor is None
+    assert model.policy.curious.actor is None
     model.learn(20)
     np.testing.assert_allclose(stored_actions(model)[10:], -1, atol=1e-3)
 
@@ -414,7 +414,7 @@ def test_rewards_of_the_critics(curiosity: str, update: str, monkeypatch: pytest
     curious_reward = 0.1 * brightness(batch.next_observations)[:, None]
     cases = [("train/critic_loss", model.critic, batch.rewards + (curious_reward if curiosity == "bonus" else 0))]
     if curiosity == "separate":
-        cases.append(("train/curious_critic_loss", model.policy.curious_critic, curious_reward))
+        cases.append(("train/curious_critic_loss", model.policy.curious.critic, curious_reward))
     for key, critic, target in cases:
         with th.no_grad():
             errors = [q - target for q in critic(model.policy.encode(batch.observations), batch.actions)]
@@ -466,8 +466,8 @@ def test_pretraining(curiosity: str | None, collector: str, update: str) -> None
     def watch(locals_: dict[str, Any], _: Any) -> bool:
         actions.append(locals_["buffer_actions"])
         if len(actions) == 1 and collector == "curious":
-            fix_action(model.policy.curious_actor, 1)
-            model.policy.curious_actor.optimizer.step = lambda: None  # it keeps its action
+            fix_action(model.policy.curious.actor, 1)
+            model.policy.curious.actor.optimizer.step = lambda: None  # it keeps its action
         return True
 
     model.pretrain(30, collector, callback=watch)
@@ -490,12 +490,12 @@ def test_pretraining(curiosity: str | None, collector: str, update: str) -> None
     fix_action(model.policy.actor, -1)
     asked: list[int] = []
     if curiosity is None:
-        assert model.policy.curious_actor is None and model.curious_log_ent_coef is None
+        assert model.policy.curious.actor is None and model.policy.curious.log_ent_coef is None
         assert not any("curious" in key for key in [*model.get_parameters(), *model.policy.state_dict()])
         with pytest.raises(ValueError, match="predict_curious"):
             model.predict_curious(model.observation_space.sample())
     else:
-        model.policy.curious_actor.register_forward_hook(lambda *_: asked.append(1))
+        model.policy.curious.actor.register_forward_hook(lambda *_: asked.append(1))
     dumps = log_to(model)
     model.learn(30)
     model.logger.dump()

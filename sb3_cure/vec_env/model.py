@@ -29,6 +29,12 @@ class ModelEnvironments(OffPolicyAlgorithm):
         if self.env is not None and not (isinstance(self.env, FiniteCheck) and self.env.skip == skip):
             self.env = FiniteCheck(self.env, self.on_bad_transition)
 
+    def get_env(self) -> VecEnv | None:
+        """
+        :return: The environments without our look around them: callbacks compare their kind with that of others
+        """
+        return self.env.venv if isinstance(self.env, FiniteCheck) else self.env
+
     def _setup_model(self) -> None:
         self._check_environments()
         if self.overlap and self.env is not None:
