@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, Logger, TensorBoardOutputFormat
@@ -33,7 +34,7 @@ from torch.nn import functional as F
 
 from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
 from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
-from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked, why_not_skipping
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, SkipsMarked, refuse_marked
 from sb3_cure.checkpoint import Run, resume, watch
 from sb3_cure.checks import (
     check_arguments,
@@ -302,6 +303,9 @@ class CuReSAC(SAC):
             self.policy_class = own.get(self.policy_class, self.policy_class)  # type: ignore[call-overload]
             check_parts(self)
             check_sb3s_images(self.policy_class, self.observation_space, self.policy_kwargs)
+            env = None if self.env is None else self.env.unwrapped
+            if self.on_bad_transition == "skip" or getattr(env, "on_env_fault", None) == "restart":
+                self._choose_skipping_buffer()
             with explaining_memory(self):
                 super()._setup_model()
             return
@@ -373,6 +377,14 @@ class CuReSAC(SAC):
             if self.observation_space.dtype == np.uint8 and len(self.observation_space.shape) == 3:  # type: ignore[arg-type]
                 self.replay_buffer_class = FrameStackReplayBuffer
                 self.replay_buffer_kwargs = {"frame_stack": frame_stack, **self.replay_buffer_kwargs}
+                return
+        self._choose_skipping_buffer()
+
+    def _choose_skipping_buffer(self) -> None:
+        """Where SB3's plain ReplayBuffer would be used: the one that never samples marked transitions."""
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        if self.replay_buffer_class is None and self.n_steps == 1 and not self.optimize_memory_usage and not is_dict:
+            self.replay_buffer_class = SkippingReplayBuffer
 
     def _told_frame_stack(self) -> int | None:
         if self.env is None:
@@ -474,7 +486,8 @@ class CuReSAC(SAC):
 
     def _check_skipping(self) -> None:
         """Whether transitions can be left out, if that may be asked for in the middle of the training."""
-        reason = why_not_skipping(self.replay_buffer)  # type: ignore[arg-type]
+        skips = isinstance(self.replay_buffer, SkipsMarked)
+        reason = None if skips else f"which a {type(self.replay_buffer).__name__} cannot do: use SkippingReplayBuffer."
         self._transition_guard.can_skip = reason is None and self._vec_normalize_env is None
         if reason is not None and self.on_bad_transition == "skip":
             raise ValueError(f"on_bad_transition='skip' leaves transitions out of the replay buffer, {reason}")
@@ -600,7 +613,7 @@ class CuReSAC(SAC):
             # The environments have gone on: another `learn` starts with a reset.
             self._last_obs = None
             raise
-        skip_marked(replay_buffer, infos)
+        refuse_marked(replay_buffer, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     # -------------------------------------------------------------- learning
