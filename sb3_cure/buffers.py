@@ -286,11 +286,11 @@ class FrameStackReplayBuffer(SkipsMarked):
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
         channels, height, width = self.obs_shape
         self.frame_shape = (channels // frame_stack, height, width)
-        # What one `add` may write: two whole stacks per environment. The ring holds that, and the stack before it, even
-        # where there is room for a single row.
+        # What one `add` may write: two whole stacks per environment. Before it does, rows are given up for that many
+        # frames; so the ring has room for as many more, and for the row that it writes and the stack before it.
         self._max_frames_per_add = 2 * frame_stack * n_envs
         n_frames = math.ceil((1 + self.SPARE_FRAMES) * self.buffer_size * n_envs)
-        self.frame_capacity = n_frames + self._max_frames_per_add + frame_stack * n_envs
+        self.frame_capacity = n_frames + 2 * self._max_frames_per_add + frame_stack * n_envs
 
         # Fresh zeros take no memory until they are written to. A file is reserved by the first `add`, so that a model
         # that is loaded to act needs none.
