@@ -31,6 +31,7 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_cure import CuReSAC
+from sb3_cure.buffers import transitions
 from sb3_cure.checkpoint import CheckpointWriter, _load_random_state, _random_state
 from sb3_cure.experiments.files import describe_run, write_json
 
@@ -137,7 +138,7 @@ def _digest(model: CuReSAC) -> str:
     resumed: Any = model._run.resumed
     take(model.get_parameters())
     rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
-    take([np.asarray(each) for each in buffer.transitions(rows, np.zeros(len(rows), int))[:5] if each is not None])
+    take([np.asarray(each) for each in transitions(buffer, rows, np.zeros(len(rows), int))[:5] if each is not None])
     take([model.num_timesteps, model._n_updates, model._last_obs])
     take([resumed.state["random"], resumed.state["environments"]])
     return digest.hexdigest()

@@ -225,15 +225,19 @@ class CuRe(OffPolicyAlgorithm):
         check_arguments(self)
         self._metrics, self._guard = Metrics(), Guard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
+        if self.replay_buffer_class is None and self.n_steps == 1 and not self.optimize_memory_usage:
+            self.replay_buffer_class, self.replay_buffer_kwargs = choose_replay_buffer(
+                self.env,
+                self.observation_space,
+                self.replay_buffer_kwargs,
+                plain=self.everything_off,
+                skips=self.on_bad_transition == "skip",
+            )
         if self.everything_off:
             self.policy_kwargs.pop("share_encoder", None)
             self.policy_class = self.plain_policies.get(self.policy_class, self.policy_class)
             super()._setup_model()
             return
-        if self.replay_buffer_class is None and self.n_steps == 1:
-            self.replay_buffer_class, self.replay_buffer_kwargs = choose_replay_buffer(
-                self.env, self.observation_space, self.replay_buffer_kwargs
-            )
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_choices()}
         super()._setup_model()

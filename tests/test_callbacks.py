@@ -26,6 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_cure import CuReSAC, callbacks, make_dmc_env
+from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import (
     CuriosityMapCallback,
     EvalBothCallback,
@@ -262,7 +263,7 @@ def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Pa
     assert [steps for steps, _ in callback.rows] == [15, 30]
     chosen = callback.observations.copy()
     assert len(chosen) == 5
-    stored = model.replay_buffer.transitions(np.arange(15), np.zeros(15, int)).observations.numpy()
+    stored = transitions(model.replay_buffer, np.arange(15), np.zeros(15, int)).observations.numpy()
     assert all((observation == stored).all(axis=(1, 2, 3)).any() for observation in chosen)
     height = np.asarray(Image.open(tmp_path / "reconstructions.png")).shape[0]
     callback.on_period()

@@ -31,6 +31,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import sb3_cure
 from benchmarks import zero_decoder
 from sb3_cure import CuReSAC, files, generations
+from sb3_cure.buffers import transitions
 from sb3_cure.experiments import cells, heads, media, plots, probe, run, visitation, yardsticks
 from sb3_cure.experiments import files as experiment_files
 from sb3_cure.experiments.cells import run_cell
@@ -431,7 +432,7 @@ def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **change
 def transitions_of(run_of_cell: Any) -> Any:
     """All that its replay buffer holds."""
     buffer = run_of_cell.model.replay_buffer
-    return buffer.transitions(*np.divmod(np.arange(2 * buffer.pos), 2))
+    return transitions(buffer, *np.divmod(np.arange(2 * buffer.pos), 2))
 
 
 @pytest.mark.parametrize(("task", "budget"), [(TASK, 200), ("dmc_pixels/cartpole-swingup-v0", 400)])

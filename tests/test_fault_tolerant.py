@@ -24,7 +24,7 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
@@ -32,10 +32,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_cure import buffers, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
-from sb3_cure.callbacks import _spread_over
 from sb3_cure.envs import EnvFaultError, FaultTolerantSubprocVecEnv
 from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
-from sb3_cure.evaluation import most_uncomfortable
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 # What the sentence says of each kind of fault
@@ -390,27 +388,6 @@ def test_skipping_changes_nothing_where_nothing_is_marked() -> None:
         np.random.seed(0)
         batches.append([tuple(buffer.sample(64)) for _ in range(3)])
     assert differences(batches[0], batches[1]) == differences(batches[0], batches[2]) == []
-
-
-def test_sb3_buffers_learn_to_skip_or_say_that_they_cannot() -> None:
-    buffer = buffer_of(ReplayBuffer, 20, 2)
-    for transition in stream(2, 10, {(7, 1)}, "bad_transition"):
-        buffers.skip_marked(buffer, transition[-1])
-        assert type(buffer) is (ReplayBuffer if transition[3][0] < 14 else SkippingReplayBuffer)
-        buffer.add(*transition)
-    assert 15 not in buffer.sample(2000).rewards
-    with pytest.raises(ValueError, match=r"out of the replay buffer \(broken\), which a DictReplayBuffer cannot do"):
-        images = spaces.Dict({"image": spaces.Box(0, 255, (2, 3, 3), np.uint8)})
-        buffers.skip_marked(DictReplayBuffer(10, images, ACTIONS), [{"env_fault": "broken"}])
-    with pytest.raises(ValueError, match=r"optimize_memory_usage is True.*: leave it False"):
-        SkippingReplayBuffer(
-            10, buffer.observation_space, ACTIONS, optimize_memory_usage=True, handle_timeout_termination=False
-        )
-    only_faults = buffer_of(SkippingReplayBuffer, 20, 1)
-    for transition in stream(1, 2, {(0, 0), (1, 0)}, "env_fault"):
-        only_faults.add(*transition)
-    with pytest.raises(ValueError, match="All 2 transitions in the replay buffer are marked"):
-        only_faults.sample(1)
 
 
 # ------------------------------------------------------------------------------------------ the vectorised environment
@@ -846,32 +823,6 @@ def test_statistics_of_episodes(tmp_path: Path) -> None:
     assert [info["l"] for info in model.ep_info_buffer] == [5] * 7
     rows = (tmp_path / "1.monitor.csv").read_text().splitlines()[2:]
     assert [int(row.split(",")[1]) for row in rows] == [5] * 3
-
-
-def test_pictures_and_measurements_leave_out_what_is_marked() -> None:
-    env = made([partial(PixelBox, size=36)] * 2)
-    model = tiny_model("CnnPolicy", env)
-    callback = KillNow(3, 6, 9, 12)
-    model.learn(40, callback=callback)
-    env.close()
-    buffer = model.replay_buffer
-    assert callback.faults == buffer.marked.sum() == 4
-    looked_at = []
-    original = buffer.transitions
-    buffer.transitions = lambda rows, env_inds, *rest: (  # type: ignore[method-assign]
-        looked_at.append(buffer.marked[rows, env_inds]),
-        original(rows, env_inds, *rest),
-    )[1]
-    buffer.marked[0, 0] = True  # one that a picture from the first to the last would begin with
-    _spread_over(buffer, 10)
-    most_uncomfortable(model, k=40)
-    assert len(looked_at) > 1 and not np.concatenate(looked_at).any()
-    buffer.marked[:, 0] = True
-    assert len(_spread_over(buffer, 10)) == 10 and not looked_at[-1].any(), "those of the other environment"
-    buffer.marked[:] = True
-    assert _spread_over(buffer, 10) is None
-    with pytest.raises(ValueError, match="all transitions in the replay buffer are marked as faulty"):
-        most_uncomfortable(model, k=40)
 
 
 def test_a_restart_is_told_with_the_traceback_of_the_worker() -> None:
