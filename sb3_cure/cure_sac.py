@@ -50,24 +50,16 @@ from sb3_cure.checks import (
     make_env,
 )
 from sb3_cure.files import PathOrFile
-from sb3_cure.guards import (
-    BadTransitionError,
-    Guard,
-    TransitionGuard,
-    check_actions,
-    looking_before_steps,
-    post_mortem_of_a_step,
-    warn_of_dark_images,
-)
+from sb3_cure.guards import Guard, looking_before_steps
 from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip, told_frame_stack
 from sb3_cure.mixers import CuriousMixer
-from sb3_cure.overlap import OverlappedVecEnv
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
 from sb3_cure.serialization import ArchiveError
 from sb3_cure.settings import NEVER_SAVED, plain_arguments
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.values import is_integer
+from sb3_cure.vec_env import BadTransitionError, FiniteCheck, OverlappedVecEnv
 from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
@@ -294,7 +286,8 @@ class CuReSAC(SAC):
         check_arguments(self)
         self._metrics = Metrics()
         self._guard = Guard(deferred=self.device.type != "cpu")
-        self._transition_guard = TransitionGuard(skip=self.on_bad_transition == "skip")
+        if self.env is not None:
+            self.env = FiniteCheck(self.env, self.on_bad_transition)
         self._read_env_attributes()
         if self.is_plain_sac:
             self.policy_kwargs.pop("share_encoder", None)
@@ -475,7 +468,6 @@ class CuReSAC(SAC):
     def _check_skipping(self) -> None:
         """Whether transitions can be left out, if that may be asked for in the middle of the training."""
         reason = why_not_skipping(self.replay_buffer)  # type: ignore[arg-type]
-        self._transition_guard.can_skip = reason is None and self._vec_normalize_env is None
         if reason is not None and self.on_bad_transition == "skip":
             raise ValueError(f"on_bad_transition='skip' leaves transitions out of the replay buffer, {reason}")
         if reason is not None and getattr(self.env.unwrapped, "on_env_fault", None) == "restart":  # type: ignore[union-attr]
@@ -520,11 +512,8 @@ class CuReSAC(SAC):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        self._check_first_observations()
         if self.is_plain_sac:
-            executed, actions = super()._sample_action(learning_starts, action_noise, n_envs)
-            self._check_actions(actions)
-            return executed, actions
+            return super()._sample_action(learning_starts, action_noise, n_envs)
         # Noise is added below, once, whoever acts.
         _, actions = super()._sample_action(learning_starts, None, n_envs)
         if self.num_timesteps >= learning_starts:
@@ -533,19 +522,7 @@ class CuReSAC(SAC):
                 actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
         if action_noise is not None:
             actions = np.clip(actions + action_noise(), -1, 1)
-        self._check_actions(actions)
         return self.policy.unscale_action(actions), actions
-
-    def _check_actions(self, actions: np.ndarray) -> None:
-        with post_mortem_of_a_step(self, observations=self._last_obs, actions=actions):
-            check_actions(actions, self.num_timesteps)
-
-    def _check_first_observations(self) -> None:
-        """Observations that no transition has brought: those of a reset."""
-        if self._last_obs is not None:
-            original = None if self._vec_normalize_env is None else self._last_original_obs
-            with post_mortem_of_a_step(self, observations=self._last_obs, original_observations=original):
-                self._last_obs = self._transition_guard.admit_first(self._last_obs, original, self.num_timesteps)  # type: ignore[arg-type, assignment]
 
     def _second_actor_acts(self, n_envs: int) -> np.ndarray:
         """Boolean array [n_envs]: where the second (curious or random) actor acts in this step."""
@@ -574,32 +551,6 @@ class CuReSAC(SAC):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        seen: dict[str, Any] = {"observations": self._last_obs, "actions": buffer_action}
-        seen |= {"next_observations": new_obs, "rewards": reward, "dones": dones}
-        seen["terminal_observations"] = {str(i): info.get("terminal_observation") for i, info in enumerate(infos)}
-        if self._vec_normalize_env is not None:
-            # What is stored; clipped, it may look finite.
-            original = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
-            seen |= {"original_next_observations": original[0], "original_rewards": original[1]}
-        try:
-            with post_mortem_of_a_step(self, **seen):
-                check_actions(buffer_action, self.num_timesteps)
-                is_normalized = self._vec_normalize_env is not None
-                if is_normalized:
-                    self._transition_guard.admit(self._last_obs, *original, dones, infos, self.num_timesteps)  # type: ignore[arg-type]
-                new_obs, reward, infos = self._transition_guard.admit(
-                    self._last_obs,  # type: ignore[arg-type]
-                    new_obs,
-                    reward,
-                    dones,
-                    infos,
-                    self.num_timesteps,
-                    is_normalized,
-                )
-        except BadTransitionError:
-            # The environments have gone on: another `learn` starts with a reset.
-            self._last_obs = None
-            raise
         skip_marked(replay_buffer, infos)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
@@ -642,14 +593,13 @@ class CuReSAC(SAC):
                 learning_starts,
                 log_interval,
             )
-        except BaseException:
-            if self._overlapped is not None:
+        except BaseException as error:
+            if self._overlapped is not None or isinstance(error, BadTransitionError):
                 # The environments may have gone on without us: another `learn` starts with a reset.
                 self._last_obs = None
             raise
         if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
             self._warmed_up = True
-            warn_of_dark_images(self.observation_space, replay_buffer)
             updates = self.warmup_updates
             if updates is None:
                 updates = 0 if self.srl is None or learning_starts == 0 else get_srl_class(self.srl).warmup_updates
@@ -1070,6 +1020,13 @@ class CuReSAC(SAC):
         :raises ValueError: if it is nothing of these, or has other spaces
         """
         super().set_env(make_env(env, self.verbose, required=True), force_reset)
+        self.env = FiniteCheck(self.env, self.on_bad_transition)  # type: ignore[arg-type]
+
+    def get_env(self) -> VecEnv | None:
+        """
+        :return: The environments as they were given, with which SB3's evaluation compares its own
+        """
+        return self.env.venv if isinstance(self.env, FiniteCheck) else self.env
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """
@@ -1080,25 +1037,13 @@ class CuReSAC(SAC):
         if seed is not None and self._mixer is not None and getattr(self, "policy", None) is not None:
             self._mixer.rng = np.random.default_rng(seed)
 
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        """Without episodes whose return is not finite, of which ``on_bad_transition="skip"`` leaves transitions out:
-        one would make the mean of the next 99 so, too."""
-        if self.on_bad_transition == "skip":
-            infos = [
-                info
-                if np.isfinite((info.get("episode") or {}).get("r", 0))
-                else {key: value for key, value in info.items() if key != "episode"}
-                for info in infos
-            ]
-        super()._update_info_buffer(infos, dones)
-
     def dump_logs(self) -> None:
         """Write the logs: SB3's, and environment steps beside agent steps."""
         self.logger.record("time/environment_steps", self.num_timesteps * self._action_repeat)
         if self._mixer is not None and self._mixer.n_steps > 0:
             self.logger.record("rollout/curious_share", self._mixer.pop_share())
-        if self._transition_guard.n_bad > 0:
-            self.logger.record("rollout/bad_transitions", self._transition_guard.n_bad)
+        if self.env is not None and self.env.n_bad > 0:  # type: ignore[attr-defined]
+            self.logger.record("rollout/bad_transitions", self.env.n_bad)  # type: ignore[attr-defined]
         super().dump_logs()
         self._guard.report(self)
 

@@ -1,7 +1,4 @@
-"""What is not finite reaches neither parameters nor replay buffer, and its source is named.
-
-``Guard`` stands before every step of an optimiser, ``TransitionGuard`` before the replay buffer and the policy.
-"""
+"""What is not finite reaches no parameter, and its source is named: ``Guard`` stands before each optimiser's step."""
 
 import contextlib
 import copy
@@ -9,7 +6,6 @@ import inspect
 import json
 import math
 import tempfile
-import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -18,11 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.sac.sac import SAC
@@ -31,8 +24,6 @@ from sb3_cure.buffers import transitions
 
 if TYPE_CHECKING:
     from sb3_cure.cure_sac import CuReSAC
-
-Observations = np.ndarray | dict[str, np.ndarray]
 
 #: Gradients with a larger norm overflow float32 where Adam squares them
 LARGEST_NORM = math.sqrt(np.finfo(np.float32).max)
@@ -71,25 +62,6 @@ class NonFiniteError(_WithPostMortem):
             f"too) must be finite: the parameters did not take it; {self._look}lower the learning rate, or fix the SRL "
             "head or the rewards."
         )
-
-
-class BadTransitionError(_WithPostMortem):
-    """A reward, an observation or an action was not finite; it was neither stored nor executed. ``post_mortem`` says
-    where more is written.
-
-    :param reason: What was not finite, where and when
-    :param consequence: What was not done with it
-    :param fix: What to do
-    """
-
-    def __init__(self, reason: str, consequence: str, fix: str):
-        super().__init__(reason, consequence, fix)
-        self.reason = reason
-        self.consequence = consequence
-        self.fix = fix
-
-    def __str__(self) -> str:
-        return f"{self.reason}: {self.consequence}; {self._look}{self.fix}."
 
 
 class Check(NamedTuple):
@@ -408,251 +380,3 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
         return value
     return repr(value)
-
-
-# ------------------------------------------------------------------- transitions
-
-
-def warn_of_dark_images(observation_space: spaces.Space, replay_buffer: ReplayBuffer) -> None:
-    """Floats in [0, 1] that an environment returns for a space of uint8 are cast without a word, to black.
-
-    :param observation_space: Observation space of the model
-    :param replay_buffer: What its environments have returned
-    """
-    stored = getattr(replay_buffer, "frames", getattr(replay_buffer, "observations", None))
-    if not is_image_space(observation_space) or not isinstance(stored, np.ndarray):
-        return
-    # What is not written yet is zero. (A row needs several frames, of which the first may be VecFrameStack's zeros.)
-    brightest = int(stored[:1000].max())
-    if brightest <= 1:
-        warnings.warn(
-            f"no pixel of the images so far is brighter than {brightest} of 255, so that the policy sees black: if the "
-            "environment returns floats in [0, 1], return (255 * image).astype(np.uint8) instead.",
-            stacklevel=2,
-        )
-
-
-class TransitionGuard:
-    """Looks at what environments return before it is stored or shown to the policy: all has to be finite as float32.
-
-    With ``skip`` a bad transition is marked in its info (``"bad_transition"``: why), by which replay buffers know never
-    to sample it; finite numbers are stored in its place, and the policy goes on with the last good observation. The
-    transition that starts from such a stand-in is as bad.
-
-    :param skip: Whether bad transitions are left out rather than an error
-    """
-
-    def __init__(self, skip: bool):
-        self.skip = skip
-        #: Whether that could be asked for
-        self.can_skip = True
-        #: How many transitions were left out
-        self.n_bad = 0
-        self._warned: set[str] = set()
-        # The latest observations that were looked at, and of which environments they are stand-ins
-        self._seen: Observations | None = None
-        self._stand_ins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        # Whether the latest observations come from a state, so that only their values tell them
-        self._restored = False
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: What the transitions to come depend on, between two steps: plain values and arrays
-        """
-        seen = self._seen if self._stand_ins.any() else None
-        return {
-            "n_bad": self.n_bad,
-            "warned": sorted(self._warned),
-            "stand_ins": [bool(stand_in) for stand_in in self._stand_ins],
-            # Observations without stand-ins can be looked at again.
-            "seen": {key: value.copy() for key, value in seen.items()} if isinstance(seen, dict) else copy.copy(seen),
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Of ``state_dict``; where the policy then does not see the same observations, as after a reset,
-            nothing is a stand-in
-        """
-        self.n_bad = state["n_bad"]
-        self._warned = set(state["warned"])
-        self._stand_ins = np.array(state["stand_ins"], dtype=bool)
-        self._seen, self._restored = state["seen"], True
-
-    def admit_first(self, observations: Observations, original: Observations | None, timestep: int) -> Observations:
-        """
-        :param observations: What the policy is about to see, [n_envs, ...]; news after a reset only
-        :param original: The same before ``VecNormalize``, if there is one
-        :param timestep: Agent steps so far, for the message
-        :return: The same, with zeros in place of what is not finite
-        :raises BadTransitionError: if something is not finite and must not be skipped
-        """
-        if observations is self._seen or (self._restored and _equal(observations, self._seen)):
-            self._seen, self._restored = observations, False
-            return observations
-        self._restored = False
-        bad = _not_finite(observations) | (False if original is None else _not_finite(original))
-        for i in map(int, np.flatnonzero(bad)):
-            self._complain("first observation", i, (_row(observations, i), _row(original, i)), timestep)
-        if bad.any():
-            observations = _replaced(observations, bad, None)
-        self._seen, self._stand_ins = observations, bad
-        return observations
-
-    def admit(
-        self,
-        last_obs: Observations,
-        new_obs: Observations,
-        rewards: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-        timestep: int,
-        normalized: bool = False,
-    ) -> tuple[Observations, np.ndarray, list[dict[str, Any]]]:
-        """
-        :param last_obs: Observations on which the agent acted, [n_envs, ...]
-        :param new_obs: Observations that followed; where an episode ended, the first of the next
-        :param rewards: Rewards, [n_envs]
-        :param dones: Whether the episode ended, [n_envs]
-        :param infos: One dictionary per environment
-        :param timestep: Agent steps so far, for the message
-        :param normalized: Whether ``VecNormalize`` has made them of others that are finite
-        :return: New observations, rewards and infos that are fit to be stored
-        :raises BadTransitionError: if something is not finite and must not be skipped
-        """
-        ends = {int(i): infos[i].get("terminal_observation") for i in np.flatnonzero(dones)}
-        if rewards.dtype == object:  # of worker processes, one of which returned None
-            rewards = rewards.astype(np.float32)
-        bad_rewards, bad_obs = _not_finite(rewards), _not_finite(new_obs)
-        bad_ends = [i for i, end in ends.items() if end is not None and _first_bad(end) is not None]
-        stand_ins = self._stand_ins if last_obs is self._seen else np.zeros(len(dones), dtype=bool)
-        self._seen, self._stand_ins = new_obs, bad_obs
-        if not (bad_ends or (bad_rewards | bad_obs | stand_ins).any()):
-            return new_obs, rewards, infos
-
-        reasons: dict[int, str] = {}
-        for i in range(len(dones)):
-            if stand_ins[i]:
-                reasons[i] = f"environment {i} returned no finite observation before agent step {timestep}"
-            if bad_rewards[i]:
-                reasons[i] = self._complain("reward", i, rewards[i], timestep, normalized)
-            if bad_obs[i]:
-                reason = self._complain("observation", i, _row(new_obs, i), timestep, normalized)
-                if ends.get(i) is None:
-                    reasons[i] = reason
-            if i in bad_ends:
-                reasons[i] = self._complain("terminal observation", i, ends[i], timestep, normalized)
-        self.n_bad += len(reasons)
-        infos = [{**info, "bad_transition": reasons[i]} if i in reasons else info for i, info in enumerate(infos)]
-        for i in bad_ends:
-            infos[i]["terminal_observation"] = _row(last_obs, i)
-        self._seen = _replaced(new_obs, bad_obs, last_obs)
-        return self._seen, np.where(bad_rewards, 0, rewards).astype(rewards.dtype), infos
-
-    def _complain(self, kind: str, env: int, value: Any, timestep: int, normalized: bool = False) -> str:
-        """Raise, or warn of the first of a kind, and return what is wrong."""
-        what = f"the {kind} {value}" if kind == "reward" else f"the {kind} with {_first_bad(value)} in it"
-        source = "VecNormalize made" if normalized else f"environment {env} returned"
-        reason = f"{source} {what} at agent step {timestep}, but {kind}s must be finite in float32"
-        if not self.skip:
-            fix = "fix the environment"
-            if normalized:
-                fix = "make a new VecNormalize, or load one: its statistics have taken a value that was not finite"
-            elif self.can_skip:
-                fix += ", or leave such transitions out with on_bad_transition='skip'"
-            raise BadTransitionError(reason, "it was not stored", fix)
-        if kind not in self._warned:
-            self._warned.add(kind)
-            warnings.warn(
-                f"{reason}: the transition is left out (on_bad_transition='skip'), and rollout/bad_transitions counts "
-                "this and others; fix the environment.",
-                stacklevel=2,
-            )
-        return reason
-
-
-def _arrays(values: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    """Those in nested dictionaries, by the names on the way."""
-    found: dict[str, np.ndarray] = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            found |= _arrays(value, f"{prefix}{name}.")
-        elif isinstance(value, np.ndarray):
-            found[prefix + name] = value
-    return found
-
-
-def _not_finite(values: Observations) -> npt.NDArray[np.bool_]:
-    """Rows in which a number is not finite, [n]."""
-    if isinstance(values, dict):
-        return np.logical_or.reduce([_not_finite(value) for value in values.values()])
-    if not np.issubdtype(values.dtype, np.floating):
-        return np.zeros(len(values), dtype=bool)
-    return ~np.logical_and.reduce(_is_finite(values.reshape(len(values), -1)), axis=1)
-
-
-def _is_finite(numbers: np.ndarray) -> npt.NDArray[np.bool_]:
-    """As float32, in which rewards are stored and networks compute: 1e39 is not."""
-    with np.errstate(over="ignore"):
-        return np.isfinite(numbers.astype(np.float32, copy=False))
-
-
-def _equal(one: Observations, other: Observations | None) -> bool:
-    if isinstance(one, dict):
-        return isinstance(other, dict) and one.keys() == other.keys() and all(_equal(one[k], other[k]) for k in one)
-    return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other)
-
-
-def _first_bad(value: Any) -> float | None:
-    """The first number that is not finite in an array, or in nested ones."""
-    if isinstance(value, dict | tuple):
-        found = map(_first_bad, value.values() if isinstance(value, dict) else value)
-        return next((bad for bad in found if bad is not None), None)
-    numbers = np.ravel([] if value is None else value)
-    bad = numbers[~_is_finite(numbers)]
-    return float(bad[0]) if len(bad) > 0 else None
-
-
-def _row(values: Observations | None, i: int) -> Any:
-    if values is None:
-        return None
-    return {key: value[i] for key, value in values.items()} if isinstance(values, dict) else values[i]
-
-
-def _replaced(values: Observations, rows: npt.NDArray[np.bool_], by: Any) -> Any:
-    """A copy with these rows of others, or with zeros in them."""
-    if isinstance(values, dict):
-        return {key: _replaced(value, rows, None if by is None else by[key]) for key, value in values.items()}
-    values = values.copy()
-    values[rows] = 0 if by is None else by[rows]
-    return values
-
-
-def check_actions(actions: np.ndarray, timestep: int) -> None:
-    """
-    :param actions: Actions of one step, [n_envs, ...]
-    :param timestep: Agent steps so far, for the message
-    :raises BadTransitionError: if one is not finite
-    """
-    for i in np.flatnonzero(_not_finite(actions)):
-        raise BadTransitionError(
-            f"the agent chose the action {actions[i]} for environment {i} at agent step {timestep}, but actions must "
-            "be finite",
-            "it was not executed",
-            "check action_noise and the policy's parameters, and load an earlier model if these are not finite",
-        )
-
-
-@contextlib.contextmanager
-def post_mortem_of_a_step(model: "CuReSAC", **seen: Any) -> Iterator[None]:
-    """What is not finite in a step of the environments is found in this context, and its post-mortem written.
-
-    :param model: The model
-    :param seen: What there is of the step: arrays are kept, also those in dictionaries
-    :raises BadTransitionError: which says where the post-mortem lies
-    """
-    try:
-        yield
-    except BadTransitionError as error:
-        report = {"source": error.reason, "agent_steps": model.num_timesteps}
-        error.post_mortem = _write_post_mortem(model, f"step_{model.num_timesteps}", report, "step.npz", _arrays(seen))
-        raise

@@ -33,8 +33,9 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from sb3_cure import buffers, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.callbacks import _spread_over
-from sb3_cure.envs import EnvFaultError, FaultTolerantSubprocVecEnv
-from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
+from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv
+from sb3_cure.checkpoint import is_plain
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.evaluation import most_uncomfortable
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)

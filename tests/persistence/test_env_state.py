@@ -27,8 +27,8 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_cure.envs import DMC_TASKS, make_dmc_env, make_pixel_env
-from sb3_cure.envs.state import load_vec_env_state, vec_env_state, why_not_restorable
-from sb3_cure.overlap import OverlappedVecEnv
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
+from sb3_cure.vec_env import OverlappedVecEnv
 
 # A task of each domain, and those that reset what no other task of theirs does; escape, for one, draws a terrain.
 OTHERS = [("finger", "spin"), ("fish", "upright"), ("quadruped", "escape")]
