@@ -32,7 +32,7 @@ _HELPERS = (GymRunningMeanStd, RunningMeanStd, StackedObservations)
 # No state of the environment: other layers, how they were built, files of results, the clock
 _PASSED_OVER = (
     *("env", "venv", "spec", "_cached_spec", "_saved_kwargs", "metadata", "_metadata", "class_attributes"),
-    *("results_writer", "t_start", "episode_start_time", "episode_start_times", "_sb3_cure_call"),
+    *("results_writer", "t_start", "episode_start_time", "episode_times", "time_queue", "_sb3_cure_call"),
 )
 _SPACES = ("action_space", "observation_space")
 # What renderers draw into, unless it is plain
@@ -204,7 +204,8 @@ def _is_dmc(layer: Any) -> bool:
 def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     name, own, attributes = _name(layer), None, vars(layer)
     if _has_state_dict(layer):
-        own, attributes = layer.state_dict(), {"_np_random": attributes.get("_np_random")}
+        own = layer.state_dict()
+        attributes = {name: value for name, value in attributes.items() if name in ("_np_random", "_np_random_seed")}
     elif _is_dmc(layer):
         if not is_of_the_suite(layer._env):
             raise _NotPlain(f"the task {type(layer._env.task).__name__} is not one of dm_control.suite")
@@ -216,7 +217,7 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     memo: dict[int, int] = {}
     encoded = {}
     for key, value in {"own": own, **{space: getattr(layer, space) for space in _SPACES}, **attributes}.items():
-        if key in _PASSED_OVER or any(value is other for other in layers):
+        if key in _PASSED_OVER or any(value is other for other in layers) or (key in _RENDERERS and value is None):
             continue
         try:
             encoded[key] = _encoded(value, memo, as_built=key != "own")
@@ -275,7 +276,7 @@ def _encoded(value: Any, memo: dict[int, int], as_built: bool = True) -> Any:
         return {"space": [encoded(space._np_random) for space in _parts(value)]}
     if kind in _HELPERS and as_built:
         return {"helper": {key: encoded(part) for key, part in vars(value).items()}}
-    if as_built and (inspect.isroutine(value) or inspect.isclass(value) or kind is functools.partial):
+    if as_built and (inspect.isroutine(value) or inspect.isclass(value) or kind in (functools.partial, np.ufunc)):
         return {"as built": None}
     raise _NotPlain(kind.__name__)
 
