@@ -27,8 +27,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_cure.buffer_files import can_be_kept, frame_rows, load_frame_rows
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.generations import CHUNK, CheckpointError, Draft, Entry, Generation, Generations
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.serialization import ArchiveError, read_state, sentences, write_state
 
 if TYPE_CHECKING:
@@ -163,7 +163,6 @@ def training_state(model: "CuReSAC", environments_may_be_gone: bool = False) -> 
         "n_envs": model.n_envs,
         "random": _random_state(model),
         "environments": environments,
-        "transition_guard": model._transition_guard.state_dict(),
         "metrics": {
             "sums": dict(model._metrics._sums),
             "counts": dict(model._metrics._counts),
@@ -296,6 +295,19 @@ def _plain_attributes(callback: BaseCallback) -> dict[str, Any]:
     given = ("locals", "globals", "num_timesteps", "verbose")
     public = {name: value for name, value in vars(callback).items() if not name.startswith("_")}
     return {name: value for name, value in public.items() if name not in given and is_plain(value)}
+
+
+def is_plain(value: Any) -> bool:
+    """
+    :param value: Anything
+    :return: Whether it can be saved: numbers, strings, arrays, and lists and dictionaries of these
+    """
+    if isinstance(value, list | tuple):
+        return all(map(is_plain, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and is_plain(each) for key, each in value.items())
+    is_array = isinstance(value, th.Tensor) or (isinstance(value, np.ndarray) and value.dtype.kind in "biuf")
+    return value is None or is_array or isinstance(value, bool | int | float | str | np.number | np.bool_)
 
 
 def _changed(watched: WatchedCallback) -> dict[str, Any]:
@@ -549,7 +561,6 @@ class Resumption:
                 load_vec_env_state(model.env, self.state["environments"])
                 for name in ("_last_obs", "_last_episode_starts", "_last_original_obs"):
                     setattr(model, name, self._kept[name])
-            model._transition_guard.load_state_dict(self.state["transition_guard"])
             _load_random_state(model, self.state["random"])
 
 

@@ -28,7 +28,8 @@ from sb3_cure.callbacks import (
     PolicyVideoCallback,
     ReconstructionCallback,
 )
-from sb3_cure.envs import FaultTolerantSubprocVecEnv, make_pixel_env
+from sb3_cure.envs import make_pixel_env
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 from sb3_cure.evaluation import most_uncomfortable, run_episodes
 from sb3_cure.srl import RAE, SRLOutput
 

@@ -29,7 +29,6 @@ from sb3_cure.buffers import (
     FrameStackReplayBuffer,
     Samples,
     SkippingReplayBuffer,
-    refuse_marked,
     transitions,
     unmarked,
 )
@@ -698,14 +697,7 @@ def test_only_marked_transitions_are_an_error(kind: type[ReplayBuffer]) -> None:
         buffer.sample(1)
 
 
-def test_buffers_that_cannot_skip_refuse_marks() -> None:
-    dictionaries = DictReplayBuffer(10, spaces.Dict({"image": GOOD}), ACTIONS)
-    for buffer in (dictionaries, buffer_of(ReplayBuffer, 20, 2)):
-        refuse_marked(buffer, [{}, {"env_fault": None}])
-        for mark in MARKS:
-            with pytest.raises(ValueError, match=rf"a {type(buffer).__name__} cannot skip it: use Skipping"):
-                refuse_marked(buffer, [{}, {mark: "broken"}])
-    refuse_marked(buffer_of(SkippingReplayBuffer, 20, 2), [{}, {"env_fault": "broken"}])
+def test_skipping_needs_whole_observations() -> None:
     with pytest.raises(ValueError, match="optimize_memory_usage=True stores"):
         SkippingReplayBuffer(10, GOOD, ACTIONS, optimize_memory_usage=True, handle_timeout_termination=False)
 

@@ -39,7 +39,7 @@ from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
 from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
-from sb3_cure.envs import FaultTolerantSubprocVecEnv
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 from sb3_cure.generations import Draft, Generations
 from sb3_cure.serialization import read_state, write_state
 

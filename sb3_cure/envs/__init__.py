@@ -5,7 +5,6 @@ DeepMind Control environment is made; what checks OpenGL is in :mod:`sb3_cure.en
 """
 
 from sb3_cure.envs.dmc import make_dmc_env
-from sb3_cure.envs.fault_tolerant import EnvFaultError, FaultTolerantSubprocVecEnv
 from sb3_cure.envs.physics import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.registration import DMC_TASKS, register_dmc_envs
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames, make_pixel_env
@@ -13,8 +12,6 @@ from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservat
 __all__ = [
     "DMC_TASKS",
     "ActionRepeat",
-    "EnvFaultError",
-    "FaultTolerantSubprocVecEnv",
     "NormalizeActions",
     "PixelObservation",
     "StackFrames",

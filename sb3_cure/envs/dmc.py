@@ -13,10 +13,7 @@ from sb3_cure.envs.wrappers import (
     NormalizeActions,
     PixelObservation,
     StackFrames,
-    check_at_least_one,
-    check_flag,
 )
-from sb3_cure.values import is_integer, is_one_of
 
 # PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
 ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}
@@ -39,7 +36,7 @@ class DMCPixels(PixelObservation):
     :param grayscale: One channel of luminance instead of three of RGB
     :param camera_id: Index of a camera of the model, -1 for its free camera
     :param renderer: ``"dmc"`` or ``"fast"``, see :func:`make_dmc_env`
-    :raises ValueError: If the model has no such camera
+    :raises ValueError: When first reset, if the model has no such camera
     """
 
     def __init__(
@@ -53,14 +50,8 @@ class DMCPixels(PixelObservation):
         self.camera_id = camera_id
         self._physics = env.get_wrapper_attr("physics")
         self._camera: Any = None
-        model = self._physics.model
-        if not (is_integer(camera_id, -1) and camera_id < model.ncam):
-            raise ValueError(
-                f"camera_id={camera_id!r} is not one of this model's cameras; use 0 to {model.ncam - 1}, or -1 for the "
-                "free camera."
-            )
         # These take effect because the rendering context is made with the first frame.
-        buffer = model.vis.global_
+        buffer = self._physics.model.vis.global_
         buffer.offwidth = max(buffer.offwidth, self.image_size)
         buffer.offheight = max(buffer.offheight, self.image_size)
 
@@ -79,6 +70,17 @@ class DMCPixels(PixelObservation):
     def close(self) -> None:
         self._camera = None
         super().close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Nothing: all that frames depend on is the physics'
+        """
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
 
 
 def make_dmc_env(
@@ -119,23 +121,17 @@ def make_dmc_env(
     :raises ValueError: If there is no such task or an argument is out of range
     :raises GLUnavailableError: If OpenGL is missing
     """
-    if not (isinstance(domain, str) and task in DMC_TASKS.get(domain, ())):
-        known = [f"{known_domain}-{known_task}" for known_domain in DMC_TASKS for known_task in DMC_TASKS[known_domain]]
+    if task not in DMC_TASKS.get(domain, ()):
+        known = [f"{each}-{its_task}" for each, tasks in DMC_TASKS.items() for its_task in tasks]
         close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
         raise ValueError(
             f"'{domain}-{task}' is not a task of the DeepMind Control suite; the closest are {close} "
             "(sb3_cure.envs.DMC_TASKS has all)."
         )
-    if not is_one_of(renderer, RENDER_FLAGS):
+    if renderer not in RENDER_FLAGS:
         raise ValueError(f"renderer={renderer!r} is unknown; use 'dmc', or 'fast' for no shadows and reflections.")
-    if not is_one_of(render_mode, (None, "rgb_array")):
+    if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode={render_mode!r} is not supported; use 'rgb_array', or None for no videos.")
-    check_flag("grayscale", grayscale)
-    if seed is not None and not (is_integer(seed, 0) and seed < 2**32):
-        raise ValueError(f"seed={seed!r} is not None or an integer from 0 to 2**32 - 1; use seed=0, for example.")
-    # Before the physics are built, although the wrappers check them too
-    check_at_least_one("image_size", image_size, usual=84)
-    check_at_least_one("frame_stack", frame_stack, usual=3)
     action_repeat = ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat
     camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id
 
@@ -168,18 +164,18 @@ def make_dmc_env(
         entry_point=ENTRY_POINT,
         order_enforce=False,
         disable_env_checker=True,
-        kwargs={
-            "domain": domain,
-            "task": task,
-            "image_size": image_size,
-            "frame_stack": frame_stack,
-            "action_repeat": action_repeat,
-            "camera_id": camera_id,
-            "renderer": renderer,
-            "render_mode": render_mode,
-            "seed": seed,
-            "grayscale": grayscale,
-        },
+        kwargs=dict(
+            domain=domain,
+            task=task,
+            image_size=image_size,
+            frame_stack=frame_stack,
+            action_repeat=action_repeat,
+            camera_id=camera_id,
+            renderer=renderer,
+            render_mode=render_mode,
+            seed=seed,
+            grayscale=grayscale,
+        ),
     )
     env = ActionRepeat(NormalizeActions(env), action_repeat)
     env = DMCPixels(env, image_size, grayscale, camera_id, renderer)

@@ -1,5 +1,9 @@
-"""The true state of a DeepMind Control environment, which agents that see pixels never get: for maps and statistics."""
+"""The true state of a DeepMind Control environment, which agents that see pixels never get.
 
+``physics_state`` is for maps and statistics; ``integration_state`` is all that the simulation goes on from.
+"""
+
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +30,13 @@ _TELLING = {
     ("joint_0", "joint_1"): ("joint 0", "joint 1"),  # swimmer, lqr
     ("rootz", "rooty"): ("torso height (from the start's)", "torso pitch"),  # walker, hopper, cheetah
 }
+
+
+# What the tasks of the suite change in MuJoCo's model at reset: targets, obstacles, gains, terrain.
+_MODEL_ARRAYS = (
+    *("body_pos", "body_quat", "dof_damping", "geom_pos", "geom_rgba", "geom_size", "hfield_data", "light_pos"),
+    *("site_pos", "site_rgba", "site_size", "wrap_prm"),
+)
 
 
 def _physics(env: gym.Env) -> Any:
@@ -114,3 +125,57 @@ def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
         raise ValueError(
             f"coordinates are {coordinates!r}, but a map needs two of the state's: choose of {', '.join(names)}."
         )
+
+
+def is_of_the_suite(control: Any) -> bool:
+    """
+    :param control: An environment of dm_control, without Gymnasium
+    :return: Whether ``integration_state`` knows all that its task may change
+    """
+    from dm_control.rl.control import Environment
+
+    return type(control) is Environment and type(control.task).__module__.startswith("dm_control.suite.")
+
+
+def integration_state(control: Any) -> dict[str, Any]:
+    """
+    :param control: An environment of the DeepMind Control suite, without Gymnasium
+    :return: All that its future depends on: numbers, arrays and dictionaries of these
+    """
+    import mujoco
+
+    physics, task = control.physics, control.task
+    numbers = (bool, int, float, np.generic, np.ndarray)
+    return {
+        "physics": physics.get_state(int(mujoco.mjtState.mjSTATE_INTEGRATION)),
+        "sensors": np.array(physics.data.sensordata),
+        "model": {name: np.array(getattr(physics.model, name)) for name in _MODEL_ARRAYS},
+        # Such as heights and weights that it measured at reset.
+        "task": {name: copy.copy(value) for name, value in vars(task).items() if isinstance(value, numbers)},
+        "random": task.random.get_state(legacy=False),
+        "step_count": control._step_count,
+        "reset_next_step": control._reset_next_step,
+    }
+
+
+def load_integration_state(control: Any, state: dict[str, Any]) -> None:
+    """
+    :param control: An environment of the DeepMind Control suite, without Gymnasium
+    :param state: Result of ``integration_state`` for the same task
+    """
+    import mujoco
+
+    physics, task = control.physics, control.task
+    for name in _MODEL_ARRAYS:
+        getattr(physics.model, name)[:] = state["model"][name]
+    for hfield in range(physics.model.nhfield):
+        with physics.contexts.gl.make_current() as context:
+            context.call(mujoco.mjr_uploadHField, physics.model.ptr, physics.contexts.mujoco.ptr, hfield)
+    physics.set_state(state["physics"], int(mujoco.mjtState.mjSTATE_INTEGRATION))
+    # dm_control ends a step with this, and the next begins in the middle of one; it leaves the warm start alone.
+    mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
+    physics.data.sensordata[:] = state["sensors"]  # those of forces are measured in the other half
+    vars(task).update(copy.deepcopy(state["task"]))
+    task.random.set_state(state["random"])
+    control._step_count = state["step_count"]
+    control._reset_next_step = state["reset_next_step"]

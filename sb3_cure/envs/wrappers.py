@@ -10,8 +10,6 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
-from sb3_cure.values import is_integer
-
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
 
@@ -24,19 +22,13 @@ def check_at_least_one(name: str, value: Any, usual: int) -> int:
     :return: The value as a plain integer
     :raises ValueError: If it is not an integer of at least 1
     """
-    if not is_integer(value, 1):
+    if not _is_positive_integer(value):
         raise ValueError(f"{name}={value!r} is not an integer of at least 1; use {name}={usual}, for example.")
     return int(value)
 
 
-def check_flag(name: str, value: Any) -> None:
-    """
-    :param name: What the value is, for the message
-    :param value: The value to check
-    :raises ValueError: If it is neither True nor False
-    """
-    if not isinstance(value, bool):
-        raise ValueError(f"{name}={value!r} is neither True nor False; use {name}=False, for example.")
+def _is_positive_integer(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 1)
 
 
 def check_frame(frame: Any, env: gym.Env) -> None:
@@ -109,13 +101,22 @@ class ActionRepeat(RepeatAction):
             self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / num_repeats}
 
 
+def told_by(env: gym.Env, name: str) -> int:
+    """
+    :param env: Any environment
+    :param name: Name of an attribute that is an integer of at least 1
+    :return: Its value, or 1 where the environment has none or means something else by that name
+    """
+    told = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else 1
+    return int(told) if _is_positive_integer(told) else 1
+
+
 def action_repeat_of(env: gym.Env) -> int:
     """
     :param env: Any environment
-    :return: Environment steps per agent step: what it tells, else 1, also where it means something else by that name
+    :return: Environment steps per agent step: what it tells, else 1
     """
-    told = env.get_wrapper_attr("action_repeat") if env.has_wrapper_attr("action_repeat") else 1
-    return int(told) if is_integer(told, 1) else 1
+    return told_by(env, "action_repeat")
 
 
 class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConstructorArgs):
@@ -133,7 +134,6 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
         RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale)
         super().__init__(env)
         self.image_size = check_at_least_one("image_size", image_size, usual=84)
-        check_flag("grayscale", grayscale)
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)

@@ -76,8 +76,8 @@ class FiniteCheck(VecEnvWrapper):
         for i in np.flatnonzero(_not_finite(np.asarray(actions))):
             raise BadTransitionError(
                 f"the agent chose the action {actions[i]} for environment {i} at agent step {self.n_steps}, but "
-                "actions must be finite: it was not executed; check action_noise and the policy's parameters, and load an "
-                "earlier model if these are not finite."
+                "actions must be finite: it was not executed; check action_noise and the policy's parameters, and load "
+                "an earlier model if these are not finite."
             )
         self.venv.step_async(actions)
 

@@ -32,8 +32,9 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_cure import buffers, make_dmc_env
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
-from sb3_cure.envs import EnvFaultError, FaultTolerantSubprocVecEnv
-from sb3_cure.envs.state import is_plain, load_vec_env_state, vec_env_state, why_not_restorable
+from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv
+from sb3_cure.checkpoint import is_plain
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 # What the sentence says of each kind of fault

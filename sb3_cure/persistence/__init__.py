@@ -1,0 +1,1 @@
+"""Files that outlive a process: model archives, replay buffers, checkpoints, the state of environments."""
