@@ -1,295 +1,270 @@
-"""The command line: training, replaying, filming and tuning from a YAML file, and the doctor."""
+"""Training, tuning, watching and filming from a YAML file, with rl-zoo3."""
 
-import os
+import copy
+import pickle
 import re
-import subprocess
+import shutil
 import sys
 import tracemalloc
 from collections import OrderedDict
-from collections.abc import Sequence
-from importlib import metadata
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, ClassVar
 
 import gymnasium as gym
+import numpy as np
 import optuna
 import pytest
 import yaml
-from envs_for_tests import PixelBox, tiny_model
-from packaging.requirements import Requirement
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure import CuReSAC, cli, doctor, zoo
-from sb3_cure.checks import check_arguments
-
-TASK = "dmc_pixels/finger-spin-v0"
-SETTINGS = {
-    "default": {
-        "n_timesteps": 24,
-        "policy": "CnnPolicy",
-        # Episodes of 10 agent steps
-        "env_kwargs": {"image_size": 36, "grayscale": True, "renderer": "fast", "action_repeat": 100},
-        "learning_starts": 10,
-        "warmup_updates": 1,
-        "batch_size": 4,
-        "policy_kwargs": {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4}},
-    }
-}
-# A user's own head, in a module of the working directory
-HEAD = """
+from sb3_cure import CuReSAC
+from sb3_cure.cli import zoo
+from sb3_cure.cli.main import main
 from sb3_cure.srl import RAE
 
-class Gentle(RAE):
+TASK = "tests/Filmed-v0"
+RUN = "tests-Filmed-v0"
+SETTINGS: dict[str, Any] = {
+    "policy": "CnnPolicy",
+    "n_timesteps": 20,
+    "buffer_size": 50,
+    "learning_starts": 10,
+    "warmup_updates": 1,
+    "batch_size": 4,
+    "env_kwargs": {"episode_length": 7},
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2, "n_layers": 2}},
+}
+#: A module of the user's own, in the working directory
+CAMERA = """
+import gymnasium as gym
+from envs_for_tests import PixelBox
+from stable_baselines3.common.buffers import ReplayBuffer
+from sb3_cure.srl import RAE
+
+class Head(RAE):
     pass
+
+class Buffer(ReplayBuffer):
+    pass
+
+gym.register("Camera-v0", PixelBox, kwargs={"channels_last": True})
 """
+
+
+class Filmed(PixelBox):
+    """It can be filmed, and hence be shown in a window."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        return self.frames[-1].transpose(1, 2, 0)
+
+
+class Gentle(RAE):
+    """A head of the user's own."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _modules() -> Iterator[None]:
+    """The tasks under their ids, and the module ``heads_of_mine``."""
+    module = ModuleType("heads_of_mine")
+    vars(module)["Gentle"] = Gentle
+    Gentle.__module__ = "heads_of_mine"
+    sys.modules["heads_of_mine"] = module
+    gym.register(TASK, Filmed)
+    gym.register("tests/Vector-v0", VectorBox)
+    yield
+    del gym.registry[TASK], gym.registry["tests/Vector-v0"], sys.modules["heads_of_mine"]
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with ``tiny.yml`` in it."""
-    (tmp_path / "tiny.yml").write_text(yaml.safe_dump(SETTINGS))
+    """The working directory."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     return tmp_path
 
 
-def start(command: Sequence[str], **environment: str) -> subprocess.Popen[str]:
-    """A process in the working directory whose output, of both kinds, can be read."""
-    return subprocess.Popen(
-        command, env={**os.environ, **environment}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+def write(entries: dict[str, Any], name: str = "settings.yml") -> str:
+    """A settings file in the working directory."""
+    Path(name).write_text(yaml.safe_dump(copy.deepcopy(entries)))
+    return name
 
 
-def finish(process: subprocess.Popen[str]) -> str:
-    """The output of a process that ends well."""
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
-    return output
+def train(*arguments: str, task: str = TASK, **changes: Any) -> None:
+    config = write({"default": {**SETTINGS, **changes}})
+    assert main(["train", "--env", task, "--conf-file", config, "--device", "cpu", *arguments]) == 0
 
 
-def script() -> str:
-    """The installed command."""
-    return str(Path(sys.executable).parent / "sb3-cure")
+@pytest.fixture
+def set_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[CuReSAC, zoo.ExperimentManager]]:
+    """Function that trains as ``train`` does, but returns the model and the manager before the first step."""
+
+    def begin(*arguments: str, task: str = TASK, **changes: Any) -> tuple[CuReSAC, zoo.ExperimentManager]:
+        begun = []
+        monkeypatch.setattr(zoo.ExperimentManager, "learn", lambda manager, model: begun.append((model, manager)))
+        monkeypatch.setattr(zoo.ExperimentManager, "save_trained_model", lambda manager, model: None)
+        train("--eval-freq", "-1", *arguments, task=task, **changes)
+        return begun[0]
+
+    return begin
 
 
-# ---------------------------------------------------------------- commands
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run with evaluations, checkpoints and a head of the user's own; read only."""
+    with pytest.MonkeyPatch.context() as context:
+        context.chdir(tmp_path_factory.mktemp("run"))
+        train("--eval-freq", "8", "--eval-episodes", "1", "--save-freq", "8", srl="heads_of_mine.Gentle")
+        return Path("logs/cure_sac", f"{RUN}_1").absolute()
 
 
-def test_without_a_command_it_shows_them_all(capsys: pytest.CaptureFixture[str]) -> None:
-    """Usage is printed, and names every command."""
-    assert cli.main([]) == 0
-    usage = capsys.readouterr().out
-    assert all(f"  {command} " in usage for command in cli.COMMANDS)
+# ------------------------------------------------------------------ training
 
 
-def test_an_unknown_command_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    """It names the command and those that exist."""
-    assert cli.main(["fly", "--env", TASK]) == 2
-    error = capsys.readouterr().err
-    assert "'fly'" in error and "train, enjoy, record, optimize, experiment, report, doctor" in error
-
-
-def test_a_missing_extra_is_named() -> None:
-    """One sentence with the package and what to install."""
-    # None is Python's way to say that there is no such module. In a process of its own, as it spoils what is imported.
-    code = """
-import sys
-from sb3_cure.cli import main
-
-for command, package in ("report", "matplotlib"), ("train", "rl_zoo3"):
-    sys.modules[package] = None
-    try:
-        main([command, "--help"])
-    except SystemExit as sentence:
-        print(sentence)
-"""
-    assert finish(start([sys.executable, "-c", code])).splitlines() == [
-        'sb3-cure report needs matplotlib, which is not installed: pip install "sb3-cure[experiments]"',
-        'sb3-cure train needs rl_zoo3, which is not installed: pip install "sb3-cure[zoo]"',
-    ]
-
-
-def test_rl_zoos_own_algorithms_keep_their_environment(folder: Path) -> None:
-    """--env may be left out with them, as in rl-zoo3: CartPole-v1."""
-    assert cli.main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
-    assert (folder / "logs" / "dqn" / "CartPole-v1_1" / "CartPole-v1.zip").exists()
-
-
-def test_a_users_missing_module_is_no_missing_extra(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A head that cannot be imported is named, and nothing is to be installed."""
-    command = ["train", "--env", TASK, "--conf-file", "tiny.yml", "-params", "srl:'no_such_heads.Mine'"]
-    assert cli.main(command) == 2
-    error = capsys.readouterr().err
-    assert "srl is 'no_such_heads.Mine'" in error and "pip install" not in error
-
-
-# ------------------------------------------------------------------- rl-zoo
-
-
-@pytest.mark.parametrize("program", ["enjoy", "record"])
-def test_help_shows_what_rl_zoo_has_not(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("program", ["train", "optimize", "enjoy", "record"])
+def test_help_lists_the_algorithms(program: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main([program, "--help"])
+        main([program, "--help"])
     shown = capsys.readouterr().out
-    assert "--srl MODULE.CLASS" in shown and "--gym-packages" in shown and "--exp-id" in shown
+    assert f"usage: sb3-cure {'train' if program == 'optimize' else program}" in shown
+    assert all(algorithm in shown for algorithm in zoo.ALGORITHMS)
 
 
-def test_train_enjoy_record(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """A round trip with a user's own head: cure_sac is the algorithm, and the file's env_kwargs hold everywhere."""
-    (folder / "my_heads.py").write_text(HEAD)
-    settings = {"default": {**SETTINGS["default"], "srl": "my_heads.Gentle"}}
-    (folder / "tiny.yml").write_text(yaml.safe_dump(settings))
-    train = [script(), "train", "--env", TASK, "--conf-file", "tiny.yml", "--eval-freq", "20", "--eval-episodes", "1"]
-    output = finish(start(train))
-    assert "Episode length: 10.00" in output  # the evaluation's environment repeats actions too
-    run = folder / "logs" / "cure_sac" / "dmc_pixels-finger-spin-v0_1"
-    assert (run / "dmc_pixels-finger-spin-v0.zip").is_file() and (run / "best_model.zip").is_file()
-
-    models = []
-    load = zoo.ActingCuReSAC.load
-
-    def load_and_keep(*args: Any, **kwargs: Any) -> CuReSAC:
-        models.append(load(*args, **kwargs))
-        return models[-1]
-
-    monkeypatch.setattr(zoo.ActingCuReSAC, "load", load_and_keep)
-    enjoy = ["enjoy", "--env", TASK, "-n", "20", "--no-render"]
-    assert cli.main(enjoy) == 2 and "add --srl my_heads.Gentle." in capsys.readouterr().err
-    assert cli.main([*enjoy, "--srl", "my_heads.Gentle"]) == 0
-    assert "2 Episodes" in capsys.readouterr().out
-    (model,) = models
-    assert model.replay_buffer is None and type(model.policy.srl).__name__ == "Gentle"
-
-    record = [sys.executable, "-m", "sb3_cure.zoo", "record", "--env", TASK, "-n", "5", "--load-best"]
-    record += ["--srl", "my_heads.Gentle"]
-    finish(start(record))
-    (video,) = run.glob("videos/*.mp4")
-    assert video.stat().st_size > 1000
+def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
+    assert (run / f"{RUN}.zip").is_file() and (run / "best_model.zip").is_file()
+    assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
 
 
-CAMERA = """
-import gymnasium as gym
-from envs_for_tests import PixelBox
-from stable_baselines3.common.buffers import ReplayBuffer
-
-class Camera(PixelBox):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
-
-    def __init__(self, render_mode=None, channels_last=True, **kwargs):
-        super().__init__(channels_last=channels_last, episode_length=10, **kwargs)
-        self.render_mode = render_mode
-
-    def render(self):
-        return self.frames[-1].transpose(1, 2, 0)
-
-gym.register("Camera-v0", Camera)
-
-class Buffer(ReplayBuffer):
-    pass
-"""
+def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
+    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "srl_kwargs:dict(augmentation='shift', pad=1)"]
+    kwargs = ["--env-kwargs", "size:40", "--eval-env-kwargs", "size:44"]
+    model, manager = set_up("-params", *overrides, *kwargs, "--seed", "3", srl="rae")
+    assert (model.curiosity_prob, model.n_envs, model.srl, model.seed) == (0.5, 2, "curl", 3)
+    assert model.observation_space.shape == (6, 40, 40)
+    assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
 
 
-def test_an_environment_of_ones_own(folder: Path) -> None:
-    """All programs find what a module of the working directory registers, by either flag; `record` and `enjoy` take the
-    latest run that has a model, which `optimize` leaves none in."""
-    (folder / "camera_of_mine.py").write_text(CAMERA)
-    settings = {key: value for key, value in SETTINGS["default"].items() if key != "env_kwargs"}
-    settings["replay_buffer_class"] = "camera_of_mine.Buffer"
-    own = {"PYTHONPATH": str(Path(__file__).parent)}
-    by_flag, by_name = ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"], ["--env", "camera_of_mine:Camera-v0"]
-    entries = {True: "Camera-v0", False: "camera_of_mine:Camera-v0"}
-    programs = [(by_flag, "train"), (by_flag, "record")]
-    programs += [(by_name, program) for program in ("train", "optimize", "enjoy", "record")]
-    for flags, program in programs:
-        rest = ["-n", "20", "--no-render"]
-        if program in ("train", "optimize"):
-            (folder / "tiny.yml").write_text(yaml.safe_dump({entries[flags is by_flag]: settings}))
-            rest = ["--conf-file", "tiny.yml", "--n-trials", "1", "--n-evaluations", "1"]
-        output = finish(start([script(), program, *flags, *rest], **own))
-        if program in ("enjoy", "record"):
-            assert f"Loading latest experiment, id={1 if flags is by_flag else 2}" in output
-    runs = folder / "logs" / "cure_sac"
-    for number in (1, 2):  # so that each can be run again from what it has kept
-        kept = yaml.unsafe_load((runs / f"Camera-v0_{number}" / "Camera-v0" / "args.yml").read_text())
-        assert (kept["env"], kept["gym_packages"]) == ("Camera-v0", ["camera_of_mine"])
-    (video,) = runs.glob("Camera-v0_2/videos/*.mp4")
-    assert video.stat().st_size > 1000
+def test_linear_learning_rate_is_saved(set_up: Callable[..., Any], folder: Path) -> None:
+    """As one of SB3's schedules, so that the archive needs no object from the user."""
+    model, _ = set_up(learning_rate="lin_1e-3")
+    model.save(folder / "model.zip")
+    for each in (model, CuReSAC.load(folder / "model.zip")):
+        assert [each.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
 
 
-def test_classes_in_settings(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file of settings in Python may hold them, and so may -params; the run, of a unique name, can be watched."""
-    (folder / "tiny.py").write_text(
-        f"from sb3_cure.srl import RAE\nhyperparams = {SETTINGS}\nhyperparams['default']['srl'] = RAE"
-    )
-    train = ["train", "--env", TASK, "--conf-file", "tiny.py", "--eval-freq", "-1", "--uuid"]
-    assert cli.main([*train, "-params", "policy_kwargs:dict(net_arch=[8], activation_fn=th.nn.Tanh)"]) == 0
-    enjoy = ["enjoy", "--env", TASK, "-n", "20", "--no-render"]
-    assert cli.main(enjoy) == 0
-    (run,) = folder.glob("logs/cure_sac/*_1_*")
-    output = capsys.readouterr().out
-    assert f"id={run.name.partition('-v0_')[2]}\n" in output and "2 Episodes" in output
-    assert cli.main([*enjoy, "--load-best"]) == 2 and "its run has the last model" in capsys.readouterr().err
-
-
-def test_an_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
-    """As the README's example does; what was trained so can be filmed."""
-    readme = (Path(__file__).parent.parent / "README.md").read_text()
-    example = next(block for block in re.findall(r"```yaml\n(.*?)```", readme, re.S) if "env_wrapper" in block)
-    settings = {**SETTINGS["default"], **yaml.safe_load(example)["default"]}
-    (folder / "tiny.yml").write_text(yaml.safe_dump({"Pendulum-v1": settings}))
-    finish(start([script(), "train", "--env", "Pendulum-v1", "--conf-file", "tiny.yml", "-n", "14"]))
-    finish(start([script(), "record", "--env", "Pendulum-v1", "-n", "5"]))
-    (video,) = folder.glob("logs/cure_sac/Pendulum-v1_1/videos/*.mp4")
-    assert video.stat().st_size > 1000
-
-
-def test_a_model_that_only_acts_has_no_replay_buffer(tmp_path: Path) -> None:
-    """Whatever the size of the buffer that it was trained with."""
-    tiny_model("CnnPolicy", PixelBox(), buffer_size=10_000).save(tmp_path / "model")
-    peaks = {}
-    for cls in (CuReSAC, zoo.ActingCuReSAC):
-        tracemalloc.start()
-        model = cls.load(tmp_path / "model", custom_objects={"learning_rate": 0.0, "lr_schedule": lambda _: 0.0})
-        peaks[cls] = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert model.replay_buffer is None
-    frames = 10_000 * 3 * 36 * 36
-    assert peaks[CuReSAC] > frames and peaks[zoo.ActingCuReSAC] < frames / 10
-    observation = model.observation_space.sample()
-    assert model.predict(observation)[0].shape == (2,)
-
-
-@pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
-def test_a_window_can_show_the_agent() -> None:
-    """`enjoy` asks for render_mode="human", which Gymnasium grants to environments that can be filmed."""
-    env = gym.make(TASK, render_mode="human", image_size=36, renderer="fast")
-    assert env.render_mode == "human"
-    assert env.get_wrapper_attr("frame_stack") == 3
-    env.close()
-
-
-def test_two_processes_share_a_study(folder: Path) -> None:
-    """Both start at once on a database that does not exist; every trial is there once, and can be trained from."""
-    storage = f"sqlite:///{folder}/study.db"
-    optimize = [script(), "optimize", "--env", TASK, "--conf-file", "tiny.yml", "-n", "12", "--n-evaluations", "1"]
-    optimize += ["--eval-episodes", "1", "--storage", storage, "--study-name", "shared", "--n-trials", "2"]
-    optimize += ["--no-optim-plots"]
-    for process in [start([*optimize, "--seed", seed]) for seed in "12"]:
-        finish(process)
-    study = optuna.load_study(study_name="shared", storage=storage)
-    assert [trial.state for trial in study.trials] == 4 * [optuna.trial.TrialState.COMPLETE]
-    assert len({trial.params["learning_rate"] for trial in study.trials}) == 4
-
+def test_namespace_and_atari_have_their_entries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The environment's own id goes first, then the id with its module, the namespace, Atari, and the default."""
+    order = [f"my_module:{TASK}", TASK, "tests", "atari", "default"]
     zoo.register()
-    arguments = type("Arguments", (), {})()
-    for trial in study.trials[0], study.trials[3]:
-        manager = zoo.ExperimentManager(
-            arguments, "cure_sac", TASK, str(folder), config="tiny.yml", storage=storage, study_name="shared",
-            trial_id=trial.number, eval_freq=-1, verbose=0,
-        )  # fmt: skip
-        model, _ = manager.setup_experiment()  # type: ignore[misc]
-        assert model.batch_size == 2 ** trial.params["batch_size_pow"]
-        assert model.curiosity_prob == trial.params["curiosity_prob"]  # type: ignore[attr-defined]
-        assert model.policy_kwargs["net_arch"] == [16]  # the file's
+    for first in range(5):
+        config = write({name: {**SETTINGS, "gamma": 0.5 + 0.01 * order.index(name)} for name in order[first:]})
+        arguments = type("Arguments", (), {"gym_packages": ["my_module"]})()
+        manager = zoo.ExperimentManager(arguments, "cure_sac", TASK, "logs", config=config)
+        manager._is_atari = True
+        hyperparams, _ = manager.read_hyperparameters()
+        assert hyperparams["gamma"] == pytest.approx(0.5 + 0.01 * first) and manager.env_name.gym_id == TASK
+
+
+def test_training_goes_on_with_a_trained_agent(set_up: Callable[..., Any], run: Path) -> None:
+    trained = CuReSAC.load(run / f"{RUN}.zip", custom_objects={"srl": Gentle}).policy.state_dict()
+    model, _ = set_up("-i", str(run / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
+    assert all(np.array_equal(value.cpu(), trained[name]) for name, value in model.policy.state_dict().items())
+
+
+def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
+    checkpoint = {"sb3_cure.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
+    train("--eval-freq", "-1", callback=[checkpoint])
+    assert CuReSAC.resume("checkpoints", Filmed(episode_length=7)).num_timesteps == 20
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"normalize": True},
+        {"normalize": {"norm_obs": False}, "frame_stack": 3},
+        {"normalize": "dict(norm_obs=False)", "env_kwargs": {"channels_last": True}},
+    ],
+)
+def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., Any], changes: dict[str, Any]) -> None:
+    """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
+    with pytest.raises(ValueError, match="VecNormalize"):
+        set_up(**changes)
+
+
+def test_rewards_of_stacked_frames_can_be_normalized(set_up: Callable[..., Any]) -> None:
+    """By wrappers in the right order."""
+    stack = "stable_baselines3.common.vec_env.VecFrameStack"
+    wrappers = ["stable_baselines3.common.vec_env.VecTransposeImage", {stack: {"n_stack": 3}}]
+    kwargs = {"channels_last": True, "frame_stack": 1}
+    model, _ = set_up(env_kwargs=kwargs, normalize={"norm_obs": False}, vec_env_wrapper=wrappers)
+    model.learn(20)
+    assert model.observation_space.shape == (9, 36, 36)
+
+
+def test_modules_of_the_working_directory_are_found(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Environment, head and buffer lie in one; it is named by either flag, and the entry of the file as well."""
+    Path("camera_of_mine.py").write_text(CAMERA)
+    settings = {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}
+    settings.update(srl="camera_of_mine.Head", replay_buffer_class="camera_of_mine.Buffer")
+    config = write({"camera_of_mine:Camera-v0": settings})
+    flags = (["--env", "camera_of_mine:Camera-v0"], ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"])
+    try:
+        for number, names in enumerate(flags, start=1):
+            gym.registry.pop("Camera-v0", None)
+            sys.modules.pop("camera_of_mine", None)
+            assert main(["train", *names, "--conf-file", config, "--eval-freq", "-1"]) == 0
+            assert main(["enjoy", *names, "-n", "20", "--no-render", "--srl", "camera_of_mine.Head"]) == 0
+            assert f"Camera-v0_{number}/Camera-v0.zip" in capsys.readouterr().out
+    finally:
+        gym.registry.pop("Camera-v0", None)
+        sys.modules.pop("camera_of_mine", None)
+
+
+def test_settings_may_be_python(folder: Path) -> None:
+    """Then they hold classes; the run, of a unique name, can be watched."""
+    Path("settings.py").write_text(
+        f"import torch\nfrom sb3_cure.srl import RAE\nhyperparams = {{'default': {SETTINGS}}}\n"
+        "hyperparams['default'].update(srl=RAE, n_envs=1)\n"
+        "hyperparams['default']['policy_kwargs']['activation_fn'] = torch.nn.Tanh"
+    )
+    assert main(["train", "--env", TASK, "--conf-file", "settings.py", "--eval-freq", "-1", "--uuid"]) == 0
+    assert main(["enjoy", "--env", TASK, "-n", "7", "--no-render"]) == 0
+
+
+def test_rl_zoos_own_algorithms_still_train(folder: Path) -> None:
+    assert main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
+    assert Path("logs/dqn/CartPole-v1_1/CartPole-v1.zip").is_file()
+
+
+# -------------------------------------------------------------------- tuning
+
+
+def test_trials_are_kept_and_trained_from(set_up: Callable[..., Any], folder: Path) -> None:
+    """Two calls add to one study; the first trial's values, number 0, reach the model, and -params beat them."""
+    study = ["--storage", "studies/study.log", "--study-name", "mine"]
+    config = write({"default": SETTINGS})
+    optimize = ["optimize", "--env", TASK, "--conf-file", config, *study, "--n-trials", "1", "--n-evaluations", "1"]
+    for seed in "12":
+        assert main([*optimize, "--eval-episodes", "1", "--no-optim-plots", "--seed", seed]) == 0
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend("studies/study.log"))
+    trials = optuna.load_study(study_name="mine", storage=storage).trials
+    assert [trial.state for trial in trials] == 2 * [optuna.trial.TrialState.COMPLETE]
+    model, _ = set_up(*study, "--trial-id", "0", "-params", "curiosity_beta:2.5")
+    assert model.batch_size == 2 ** trials[0].params["batch_size_pow"]
+    assert model.curiosity_prob == trials[0].params["curiosity_prob"] != trials[1].params["curiosity_prob"]
+    assert model.curiosity_beta == 2.5 and model.policy_kwargs["net_arch"] == [8]  # the latter is the file's
+    with pytest.raises(ValueError, match="--study-name"):
+        set_up("--trial-id", "0")
 
 
 @pytest.mark.parametrize(
@@ -301,115 +276,212 @@ def test_two_processes_share_a_study(folder: Path) -> None:
         (None, set()),
     ],
 )
-def test_what_is_tuned(curiosity: str | None, tuned: set[str]) -> None:
-    """Only what the kind of curiosity uses; Optuna's names and CuReSAC's agree."""
+def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str], folder: Path) -> None:
+    """The sampler is the one of the file's kind of curiosity; its names are arguments of the algorithm."""
+    zoo.register()
+    config = write({"default": {**SETTINGS, "curiosity": curiosity}})
+    asked = []
+
+    def sample(trial: optuna.Trial) -> float:
+        asked.append(zoo.HYPERPARAMS_SAMPLER["cure_sac"](trial, 2, 1, {}))
+        return 0.0
+
+    arguments = type("Arguments", (), {"gym_packages": []})()
+    manager = zoo.ExperimentManager(
+        arguments, "cure_sac", TASK, "logs", config=config, optimize_hyperparameters=True, sampler="random",
+        no_optim_plots=True, eval_freq=-1,
+    )  # fmt: skip
+    assert manager.setup_experiment() is None
+    manager.objective = sample  # type: ignore[method-assign]
+    manager.hyperparameters_optimization()
+    assert {name for name in asked[0] if "curiosity" in name} == tuned
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, **{**asked[0], "buffer_size": 20})
+    assert {name: getattr(model, name) for name in asked[0]} == asked[0]
+
+
+def test_quantiles_are_tuned_for_tqc() -> None:
     trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask()
-    arguments = zoo.sample_cure_sac_params(trial, 2, 1, {}, curiosity=curiosity)
-    assert {name for name in arguments if "curiosity" in name} == tuned
-    assert zoo.convert_cure_sac_params(trial.params) == arguments
-    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, **{**arguments, "buffer_size": 20})
-    check_arguments(model)
-    assert {name: getattr(model, name) for name in arguments} == arguments
+    arguments = zoo.sample_params(trial, 2, 1, {}, quantiles=True)
+    assert 0 <= arguments["top_quantiles_to_drop_per_net"] <= 5
+    assert zoo.convert_params(trial.params) == arguments
 
 
-# ------------------------------------------------------------------- doctor
+# ----------------------------------------------------------------- replaying
 
 
-def test_the_doctor_on_a_machine_that_works(capsys: pytest.CaptureFixture[str]) -> None:
-    """Versions, choices, and the time of a frame with both renderers; status 0."""
-    assert cli.main(["doctor"]) == 0
-    report = capsys.readouterr().out
-    for text in (
-        "torch  ",
-        "mujoco  ",
-        f"rl_zoo3 {metadata.version('rl_zoo3')}",
-        'precision="auto"',
-        'compile="auto"',
-        '(renderer="fast")',
-        "MUJOCO_GL=",
-    ):
-        assert text in report
-    assert "ERROR" not in report and "Training can work here." in report
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[OffPolicyAlgorithm]:
+    """The models that are replayed."""
+    models = []
+    play = zoo._play
+
+    def keep(model: OffPolicyAlgorithm, *args: Any) -> Any:
+        models.append(model)
+        return play(model, *args)
+
+    monkeypatch.setattr(zoo, "_play", keep)
+    return models
 
 
-@pytest.mark.parametrize("broken", [{"MUJOCO_GL": "nonsense"}, {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "nonsense"}])
-def test_the_doctor_survives_broken_opengl(
-    broken: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The rest of the report is there, the error says what to install, and the status is 1."""
-    for name, value in broken.items():
-        monkeypatch.setenv(name, value)
-    assert cli.main(["doctor"]) == 1
-    report = capsys.readouterr().out
-    assert "torch  " in report and "Traceback" not in report
-    assert "ERROR    OpenGL cannot render here" in report and "apt-get install libegl1" in report
-    assert "Training cannot work here yet." in report
+def replay(program: str, run: Path, *arguments: str, task: str = TASK) -> int:
+    rest = ["--no-render"] if program == "enjoy" else []
+    flags = ["--env", task, "-f", str(run.parent.parent), "-n", "14", "--device", "cpu"]
+    return main([program, *flags, *rest, *arguments])
 
 
-def test_the_doctor_in_a_folder_of_any_names(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A random.py in the working directory is not taken for Python's own; modules may be looked for in a Path."""
-    (folder / "random.py").write_text("1 / 0")
-    monkeypatch.setattr(sys, "path", [*sys.path, folder / "modules"])
-    assert "error" not in doctor.try_rendering()
+def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """With the class of its head, in its own environment, or in one that flags change."""
+    with pytest.raises(ValueError, match="heads_of_mine"):
+        replay("enjoy", run)
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle") == 0
+    assert "2 Episodes" in capsys.readouterr().out  # of 7 steps each
+    assert type(played[0].policy.srl) is Gentle
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "episode_length:2") == 0
+    assert "7 Episodes" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="observations"):
+        replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40")
+
+
+@pytest.mark.parametrize("flags", [[], ["--stochastic"]])
+def test_actions_are_means_unless_asked(flags: list[str], run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def predict(model: CuReSAC, observation: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
+        asked.append(deterministic)
+        return np.zeros((1, 2), np.float32), None
+
+    monkeypatch.setattr(CuReSAC, "predict", predict)
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", *flags) == 0
+    assert asked == 14 * [not flags]
+
+
+def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
+    assert replay("record", run, "--srl", "heads_of_mine.Gentle", "--load-best", "-o", str(tmp_path)) == 0
+    (video,) = tmp_path.glob("best_model-*.mp4")
+    assert video.stat().st_size > 1000
+
+
+@pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
+def test_window_can_show_the_agent() -> None:
+    """`enjoy` asks for render_mode="human", which Gymnasium grants to environments that can be filmed."""
+    env = gym.make(TASK, render_mode="human")
+    assert env.render_mode == "human" and env.get_wrapper_attr("frame_stack") == 2
+    env.close()
 
 
 @pytest.mark.parametrize(
-    ("renderer", "gpus", "install"),
+    ("flags", "model"),
     [
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", ["NVIDIA A100"], "libegl-nvidia0"),
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", ["Intel GPU"], "libgl1-mesa-dri"),
-        ("llvmpipe (LLVM 15.0.6, 256 bits)", [], None),
-        ("NVIDIA A100/PCIe/SSE2", ["NVIDIA A100"], None),
+        ([], f"{RUN}_12_0a-9b/{RUN}.zip"),  # not of 13, which has none: of a search, say
+        (["--exp-id", "3"], f"{RUN}_3/{RUN}.zip"),
+        (["--exp-id", "3", "--load-best"], f"{RUN}_3/best_model.zip"),
+        (["--exp-id", "3", "--load-checkpoint", "50"], f"{RUN}_3/rl_model_50_steps.zip"),
+        (["--exp-id", "3", "--load-last-checkpoint"], f"{RUN}_3/rl_model_100_steps.zip"),
+        (["--load-best"], None),  # rather than that of an older run
+        (["--exp-id", "3", "--load-checkpoint", "5"], None),
+        (["--exp-id", "4"], None),
+        (["--algo", "cure_sac", "--env", "tests/Vector-v0"], None),
     ],
 )
-def test_software_rendering_beside_a_gpu_is_warned_of(renderer: str, gpus: list[str], install: str | None) -> None:
-    """The warning names both, and what to install; without a GPU there is nothing to warn of."""
-    warning = doctor.judge_renderer(renderer, gpus)
-    assert (warning is not None) == (install is not None)
-    if warning and install:
-        assert "llvmpipe" in warning and gpus[0] in warning and install in warning
+def test_model_is_the_one_that_flags_name(
+    flags: list[str], model: str | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Found(Exception):
+        pass
+
+    runs = Path("logs/cure_sac")
+    files = [f"{RUN}_3/{name}" for name in ("best_model", "rl_model_50_steps", "rl_model_100_steps", RUN)]
+    files += [f"{RUN}_12_0a-9b/{RUN}", f"tests-Filmed-v01_14/{RUN}"]
+    for file in files:
+        (runs / file).parent.mkdir(parents=True, exist_ok=True)
+        (runs / f"{file}.zip").touch()
+    (runs / f"{RUN}_13").mkdir()
+
+    def load(path: Path, *args: Any, **kwargs: Any) -> None:
+        raise Found(str(path))
+
+    monkeypatch.setattr(CuReSAC, "load", load)
+    with pytest.raises(SystemExit if model is None else Found) as found:
+        main(["enjoy", "--env", TASK, "--no-render", *flags])
+    assert model is None or str(found.value) == str(runs / model)
 
 
-def test_gpus_that_draw_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of AMD and Intel, which this torch does not compute on; not the display of a server's board (ASPEED)."""
-    for number, vendor in enumerate(["0x8086", "0x1002", "0x1a03"]):
-        device = tmp_path / f"renderD{128 + number}" / "device"
-        device.mkdir(parents=True)
-        (device / "vendor").write_text(f"{vendor}\n")
-    monkeypatch.setattr(doctor, "DRM", tmp_path)
-    monkeypatch.setattr(doctor.th.cuda, "is_available", lambda: False)
-    gpus = doctor.find_gpus()
-    assert gpus[-2:] == ["Intel GPU", "AMD GPU"]
-    report = doctor.Report()
-    doctor._check_hardware(report, gpus[-2:])
-    assert ("GPU", "Intel GPU, AMD GPU") in report.sections["Hardware"]
-    assert not any("CUDA" in warning for warning in report.warnings), "which they do not run"
+def test_replaying_needs_no_replay_buffer(folder: Path, played: list[Any]) -> None:
+    """Whatever the size and the class of the one that it was trained with."""
+    run = folder / "logs" / "cure_sac" / f"{RUN}_1"
+    run.mkdir(parents=True)
+    tiny_model("CnnPolicy", Filmed(), buffer_size=10_000).save(run / f"{RUN}.zip")
+    tracemalloc.start()
+    replay("enjoy", run)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert played[0].observation_space.shape == (6, 36, 36)
+    assert peak < 10_000 * 3 * 36 * 36 / 10
 
 
-def test_memory_is_compared_with_the_buffer() -> None:
-    """80 000 transitions of three 84 x 84 frames; where they do not fit, the ways out are named."""
-    needed = doctor.default_buffer_bytes()
-    assert 80_000 * 3 * 84 * 84 < needed < 1.1 * 80_000 * 3 * 84 * 84
-    assert doctor.judge_memory(needed + 1, needed) is None
-    assert doctor.judge_memory(None, needed) is None
-    assert "frames_dir" in str(doctor.judge_memory(needed - 1, needed))
+def hostile(run: Path, folder: Path, file: str, text: str) -> Path:
+    """A copy of the run with another settings file."""
+    copied = folder / "logs" / "cure_sac" / run.name
+    shutil.copytree(run, copied)
+    (copied / RUN / file).write_text(text)
+    return copied
 
 
-def test_versions_are_compared_with_the_requirements() -> None:
-    """Missing and unsuitable packages are told apart; an extra's include those of the extras it builds on."""
-    numpy = Requirement("numpy>=999")
-    missing = Requirement("no-such-package-of-sb3-cure>=1")
-    problems = doctor.unmet([Requirement("numpy>=1"), numpy, missing])
-    assert len(problems) == 2 and ">=999" in problems[0] and "is missing" in problems[1]
-    assert {"torch", "mujoco", "gymnasium"} <= {requirement.name for requirement in doctor.requirements()}
-    extra = {requirement.name for requirement in doctor.requirements("experiments")}
-    assert {"rliable", "matplotlib"} <= extra and ("rl_zoo3" in extra or "rl-zoo3" in extra) and "torch" not in extra
+@pytest.mark.parametrize("program", ["enjoy", "record"])
+@pytest.mark.parametrize("file", ["config.yml", "args.yml"])
+@pytest.mark.parametrize("tag", ["object/apply:os.mkdir [pwned]", "object/new:os.mkdir [pwned]", "module:antigravity"])
+def test_settings_of_a_run_execute_nothing(program: str, file: str, tag: str, run: Path, folder: Path) -> None:
+    copied = hostile(run, folder, file, f"env_kwargs: !!python/{tag}")
+    with pytest.raises(yaml.YAMLError):
+        replay(program, copied, "--srl", "heads_of_mine.Gentle")
+    assert not Path("pwned").exists() and "antigravity" not in sys.modules
 
 
-def test_a_runs_settings_cannot_run_code(tmp_path: Path) -> None:
-    """What rl-zoo3 writes beside a model is read as data, classes as their names; objects are refused."""
-    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5))])
-    assert yaml.load(yaml.dump(settings), Loader=zoo.RunLoader) == settings
-    assert yaml.load("!!python/name:no_such.module ''", Loader=zoo.RunLoader) == "no_such.module"
-    with pytest.raises(yaml.YAMLError, match="could not determine a constructor"):
-        yaml.load("!!python/object/apply:os.system ['true']", Loader=zoo.RunLoader)
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "normalize: \"__import__('os').mkdir('pwned')\"",
+        "env_wrapper: [{antigravity.Wrapper: {}}]",
+        "vec_env_wrapper: antigravity.Wrapper",
+    ],
+)
+def test_settings_that_name_code_need_trust(setting: str, run: Path, folder: Path) -> None:
+    copied = hostile(run, folder, "config.yml", setting)
+    with pytest.raises(SystemExit):
+        replay("enjoy", copied, "--srl", "heads_of_mine.Gentle")
+    assert not Path("pwned").exists() and "antigravity" not in sys.modules
+
+
+def test_statistics_of_a_run_need_trust(folder: Path, played: list[Any]) -> None:
+    """They are pickled; with trust the agent sees the observations normalised as in training."""
+    train(
+        *("--eval-freq", "-1"), task="tests/Vector-v0", policy="MlpPolicy", normalize=True, srl=None, curiosity=None,
+        policy_kwargs={"net_arch": [8]}, warmup_updates=None, env_kwargs={},
+    )  # fmt: skip
+    run = folder / "logs" / "cure_sac" / "tests-Vector-v0_1"
+    with pytest.raises(SystemExit):
+        replay("enjoy", run, task="tests/Vector-v0")
+    assert replay("enjoy", run, "--trusted", task="tests/Vector-v0") == 0
+    (model,) = played
+    statistics = model.get_vec_normalize_env()
+    with open(run / "tests-Vector-v0" / "vecnormalize.pkl", "rb") as file:
+        trained = pickle.load(file)
+    assert not statistics.training and not statistics.norm_reward
+    np.testing.assert_array_equal(statistics.obs_rms.mean, trained.obs_rms.mean)
+
+
+def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
+    """As the README's example does; what was trained so can be filmed."""
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    example = next(block for block in re.findall(r"```yaml\n(.*?)```", readme, re.S) if "env_wrapper" in block)
+    train("--eval-freq", "-1", "-n", "14", task="Pendulum-v1", **yaml.safe_load(example)["default"])
+    assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
+    (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
+    assert video.stat().st_size > 1000
+
+
+def test_what_rl_zoo_writes_is_read_as_data() -> None:
+    """Tuples and ordered dictionaries are what they were, classes their names."""
+    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5)), ("class", Filmed)])
+    read = yaml.load(yaml.dump(settings), Loader=zoo.RunLoader)
+    assert read == {**settings, "class": f"{Filmed.__module__}.Filmed"}

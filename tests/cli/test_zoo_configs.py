@@ -11,11 +11,12 @@ import yaml
 from envs_for_tests import PixelBox
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cure import CuReSAC, zoo
+from sb3_cure import CuReSAC
+from sb3_cure.cli import zoo
 from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
 from sb3_cure.experiments.grid import load_grid
 
-FOLDER = Path(__file__).parent.parent / "zoo_configs"
+FOLDER = Path(__file__).parents[2] / "zoo_configs"
 METHODS = {
     "sac_ae": {"srl": "rae", "curiosity": None},
     "curl": {"srl": "curl", "curiosity": None},
@@ -63,7 +64,7 @@ def set_up(config: Path, task: str, log_folder: Path, **changes: Any) -> tuple[C
     """The model and the manager of a training from this file, as ``sb3-cure train`` makes them."""
     zoo.register()
     changes = copy.deepcopy(changes)  # SB3 adds to policy_kwargs
-    arguments = type("Arguments", (), {})()
+    arguments = type("Arguments", (), {"gym_packages": []})()
     n_timesteps = changes.pop("n_timesteps", 0)
     manager = zoo.ExperimentManager(
         arguments, "cure_sac", task, str(log_folder), n_timesteps=n_timesteps, config=str(config),
@@ -163,22 +164,6 @@ def test_every_grid_has_a_fast_one(name: str) -> None:
             share = method["pretrain"]["budget"] / slow.description["budget"]
             method["pretrain"]["budget"] = share * fast.description["budget"]
     assert list(fast.description["methods"].items()) == list(methods.items())
-
-
-def test_rl_zoos_entry_for_atari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Holds before the default where there is one, as in rl-zoo3's files; without one the default does."""
-
-    class AtariEnv(Dots):  # by this name rl-zoo3 tells them
-        pass
-
-    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", AtariEnv))
-    settings = {"default": {**yaml.safe_load((FOLDER / "sac_ae.yml").read_text())["default"], "gamma": 0.5}}
-    for gamma in (0.5, 0.7):
-        path = tmp_path / f"{gamma}.yml"
-        path.write_text(yaml.safe_dump(settings))
-        model, _ = set_up(path, "Dots-v0", tmp_path, policy_kwargs=SMALL, buffer_size=200)
-        assert model.gamma == gamma
-        settings["atari"] = {**settings["default"], "gamma": 0.7}
 
 
 def test_grids_read_the_entry_of_the_namespace() -> None:
