@@ -49,6 +49,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
       ``my_module:My-v0:`` for an environment that this module registers;
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
+    - statistics beside the model of ``-i``, which are pickled, are loaded only where the settings say ``normalize``;
     - ``--trial-id 0`` is the first trial, where rl-zoo3 takes 0 for none;
     - ``optimize`` samples only what the chosen kind of curiosity uses.
     """
@@ -87,6 +88,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         return processed
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        return super()._maybe_normalize(env, eval_env) if self.normalize else env
 
     def hyperparameters_optimization(self) -> None:
         if self.algo in ALGORITHMS:

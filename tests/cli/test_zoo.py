@@ -179,6 +179,13 @@ def test_training_goes_on_with_a_trained_agent(set_up: Callable[..., Any], run: 
     assert all(np.array_equal(value.cpu(), trained[name]) for name, value in model.policy.state_dict().items())
 
 
+def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
+    """They are pickled, and their run's settings did not ask for them."""
+    copied = hostile(run, folder, "vecnormalize.pkl", "cos\nmkdir\n(S'pwned'\ntR.")
+    model, _ = set_up("-i", str(copied / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
+    assert model.get_vec_normalize_env() is None and not Path("pwned").exists()
+
+
 def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
     checkpoint = {"sb3_cure.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
     train("--eval-freq", "-1", callback=[checkpoint])
