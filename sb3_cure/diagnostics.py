@@ -14,8 +14,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_cure import doctor
 from sb3_cure.buffers import transitions
+from sb3_cure.envs import render_check
 from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import RAE
 
@@ -281,12 +281,12 @@ def software_rendering(env: VecEnv) -> Finding | None:
     :param env: Training environments
     :return: None without a GPU, without images, or where the environments do not render MuJoCo by OpenGL
     """
-    gpus = doctor.find_gpus()
+    gpus = render_check.find_gpus()
     renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
     if not gpus or not renders or not is_image_space(env.observation_space):
         return None
-    renderer = doctor.try_rendering().get("renderer")
-    problem = None if renderer is None else doctor.judge_renderer(renderer, gpus)
+    renderer = render_check.try_rendering().get("renderer")
+    problem = None if renderer is None else render_check.judge_renderer(renderer, gpus)
     return Finding("software_rendering", problem is not None, problem)
 
 

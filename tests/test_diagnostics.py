@@ -22,8 +22,9 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_cure import CuReSAC, diagnostics, doctor, make_dmc_env
+from sb3_cure import CuReSAC, diagnostics, make_dmc_env
 from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
+from sb3_cure.envs import render_check
 from sb3_cure.srl import SRLHead, SRLOutput
 
 
@@ -270,7 +271,7 @@ def test_software_rendering_on_a_gpu_machine(software: bool, monkeypatch: pytest
     monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(th.cuda, "get_device_name", lambda index: "NVIDIA H200")
     renderer = "llvmpipe (LLVM 15.0.6, 256 bits)" if software else "NVIDIA H200/PCIe/SSE2"
-    monkeypatch.setattr(doctor, "try_rendering", lambda: {"renderer": renderer})
+    monkeypatch.setattr(render_check, "try_rendering", lambda: {"renderer": renderer})
     env = make_dmc_env("cartpole", "swingup", image_size=40)
     warned, logged = watch(tiny_model("CnnPolicy", env), 60)
     env.close()
@@ -284,12 +285,12 @@ def test_software_rendering_on_a_gpu_machine(software: bool, monkeypatch: pytest
 
 def test_rendering_is_not_asked_about_without_need(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither without a GPU, nor where nothing is rendered by OpenGL: it takes a process of its own."""
-    monkeypatch.setattr(doctor, "try_rendering", lambda: pytest.fail("rendered"))
-    monkeypatch.setattr(doctor, "find_gpus", lambda: [])
+    monkeypatch.setattr(render_check, "try_rendering", lambda: pytest.fail("rendered"))
+    monkeypatch.setattr(render_check, "find_gpus", lambda: [])
     env = make_dmc_env("cartpole", "swingup", image_size=40)
     assert diagnostics.software_rendering(DummyVecEnv([lambda: env])) is None
     env.close()
-    monkeypatch.setattr(doctor, "find_gpus", lambda: ["NVIDIA H200"])
+    monkeypatch.setattr(render_check, "find_gpus", lambda: ["NVIDIA H200"])
     assert diagnostics.software_rendering(DummyVecEnv([PixelBox])) is None
 
 

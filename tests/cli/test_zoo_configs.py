@@ -11,11 +11,12 @@ import yaml
 from envs_for_tests import PixelBox
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cure import CuReSAC, zoo
+from sb3_cure import CuReSAC
+from sb3_cure.cli import zoo
 from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
 from sb3_cure.experiments.grid import load_grid
 
-FOLDER = Path(__file__).parent.parent / "zoo_configs"
+FOLDER = Path(__file__).parents[2] / "zoo_configs"
 METHODS = {
     "sac_ae": {"srl": "rae", "curiosity": None},
     "curl": {"srl": "curl", "curiosity": None},
@@ -59,15 +60,17 @@ def entry_of(path: Path, task: str) -> dict[str, Any]:
     return content.get(task, content.get("dmc_pixels", content["default"]))
 
 
-def set_up(config: Path, task: str, log_folder: Path, **changes: Any) -> tuple[CuReSAC, zoo.ExperimentManager]:
+def set_up(
+    config: Path, task: str, log_folder: Path, algorithm: str = "cure_sac", **changes: Any
+) -> tuple[CuReSAC, zoo.ExperimentManager]:
     """The model and the manager of a training from this file, as ``sb3-cure train`` makes them."""
     zoo.register()
     changes = copy.deepcopy(changes)  # SB3 adds to policy_kwargs
-    arguments = type("Arguments", (), {})()
+    arguments = type("Arguments", (), {"gym_packages": []})()
     n_timesteps = changes.pop("n_timesteps", 0)
     manager = zoo.ExperimentManager(
-        arguments, "cure_sac", task, str(log_folder), n_timesteps=n_timesteps, config=str(config),
-        hyperparams=changes, eval_freq=-1, n_eval_episodes=1, device="cpu", verbose=0,
+        arguments, algorithm, task, str(log_folder), n_timesteps=n_timesteps, config=str(config),
+        hyperparams=changes, eval_freq=-1, log_interval=-1, device="cpu", verbose=0,
     )  # fmt: skip
     model, _ = manager.setup_experiment()  # type: ignore[misc]
     return model, manager  # type: ignore[return-value]
@@ -120,18 +123,23 @@ def test_every_fast_entry_is_the_demos_settings(method: str, task: str, tmp_path
     assert manager.n_timesteps * model.env.get_attr("action_repeat")[0] == 100_000  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("path", [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS])
-def test_each_file_trains(path: str, tmp_path: Path) -> None:
-    """50 steps in two real environments; those of the evaluation show the same pixels."""
+FILES = [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS]
+TRAINED = [("cure_sac", path) for path in FILES]
+TRAINED += [(algorithm, "cure_sac_ae.yml") for algorithm in zoo.ALGORITHMS if algorithm != "cure_sac"]
+
+
+@pytest.mark.parametrize(("algorithm", "path"), TRAINED)
+def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
+    """In two real environments; those of the evaluation show the same pixels."""
     burst = min(entry_of(FOLDER / path, ANY_OTHER)["warmup_updates"], 3)
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=30, warmup_updates=burst, buffer_size=200)
+    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=10, warmup_updates=burst, buffer_size=200)
     model, manager = set_up(
-        FOLDER / path, "dmc_pixels/cartpole-swingup-v0", tmp_path, n_timesteps=50, n_envs=2, **small
+        FOLDER / path, "dmc_pixels/cartpole-swingup-v0", tmp_path, algorithm, n_timesteps=18, n_envs=2, **small
     )
     manager.learn(model)
-    assert model.num_timesteps == 50
+    assert type(model) is zoo.ALGORITHMS[algorithm] and model.num_timesteps == 18
     # The burst, then an update per agent step.
-    assert model._n_updates == burst + 20
+    assert model._n_updates == burst + 8
     assert float(model.logger.name_to_value["train/srl_loss"]) > 0
     evaluation = manager.create_envs(1, eval_env=True, no_log=True)
     assert evaluation.observation_space == model.observation_space
@@ -139,14 +147,14 @@ def test_each_file_trains(path: str, tmp_path: Path) -> None:
     evaluation.close()
 
 
-@pytest.mark.parametrize("path", [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS])
-def test_the_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("path", FILES)
+def test_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whatever size and order of channels, here 52 pixels, channels last; with that file's head."""
     monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", Dots))
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=30, warmup_updates=2, buffer_size=200)
-    model, manager = set_up(FOLDER / path, "Dots-v0", tmp_path, n_timesteps=50, **small)
+    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=20, warmup_updates=2, buffer_size=200)
+    model, manager = set_up(FOLDER / path, "Dots-v0", tmp_path, n_timesteps=25, **small)
     manager.learn(model)
-    assert (model.num_timesteps, model._n_updates) == (50, 2 + 20)
+    assert (model.num_timesteps, model._n_updates) == (25, 2 + 5)
     assert model.srl == METHODS[path.removeprefix("fast/").removesuffix(".yml")]["srl"]
     assert float(model.logger.name_to_value["train/srl_loss"]) > 0
 
@@ -163,22 +171,6 @@ def test_every_grid_has_a_fast_one(name: str) -> None:
             share = method["pretrain"]["budget"] / slow.description["budget"]
             method["pretrain"]["budget"] = share * fast.description["budget"]
     assert list(fast.description["methods"].items()) == list(methods.items())
-
-
-def test_rl_zoos_entry_for_atari(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Holds before the default where there is one, as in rl-zoo3's files; without one the default does."""
-
-    class AtariEnv(Dots):  # by this name rl-zoo3 tells them
-        pass
-
-    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", AtariEnv))
-    settings = {"default": {**yaml.safe_load((FOLDER / "sac_ae.yml").read_text())["default"], "gamma": 0.5}}
-    for gamma in (0.5, 0.7):
-        path = tmp_path / f"{gamma}.yml"
-        path.write_text(yaml.safe_dump(settings))
-        model, _ = set_up(path, "Dots-v0", tmp_path, policy_kwargs=SMALL, buffer_size=200)
-        assert model.gamma == gamma
-        settings["atari"] = {**settings["default"], "gamma": 0.7}
 
 
 def test_grids_read_the_entry_of_the_namespace() -> None:

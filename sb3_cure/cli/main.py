@@ -1,0 +1,69 @@
+"""The command ``sb3-cure``: one word that says what to do, and that program's own arguments."""
+
+import pkgutil
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sb3_cure.allocator import tune_allocator
+
+
+class Command(NamedTuple):
+    """
+    :param program: Function of the arguments that returns the exit status, or None for 0
+    :param extra: Extra of sb3-cure that it needs, or None
+    :param purpose: One line for the overview
+    """
+
+    program: str
+    extra: str | None
+    purpose: str
+
+
+#: Programs are named, because importing them takes seconds, and their packages may be missing.
+COMMANDS = {
+    "train": Command("sb3_cure.cli.zoo:train", "zoo", "train from a YAML file (rl-zoo3's train)"),
+    "enjoy": Command("sb3_cure.cli.zoo:enjoy", "zoo", "watch a trained agent, or only print its returns"),
+    "record": Command("sb3_cure.cli.zoo:record", "zoo", "write a video of a trained agent"),
+    "optimize": Command("sb3_cure.cli.zoo:optimize", "zoo", "search hyper-parameters (rl-zoo3's train -optimize)"),
+    "experiment": Command("sb3_cure.experiments.run:main", "experiments", "run a grid of tasks, methods and seeds"),
+    "report": Command("sb3_cure.experiments.report:main", "experiments", "show a grid's results as one HTML file"),
+    "doctor": Command("sb3_cure.cli.doctor:main", None, "tell what this machine has and what is missing"),
+}
+
+
+def usage() -> str:
+    """
+    :return: The overview of all commands
+    """
+    lines = [f"  {name:<12} {command.purpose}" for name, command in COMMANDS.items()]
+    return "\n".join(["usage: sb3-cure COMMAND [ARGUMENTS]   (sb3-cure COMMAND --help shows them)", "", *lines])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    :param argv: Command line without the program's name, ``sys.argv[1:]`` by default
+    :return: Exit status
+    """
+    name, *arguments = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+        return 0
+    if name not in COMMANDS:
+        print(f"sb3-cure has no command {name!r}; it has {', '.join(COMMANDS)}.", file=sys.stderr)
+        return 2
+    command = COMMANDS[name]
+    try:
+        program = pkgutil.resolve_name(command.program)
+    except ModuleNotFoundError as error:
+        if command.extra is None or str(error.name).startswith("sb3_cure"):
+            raise
+        install = f'pip install "sb3-cure[{command.extra}]"'
+        print(f"sb3-cure {name} needs {error.name}, which is not installed: {install}", file=sys.stderr)
+        return 2
+    tune_allocator()
+    return program(arguments) or 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

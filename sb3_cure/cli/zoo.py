@@ -1,0 +1,355 @@
+"""rl-zoo3 with CuRe's algorithms: ``train`` and ``optimize`` are rl-zoo3's programs, ``enjoy`` and ``record`` our own.
+
+rl-zoo3's own programs to replay a run read its settings with a YAML loader that runs code, and allocate the whole
+replay buffer. Ours do neither.
+"""
+
+import argparse
+import contextlib
+import importlib
+import sys
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import rl_zoo3.train
+import yaml
+from rl_zoo3 import ALGOS, create_test_env, exp_manager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_class_by_name
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule, set_random_seed
+from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
+
+import sb3_cure
+from sb3_cure.envs.rendering import is_headless
+
+DEFAULT_ALGORITHM = "cure_sac"
+#: Algorithms by the names that ``--algo`` knows them by
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {DEFAULT_ALGORITHM: sb3_cure.CuReSAC}
+if hasattr(sb3_cure, "CuReTQC"):
+    ALGORITHMS["cure_tqc"] = sb3_cure.CuReTQC
+#: Arguments of the algorithms that take a class of the user's own, which settings name as ``my_module.MyClass``
+OWN = ("srl", "intrinsic")
+#: Settings of a run by which replaying it imports and calls what they name, or unpickles
+TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
+
+
+# ------------------------------------------------------------------ training
+
+
+class ExperimentManager(exp_manager.ExperimentManager):
+    """rl-zoo3's, which reads the settings and makes environments and model, with these additions:
+
+    - an entry ``dmc_pixels:`` of a YAML file holds for the tasks of this namespace that have none of their own, and
+      ``my_module:My-v0:`` for an environment that this module registers;
+    - ``env_kwargs`` of the file hold for the evaluation's environments, too;
+    - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
+    - statistics beside the model of ``-i``, which are pickled, are loaded only where the settings say ``normalize``;
+    - ``--trial-id 0`` is the first trial, where rl-zoo3 takes 0 for none;
+    - ``optimize`` samples only what the chosen kind of curiosity uses.
+    """
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        if self.trial_id is not None:
+            if not (self.storage and self.study_name):
+                raise ValueError("--trial-id names a trial of a study: add --storage and --study-name.")
+            trial = self.load_trial(self.storage, self.study_name, self.trial_id)
+            self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
+            self.trial_id = None
+        env_name = self.env_name
+        if self.config.endswith((".yml", ".yaml")):
+            # rl-zoo3 looks for the environment's own id, then for "default".
+            self.env_name = EnvironmentName(self._entry(yaml.safe_load(Path(self.config).read_text())))
+        try:
+            return super().read_hyperparameters()
+        finally:
+            self.env_name = env_name
+
+    def _entry(self, entries: dict[str, Any]) -> str:
+        task = self.env_name.gym_id
+        names = [*(f"{module}:{task}" for module in self.args.gym_packages), task, task.rpartition("/")[0]]
+        names += ["atari"] if self._is_atari else []
+        return next((name for name in [*names, "default"] if name in entries), task)
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
+        for name in (*OWN, "replay_buffer_class"):
+            value = hyperparams.get(name)
+            if isinstance(value, str) and "." in value:
+                hyperparams[name] = get_class_by_name(value)
+        processed = super()._preprocess_hyperparams(hyperparams)
+        rate = processed[0].get("learning_rate")
+        if isinstance(rate, SimpleLinearSchedule):  # which archives do not know
+            processed[0]["learning_rate"] = LinearSchedule(rate.initial_value, 0.0, 1.0)
+        if self._eval_env_kwargs_args is None:
+            self.eval_env_kwargs = self.env_kwargs
+        return processed
+
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        return super()._maybe_normalize(env, eval_env) if self.normalize else env
+
+    def hyperparameters_optimization(self) -> None:
+        if self.algo in ALGORITHMS:
+            curiosity = self._hyperparams.get("curiosity", "separate")
+            sampler = partial(sample_params, curiosity=curiosity, quantiles=self.algo == "cure_tqc")
+            HYPERPARAMS_SAMPLER[self.algo] = sampler
+        super().hyperparameters_optimization()
+
+
+def sample_params(
+    trial: optuna.Trial,
+    n_actions: int,
+    n_envs: int,
+    additional_args: dict[str, Any],
+    curiosity: str | None = "separate",
+    quantiles: bool = False,
+) -> dict[str, Any]:
+    """What ``optimize`` varies; all else, such as the head and the networks, stays as in the YAML file.
+
+    :param trial: Optuna's trial
+    :param n_actions: Unused (rl-zoo3's signature)
+    :param n_envs: Unused (rl-zoo3's signature)
+    :param additional_args: Unused (rl-zoo3's signature)
+    :param curiosity: As in ``CuReSAC``; decides which of the curious agent's parameters matter
+    :param quantiles: Whether the critics are TQC's
+    :return: Arguments of the algorithm
+    """
+    sampled: dict[str, Any] = {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 2e-3, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 5, 9),
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.005, 0.05, log=True),
+        "tau": trial.suggest_float("tau", 0.002, 0.05, log=True),
+        "encoder_tau": trial.suggest_float("encoder_tau", 0.01, 0.1, log=True),
+        "initial_temperature": trial.suggest_float("initial_temperature", 0.01, 1.0, log=True),
+    }
+    if curiosity in ("separate", "random"):
+        sampled["curiosity_prob"] = trial.suggest_float("curiosity_prob", 0.0, 0.5)
+    if curiosity in ("separate", "bonus"):
+        sampled["curiosity_beta"] = trial.suggest_float("curiosity_beta", 0.1, 10.0, log=True)
+    if quantiles:
+        sampled["top_quantiles_to_drop_per_net"] = trial.suggest_int("top_quantiles_to_drop_per_net", 0, 5)
+    converted = convert_params(sampled)
+    for name in ("batch_size", "gamma", "ent_coef"):  # Optuna's reports then show the values themselves
+        trial.set_user_attr(name, converted[name])
+    return converted
+
+
+def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: Parameters of a trial, by the names that Optuna knows them by
+    :return: Arguments of the algorithm
+    """
+    arguments = dict(sampled_params)
+    arguments["batch_size"] = 2 ** arguments.pop("batch_size_pow")
+    arguments["gamma"] = 1 - arguments.pop("one_minus_gamma")
+    arguments["ent_coef"] = f"auto_{arguments.pop('initial_temperature')}"
+    return arguments
+
+
+def register() -> None:
+    """Make ``cure_sac`` and ``cure_tqc`` known to rl-zoo3: to its programs, its experiment manager and its samplers."""
+    ALGOS.update(ALGORITHMS)
+    for name in ALGORITHMS:
+        HYPERPARAMS_SAMPLER[name] = partial(sample_params, quantiles=name == "cure_tqc")
+        HYPERPARAMS_CONVERTER[name] = convert_params
+    rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc, attr-defined]
+
+
+def train(arguments: Sequence[str]) -> None:
+    """
+    :param arguments: Command line of rl-zoo3's ``train``; ``--algo`` is ``cure_sac`` unless given, and ``--env`` may be
+        ``my_module:My-v0``, with the module that registers it
+    """
+    register()
+    _find_modules_here()
+    parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
+    parser.add_argument("--env")
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    given, rest = parser.parse_known_args(arguments)
+    if given.env is not None:
+        module, _, task = given.env.rpartition(":")
+        rest += ["--env", task]
+        given.gym_packages += [module] if module else []
+    if given.gym_packages:
+        rest += ["--gym-packages", *given.gym_packages]
+    own_arguments = sys.argv
+    sys.argv = ["sb3-cure train", "--algo", DEFAULT_ALGORITHM, *rest]  # of repeated flags argparse takes the last
+    try:
+        rl_zoo3.train.train()
+    finally:
+        sys.argv = own_arguments
+
+
+def optimize(arguments: Sequence[str]) -> None:
+    """
+    :param arguments: As for ``train``
+    """
+    train(["-optimize", *arguments])
+
+
+# ------------------------------------------------------------------ replaying
+
+
+class RunLoader(yaml.SafeLoader):
+    """Reads the settings that rl-zoo3 saves with a run: plain values, tuples and ordered dictionaries, nothing else.
+
+    Of classes and functions, such as an ``activation_fn``, the names are read, and nothing is imported.
+    """
+
+
+RunLoader.add_constructor(
+    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
+    lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),
+)
+RunLoader.add_constructor(
+    "tag:yaml.org,2002:python/tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True))
+)
+RunLoader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader, name, node: name)
+
+
+def enjoy(arguments: Sequence[str]) -> None:
+    """
+    :param arguments: Command line, see ``sb3-cure enjoy --help``
+    """
+    parser = _parser("enjoy", "Watch a trained agent, and print the returns of its episodes.")
+    parser.add_argument("--no-render", action="store_true", help="Open no window, only print the returns")
+    args = parser.parse_args(arguments)
+    if is_headless() and not args.no_render:
+        print("There is no display to show the agent on (as with --no-render); `record` writes a video.")
+        args.no_render = True
+    model, _ = _load(parser, args, None if args.no_render else "human")
+    env = model.get_env()
+    assert env is not None
+    episodes = _play(model, env, args)
+    env.close()
+    print(f"{len(episodes)} Episodes")
+    for name, key in (("reward", "r"), ("episode length", "l")):
+        values = [episode[key] for episode in episodes]
+        if values:
+            print(f"Mean {name}: {np.mean(values):.2f} +/- {np.std(values):.2f}")
+
+
+def record(arguments: Sequence[str]) -> None:
+    """
+    :param arguments: Command line, see ``sb3-cure record --help``
+    """
+    parser = _parser("record", "Write a video of a trained agent.")
+    parser.add_argument("-o", "--output-folder", type=Path, help="Default: videos, in the run's folder")
+    args = parser.parse_args(arguments)
+    model, path = _load(parser, args, "rgb_array")
+    env = model.get_env()
+    assert env is not None
+    folder = args.output_folder or path.parent / "videos"
+    recorder = VecVideoRecorder(env, str(folder), lambda step: step == 0, args.n_timesteps, name_prefix=path.stem)
+    _play(model, recorder, args)
+    recorder.close()
+
+
+def _parser(program: str, description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(f"sb3-cure {program}", description=description)
+    parser.add_argument("--env", required=True, help="Gymnasium's id of the environment, or my_module:My-v0")
+    parser.add_argument("--algo", default=DEFAULT_ALGORITHM, choices=ALGORITHMS, help="Default: %(default)s")
+    parser.add_argument("-f", "--folder", default="logs", help="Where it was trained into (default: %(default)s)")
+    parser.add_argument("--exp-id", type=int, default=0, help="Number of the run (default: the latest with a model)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--load-best", action="store_true", help="The model with the best evaluation")
+    which.add_argument("--load-checkpoint", metavar="STEPS", help="The checkpoint of this number of agent steps")
+    which.add_argument("--load-last-checkpoint", action="store_true", help="The checkpoint that was written last")
+    parser.add_argument("-n", "--n-timesteps", type=int, default=1000, help="Agent steps (default: %(default)s)")
+    parser.add_argument("--stochastic", action="store_true", help="Sample actions instead of taking the mean")
+    parser.add_argument("--seed", type=int, default=0, help="Default: %(default)s")
+    parser.add_argument("--device", default="auto", help="PyTorch device (default: %(default)s)")
+    parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, metavar="NAME:VALUE", help="As for train")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="Modules that register environments")
+    for name in OWN:
+        parser.add_argument(f"--{name}", metavar="MODULE.CLASS", help="Class of your own, which no saved model holds")
+    parser.add_argument(
+        "--trusted", action="store_true", help="Also import, call and unpickle what the run's folder asks for"
+    )
+    return parser
+
+
+def _load(
+    parser: argparse.ArgumentParser, args: argparse.Namespace, render_mode: str | None
+) -> tuple[OffPolicyAlgorithm, Path]:
+    """The model, in its run's environment and without a replay buffer to speak of, and its path."""
+    _find_modules_here()
+    module, _, task = args.env.rpartition(":")
+    for package in [*args.gym_packages, *([module] if module else [])]:
+        importlib.import_module(package)
+    path = _find_model(parser, args, task)
+    print(f"Loading {path}")
+    folder = path.parent / EnvironmentName(task)
+    settings, flags = _read_settings(folder / "config.yml"), _read_settings(folder / "args.yml")
+    if not args.trusted and (named := [name for name in TRUSTED_SETTINGS if settings.get(name)]):
+        parser.error(
+            f"{folder / 'config.yml'} has {' and '.join(named)}, which can run any code: if you know where it comes "
+            "from, add --trusted."
+        )
+    env_kwargs = {**(flags.get("env_kwargs") or settings.get("env_kwargs") or {}), **(args.env_kwargs or {})}
+    if render_mode == "rgb_array" or (render_mode and "render_mode" not in env_kwargs):
+        env_kwargs["render_mode"] = render_mode
+    settings.setdefault("normalize", False)
+    settings["normalize_kwargs"] = settings["normalize"]
+    set_random_seed(args.seed)
+    env = create_test_env(
+        task, stats_path=str(folder), seed=args.seed, should_render=False, hyperparams=settings, env_kwargs=env_kwargs
+    )
+    objects: dict[str, Any] = {name: get_class_by_name(vars(args)[name]) for name in OWN if vars(args)[name]}
+    # The smallest buffer, of the default class: it is not used, and its own may be one that archives do not hold.
+    objects.update(replay_buffer_class=None, replay_buffer_kwargs={}, optimize_memory_usage=False)
+    load: Any = ALGORITHMS[args.algo].load
+    return load(path, env, args.device, objects, buffer_size=1, trusted=args.trusted), path
+
+
+def _find_model(parser: argparse.ArgumentParser, args: argparse.Namespace, task: str) -> Path:
+    """The model that the flags name, of the run that they name or the latest that holds one."""
+    name = EnvironmentName(task)
+
+    def number(run: Path) -> int:  # --uuid adds to it
+        return int(run.name.removeprefix(f"{name}_").partition("_")[0])
+
+    runs = [run for run in Path(args.folder, args.algo).glob(f"{name}_[0-9]*") if any(run.glob("*.zip"))]
+    runs = [run for run in runs if args.exp_id in (0, number(run))]
+    if not runs:
+        wanted = f"run {args.exp_id}" if args.exp_id else "run"
+        parser.error(f"there is no {wanted} of {task} with a model in {Path(args.folder, args.algo)}.")
+    latest = max(runs, key=lambda run: (number(run), run.stat().st_mtime))
+    pattern = f"{name}.zip"
+    if args.load_best:
+        pattern = "best_model.zip"
+    elif args.load_checkpoint or args.load_last_checkpoint:
+        pattern = f"rl_model_{args.load_checkpoint or '*'}_steps.zip"
+    models = list(latest.glob(pattern))
+    if not models:
+        there = ", ".join(sorted(file.name for file in latest.glob("*.zip")))
+        parser.error(f"{latest} has no {pattern}; it has {there}.")
+    return max(models, key=lambda model: model.stat().st_mtime)
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    return yaml.load(path.read_text(), Loader=RunLoader) if path.is_file() else {}
+
+
+def _play(model: OffPolicyAlgorithm, env: VecEnv, args: argparse.Namespace) -> list[dict[str, float]]:
+    """Monitor's summaries of the episodes that ended."""
+    episodes = []
+    observations = env.reset()
+    with contextlib.suppress(KeyboardInterrupt):
+        for _ in range(args.n_timesteps):
+            actions, _ = model.predict(observations, deterministic=not args.stochastic)  # type: ignore[arg-type]
+            observations, _, _, infos = env.step(actions)
+            for episode in (info["episode"] for info in infos if "episode" in info):
+                print(f"Episode Reward: {episode['r']:.2f}, Episode Length: {episode['l']}")
+                episodes.append(episode)
+    return episodes
+
+
+def _find_modules_here() -> None:
+    """Classes and environments that the user names may lie in the working directory."""
+    if "" not in sys.path:
+        sys.path.append("")

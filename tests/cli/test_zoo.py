@@ -1,0 +1,494 @@
+"""Training, tuning, watching and filming from a YAML file, with rl-zoo3."""
+
+import copy
+import pickle
+import re
+import shutil
+import sys
+import tracemalloc
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import optuna
+import pytest
+import yaml
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_cure import CuReSAC
+from sb3_cure.cli import zoo
+from sb3_cure.cli.main import main
+from sb3_cure.srl import RAE
+
+TASK = "tests/Filmed-v0"
+RUN = "tests-Filmed-v0"
+SETTINGS: dict[str, Any] = {
+    "policy": "CnnPolicy",
+    "n_timesteps": 20,
+    "buffer_size": 50,
+    "learning_starts": 10,
+    "warmup_updates": 1,
+    "batch_size": 4,
+    "env_kwargs": {"episode_length": 7},
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2, "n_layers": 2}},
+}
+#: A module of the user's own, in the working directory
+CAMERA = """
+import gymnasium as gym
+from envs_for_tests import PixelBox
+from stable_baselines3.common.buffers import ReplayBuffer
+from sb3_cure.srl import RAE
+
+class Head(RAE):
+    pass
+
+class Buffer(ReplayBuffer):
+    pass
+
+gym.register("Camera-v0", PixelBox, kwargs={"channels_last": True})
+"""
+
+
+class Filmed(PixelBox):
+    """It can be filmed, and hence be shown in a window."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        return self.frames[-1].transpose(1, 2, 0)
+
+
+class Gentle(RAE):
+    """A head of the user's own."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _modules() -> Iterator[None]:
+    """The tasks under their ids, and the module ``heads_of_mine``."""
+    module = ModuleType("heads_of_mine")
+    vars(module)["Gentle"] = Gentle
+    Gentle.__module__ = "heads_of_mine"
+    sys.modules["heads_of_mine"] = module
+    gym.register(TASK, Filmed)
+    gym.register("tests/Vector-v0", VectorBox)
+    yield
+    del gym.registry[TASK], gym.registry["tests/Vector-v0"], sys.modules["heads_of_mine"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return tmp_path
+
+
+def write(entries: dict[str, Any], name: str = "settings.yml") -> str:
+    """A settings file in the working directory."""
+    Path(name).write_text(yaml.safe_dump(copy.deepcopy(entries)))
+    return name
+
+
+def train(*arguments: str, task: str = TASK, **changes: Any) -> None:
+    config = write({"default": {**SETTINGS, **changes}})
+    assert main(["train", "--env", task, "--conf-file", config, "--device", "cpu", *arguments]) == 0
+
+
+@pytest.fixture
+def set_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[CuReSAC, zoo.ExperimentManager]]:
+    """Function that trains as ``train`` does, but returns the model and the manager before the first step."""
+
+    def begin(*arguments: str, task: str = TASK, **changes: Any) -> tuple[CuReSAC, zoo.ExperimentManager]:
+        begun = []
+        monkeypatch.setattr(zoo.ExperimentManager, "learn", lambda manager, model: begun.append((model, manager)))
+        monkeypatch.setattr(zoo.ExperimentManager, "save_trained_model", lambda manager, model: None)
+        train("--eval-freq", "-1", *arguments, task=task, **changes)
+        return begun[0]
+
+    return begin
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run with evaluations, checkpoints and a head of the user's own; read only."""
+    with pytest.MonkeyPatch.context() as context:
+        context.chdir(tmp_path_factory.mktemp("run"))
+        train("--eval-freq", "8", "--eval-episodes", "1", "--save-freq", "8", srl="heads_of_mine.Gentle")
+        return Path("logs/cure_sac", f"{RUN}_1").absolute()
+
+
+# ------------------------------------------------------------------ training
+
+
+@pytest.mark.parametrize("program", ["train", "optimize", "enjoy", "record"])
+def test_help_lists_the_algorithms(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([program, "--help"])
+    shown = capsys.readouterr().out
+    assert f"usage: sb3-cure {'train' if program == 'optimize' else program}" in shown
+    assert all(algorithm in shown for algorithm in zoo.ALGORITHMS)
+
+
+def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
+    assert (run / f"{RUN}.zip").is_file() and (run / "best_model.zip").is_file()
+    assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
+
+
+def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
+    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "srl_kwargs:dict(augmentation='shift', pad=1)"]
+    kwargs = ["--env-kwargs", "size:40", "--eval-env-kwargs", "size:44"]
+    model, manager = set_up("-params", *overrides, *kwargs, "--seed", "3", srl="rae")
+    assert (model.curiosity_prob, model.n_envs, model.srl, model.seed) == (0.5, 2, "curl", 3)
+    assert model.observation_space.shape == (6, 40, 40)
+    assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
+
+
+def test_linear_learning_rate_is_saved(set_up: Callable[..., Any], folder: Path) -> None:
+    """As one of SB3's schedules, so that the archive needs no object from the user."""
+    model, _ = set_up(learning_rate="lin_1e-3")
+    model.save(folder / "model.zip")
+    for each in (model, CuReSAC.load(folder / "model.zip")):
+        assert [each.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
+
+
+def test_namespace_and_atari_have_their_entries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The environment's own id goes first, then the id with its module, the namespace, Atari, and the default."""
+    order = [f"my_module:{TASK}", TASK, "tests", "atari", "default"]
+    zoo.register()
+    for first in range(5):
+        config = write({name: {**SETTINGS, "gamma": 0.5 + 0.01 * order.index(name)} for name in order[first:]})
+        arguments = type("Arguments", (), {"gym_packages": ["my_module"]})()
+        manager = zoo.ExperimentManager(arguments, "cure_sac", TASK, "logs", config=config)
+        manager._is_atari = True
+        hyperparams, _ = manager.read_hyperparameters()
+        assert hyperparams["gamma"] == pytest.approx(0.5 + 0.01 * first) and manager.env_name.gym_id == TASK
+
+
+def test_training_goes_on_with_a_trained_agent(set_up: Callable[..., Any], run: Path) -> None:
+    trained = CuReSAC.load(run / f"{RUN}.zip", custom_objects={"srl": Gentle}).policy.state_dict()
+    model, _ = set_up("-i", str(run / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
+    assert all(np.array_equal(value.cpu(), trained[name]) for name, value in model.policy.state_dict().items())
+
+
+def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
+    """They are pickled, and their run's settings did not ask for them."""
+    copied = hostile(run, folder, "vecnormalize.pkl", "cos\nmkdir\n(S'pwned'\ntR.")
+    model, _ = set_up("-i", str(copied / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
+    assert model.get_vec_normalize_env() is None and not Path("pwned").exists()
+
+
+def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
+    checkpoint = {"sb3_cure.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
+    train("--eval-freq", "-1", callback=[checkpoint])
+    assert CuReSAC.resume("checkpoints", Filmed(episode_length=7)).num_timesteps == 20
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"normalize": True},
+        {"normalize": {"norm_obs": False}, "frame_stack": 3},
+        {"normalize": "dict(norm_obs=False)", "env_kwargs": {"channels_last": True}},
+    ],
+)
+def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., Any], changes: dict[str, Any]) -> None:
+    """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
+    with pytest.raises(ValueError, match="VecNormalize"):
+        set_up(**changes)
+
+
+def test_rewards_of_stacked_frames_can_be_normalized(set_up: Callable[..., Any]) -> None:
+    """By wrappers in the right order."""
+    stack = "stable_baselines3.common.vec_env.VecFrameStack"
+    wrappers = ["stable_baselines3.common.vec_env.VecTransposeImage", {stack: {"n_stack": 3}}]
+    kwargs = {"channels_last": True, "frame_stack": 1}
+    model, _ = set_up(env_kwargs=kwargs, normalize={"norm_obs": False}, vec_env_wrapper=wrappers)
+    model.learn(20)
+    assert model.observation_space.shape == (9, 36, 36)
+
+
+def test_modules_of_the_working_directory_are_found(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Environment, head and buffer lie in one; it is named by either flag, and the entry of the file as well."""
+    Path("camera_of_mine.py").write_text(CAMERA)
+    settings = {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}
+    settings.update(srl="camera_of_mine.Head", replay_buffer_class="camera_of_mine.Buffer")
+    config = write({"camera_of_mine:Camera-v0": settings})
+    flags = (["--env", "camera_of_mine:Camera-v0"], ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"])
+    try:
+        for number, names in enumerate(flags, start=1):
+            gym.registry.pop("Camera-v0", None)
+            sys.modules.pop("camera_of_mine", None)
+            assert main(["train", *names, "--conf-file", config, "--eval-freq", "-1"]) == 0
+            assert main(["enjoy", *names, "-n", "20", "--no-render", "--srl", "camera_of_mine.Head"]) == 0
+            assert f"Camera-v0_{number}/Camera-v0.zip" in capsys.readouterr().out
+    finally:
+        gym.registry.pop("Camera-v0", None)
+        sys.modules.pop("camera_of_mine", None)
+
+
+def test_settings_may_be_python(folder: Path) -> None:
+    """Then they hold classes; the run, of a unique name, can be watched."""
+    Path("settings.py").write_text(
+        f"import torch\nfrom sb3_cure.srl import RAE\nhyperparams = {{'default': {SETTINGS}}}\n"
+        "hyperparams['default'].update(srl=RAE, n_envs=1)\n"
+        "hyperparams['default']['policy_kwargs']['activation_fn'] = torch.nn.Tanh"
+    )
+    assert main(["train", "--env", TASK, "--conf-file", "settings.py", "--eval-freq", "-1", "--uuid"]) == 0
+    assert main(["enjoy", "--env", TASK, "-n", "7", "--no-render"]) == 0
+
+
+def test_rl_zoos_own_algorithms_still_train(folder: Path) -> None:
+    assert main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
+    assert Path("logs/dqn/CartPole-v1_1/CartPole-v1.zip").is_file()
+
+
+# -------------------------------------------------------------------- tuning
+
+
+def test_trials_are_kept_and_trained_from(set_up: Callable[..., Any], folder: Path) -> None:
+    """Two calls add to one study; the first trial's values, number 0, reach the model, and -params beat them."""
+    study = ["--storage", "studies/study.log", "--study-name", "mine"]
+    config = write({"default": SETTINGS})
+    optimize = ["optimize", "--env", TASK, "--conf-file", config, *study, "--n-trials", "1", "--n-evaluations", "1"]
+    for seed in "12":
+        assert main([*optimize, "--eval-episodes", "1", "--no-optim-plots", "--seed", seed]) == 0
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend("studies/study.log"))
+    trials = optuna.load_study(study_name="mine", storage=storage).trials
+    assert [trial.state for trial in trials] == 2 * [optuna.trial.TrialState.COMPLETE]
+    model, _ = set_up(*study, "--trial-id", "0", "-params", "curiosity_beta:2.5")
+    assert model.batch_size == 2 ** trials[0].params["batch_size_pow"]
+    assert model.curiosity_prob == trials[0].params["curiosity_prob"] != trials[1].params["curiosity_prob"]
+    assert model.curiosity_beta == 2.5 and model.policy_kwargs["net_arch"] == [8]  # the latter is the file's
+    with pytest.raises(ValueError, match="--study-name"):
+        set_up("--trial-id", "0")
+
+
+@pytest.mark.parametrize(
+    ("curiosity", "tuned"),
+    [
+        ("separate", {"curiosity_prob", "curiosity_beta"}),
+        ("random", {"curiosity_prob"}),
+        ("bonus", {"curiosity_beta"}),
+        (None, set()),
+    ],
+)
+def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str], folder: Path) -> None:
+    """The sampler is the one of the file's kind of curiosity; its names are arguments of the algorithm."""
+    zoo.register()
+    config = write({"default": {**SETTINGS, "curiosity": curiosity}})
+    asked = []
+
+    def sample(trial: optuna.Trial) -> float:
+        asked.append(zoo.HYPERPARAMS_SAMPLER["cure_sac"](trial, 2, 1, {}))
+        return 0.0
+
+    arguments = type("Arguments", (), {"gym_packages": []})()
+    manager = zoo.ExperimentManager(
+        arguments, "cure_sac", TASK, "logs", config=config, optimize_hyperparameters=True, sampler="random",
+        no_optim_plots=True, eval_freq=-1,
+    )  # fmt: skip
+    assert manager.setup_experiment() is None
+    manager.objective = sample  # type: ignore[method-assign]
+    manager.hyperparameters_optimization()
+    assert {name for name in asked[0] if "curiosity" in name} == tuned
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, **{**asked[0], "buffer_size": 20})
+    assert {name: getattr(model, name) for name in asked[0]} == asked[0]
+
+
+def test_quantiles_are_tuned_for_tqc() -> None:
+    trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask()
+    arguments = zoo.sample_params(trial, 2, 1, {}, quantiles=True)
+    assert 0 <= arguments["top_quantiles_to_drop_per_net"] <= 5
+    assert zoo.convert_params(trial.params) == arguments
+
+
+# ----------------------------------------------------------------- replaying
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[OffPolicyAlgorithm]:
+    """The models that are replayed."""
+    models = []
+    play = zoo._play
+
+    def keep(model: OffPolicyAlgorithm, *args: Any) -> Any:
+        models.append(model)
+        return play(model, *args)
+
+    monkeypatch.setattr(zoo, "_play", keep)
+    return models
+
+
+def replay(program: str, run: Path, *arguments: str, task: str = TASK) -> int:
+    rest = ["--no-render"] if program == "enjoy" else []
+    flags = ["--env", task, "-f", str(run.parent.parent), "-n", "14", "--device", "cpu"]
+    return main([program, *flags, *rest, *arguments])
+
+
+def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """With the class of its head, in its own environment, or in one that flags change."""
+    with pytest.raises(ValueError, match="heads_of_mine"):
+        replay("enjoy", run)
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle") == 0
+    assert "2 Episodes" in capsys.readouterr().out  # of 7 steps each
+    assert type(played[0].policy.srl) is Gentle
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "episode_length:2") == 0
+    assert "7 Episodes" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="observations"):
+        replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40")
+
+
+@pytest.mark.parametrize("flags", [[], ["--stochastic"]])
+def test_actions_are_means_unless_asked(flags: list[str], run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def predict(model: CuReSAC, observation: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
+        asked.append(deterministic)
+        return np.zeros((1, 2), np.float32), None
+
+    monkeypatch.setattr(CuReSAC, "predict", predict)
+    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", *flags) == 0
+    assert asked == 14 * [not flags]
+
+
+def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
+    assert replay("record", run, "--srl", "heads_of_mine.Gentle", "--load-best", "-o", str(tmp_path)) == 0
+    (video,) = tmp_path.glob("best_model-*.mp4")
+    assert video.stat().st_size > 1000
+
+
+@pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
+def test_window_can_show_the_agent() -> None:
+    """`enjoy` asks for render_mode="human", which Gymnasium grants to environments that can be filmed."""
+    env = gym.make(TASK, render_mode="human")
+    assert env.render_mode == "human" and env.get_wrapper_attr("frame_stack") == 2
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("flags", "model"),
+    [
+        ([], f"{RUN}_12_0a-9b/{RUN}.zip"),  # not of 13, which has none: of a search, say
+        (["--exp-id", "3"], f"{RUN}_3/{RUN}.zip"),
+        (["--exp-id", "3", "--load-best"], f"{RUN}_3/best_model.zip"),
+        (["--exp-id", "3", "--load-checkpoint", "50"], f"{RUN}_3/rl_model_50_steps.zip"),
+        (["--exp-id", "3", "--load-last-checkpoint"], f"{RUN}_3/rl_model_100_steps.zip"),
+        (["--load-best"], None),  # rather than that of an older run
+        (["--exp-id", "3", "--load-checkpoint", "5"], None),
+        (["--exp-id", "4"], None),
+        (["--algo", "cure_sac", "--env", "tests/Vector-v0"], None),
+    ],
+)
+def test_model_is_the_one_that_flags_name(
+    flags: list[str], model: str | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Found(Exception):
+        pass
+
+    runs = Path("logs/cure_sac")
+    files = [f"{RUN}_3/{name}" for name in ("best_model", "rl_model_50_steps", "rl_model_100_steps", RUN)]
+    files += [f"{RUN}_12_0a-9b/{RUN}", f"tests-Filmed-v01_14/{RUN}"]
+    for file in files:
+        (runs / file).parent.mkdir(parents=True, exist_ok=True)
+        (runs / f"{file}.zip").touch()
+    (runs / f"{RUN}_13").mkdir()
+
+    def load(path: Path, *args: Any, **kwargs: Any) -> None:
+        raise Found(str(path))
+
+    monkeypatch.setattr(CuReSAC, "load", load)
+    with pytest.raises(SystemExit if model is None else Found) as found:
+        main(["enjoy", "--env", TASK, "--no-render", *flags])
+    assert model is None or str(found.value) == str(runs / model)
+
+
+def test_replaying_needs_no_replay_buffer(folder: Path, played: list[Any]) -> None:
+    """Whatever the size and the class of the one that it was trained with."""
+    run = folder / "logs" / "cure_sac" / f"{RUN}_1"
+    run.mkdir(parents=True)
+    tiny_model("CnnPolicy", Filmed(), buffer_size=10_000).save(run / f"{RUN}.zip")
+    tracemalloc.start()
+    replay("enjoy", run)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert played[0].observation_space.shape == (6, 36, 36)
+    assert peak < 10_000 * 3 * 36 * 36 / 10
+
+
+def hostile(run: Path, folder: Path, file: str, text: str) -> Path:
+    """A copy of the run with another settings file."""
+    copied = folder / "logs" / "cure_sac" / run.name
+    shutil.copytree(run, copied)
+    (copied / RUN / file).write_text(text)
+    return copied
+
+
+@pytest.mark.parametrize("program", ["enjoy", "record"])
+@pytest.mark.parametrize("file", ["config.yml", "args.yml"])
+@pytest.mark.parametrize("tag", ["object/apply:os.mkdir [pwned]", "object/new:os.mkdir [pwned]", "module:antigravity"])
+def test_settings_of_a_run_execute_nothing(program: str, file: str, tag: str, run: Path, folder: Path) -> None:
+    copied = hostile(run, folder, file, f"env_kwargs: !!python/{tag}")
+    with pytest.raises(yaml.YAMLError):
+        replay(program, copied, "--srl", "heads_of_mine.Gentle")
+    assert not Path("pwned").exists() and "antigravity" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "normalize: \"__import__('os').mkdir('pwned')\"",
+        "env_wrapper: [{antigravity.Wrapper: {}}]",
+        "vec_env_wrapper: antigravity.Wrapper",
+    ],
+)
+def test_settings_that_name_code_need_trust(setting: str, run: Path, folder: Path) -> None:
+    copied = hostile(run, folder, "config.yml", setting)
+    with pytest.raises(SystemExit):
+        replay("enjoy", copied, "--srl", "heads_of_mine.Gentle")
+    assert not Path("pwned").exists() and "antigravity" not in sys.modules
+
+
+def test_statistics_of_a_run_need_trust(folder: Path, played: list[Any]) -> None:
+    """They are pickled; with trust the agent sees the observations normalised as in training."""
+    train(
+        *("--eval-freq", "-1"), task="tests/Vector-v0", policy="MlpPolicy", normalize=True, srl=None, curiosity=None,
+        policy_kwargs={"net_arch": [8]}, warmup_updates=None, env_kwargs={},
+    )  # fmt: skip
+    run = folder / "logs" / "cure_sac" / "tests-Vector-v0_1"
+    with pytest.raises(SystemExit):
+        replay("enjoy", run, task="tests/Vector-v0")
+    assert replay("enjoy", run, "--trusted", task="tests/Vector-v0") == 0
+    (model,) = played
+    statistics = model.get_vec_normalize_env()
+    with open(run / "tests-Vector-v0" / "vecnormalize.pkl", "rb") as file:
+        trained = pickle.load(file)
+    assert not statistics.training and not statistics.norm_reward
+    np.testing.assert_array_equal(statistics.obs_rms.mean, trained.obs_rms.mean)
+
+
+def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
+    """As the README's example does; what was trained so can be filmed."""
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    example = next(block for block in re.findall(r"```yaml\n(.*?)```", readme, re.S) if "env_wrapper" in block)
+    train("--eval-freq", "-1", "-n", "14", task="Pendulum-v1", **yaml.safe_load(example)["default"])
+    assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
+    (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
+    assert video.stat().st_size > 1000
+
+
+def test_what_rl_zoo_writes_is_read_as_data() -> None:
+    """Tuples and ordered dictionaries are what they were, classes their names."""
+    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5)), ("class", Filmed)])
+    read = yaml.load(yaml.dump(settings), Loader=zoo.RunLoader)
+    assert read == {**settings, "class": f"{Filmed.__module__}.Filmed"}
