@@ -6,6 +6,7 @@ encoder they share, in ``encoder_update.py``.
 """
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -244,7 +245,7 @@ class CuRe(OffPolicyAlgorithm):
         self.policy_kwargs = user_kwargs
         self._critics = self.critics(self)
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
-        self.policy.encoder_update.autocast = self._autocast
+        self.policy.encoder_update.autocast = partial(autocast_context, self._computed_precision, self.device)
         self._compiles, sentence = resolve_compile(self.compile, self.device)
         if self._compiles:
             self.policy.compile_networks()
@@ -457,7 +458,7 @@ class CuRe(OffPolicyAlgorithm):
             return True, False
         if self.srl is None or self.srl_schedule == "simultaneous":
             return True, True
-        in_turn = self._n_updates // self.srl_period % 2 == 0
+        in_turn = bool(self._n_updates // self.srl_period % 2 == 0)
         return in_turn, not in_turn
 
     def _gradient_step(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> None:

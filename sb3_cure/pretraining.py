@@ -49,10 +49,14 @@ class Pretraining(CuRe):
             raise ValueError("pretrain trains the representation alone, but srl is None: choose a head.")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector is {collector!r}: choose 'curious' or 'random'.")
+        if self._was_over("pretrain"):
+            return self
         self._begin_pretraining(collector)
+        self._call_name = "pretrain"
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
+            del self._call_name
             self._end_pretraining()
         return self
 
@@ -74,6 +78,8 @@ class Pretraining(CuRe):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
+        if self._was_over("learn"):
+            return self
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
         if self._is_pretrained:
             self._restart_random_streams()

@@ -12,6 +12,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cure import CuReSAC
+from sb3_cure.buffers import Samples
 
 
 class VectorBox(gym.Env):
@@ -136,6 +137,16 @@ def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
     defaults.update(kwargs)
     defaults["policy_kwargs"] = {**policy_kwargs, **kwargs.get("policy_kwargs", {})}
     return CuReSAC(policy, env, **defaults)
+
+
+def samples_of(model: CuReSAC, batch_size: int) -> Samples:
+    """Samples of a model's replay buffer, as heads get them when measuring: the views are the centred ones.
+
+    :param model: A model that has collected
+    :param batch_size: How many
+    """
+    sampled = model.replay_buffer.sample(batch_size)
+    return Samples(**sampled._asdict(), views=model.policy.augmentation.center(sampled.observations))
 
 
 def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:

@@ -38,8 +38,6 @@ class ModelEnvironments(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_environments()
-        if self.overlap and self.env is not None:
-            OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         super()._setup_model()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
