@@ -1,9 +1,7 @@
 """CuReSAC: SAC from pixels with state representation learning (SRL) and a policy that is curious about it."""
 
-import io
-import pathlib
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, ClassVar, TypeVar
@@ -22,7 +20,6 @@ from stable_baselines3.common.type_aliases import (
     ReplayBufferSamples,
     RolloutReturn,
     Schedule,
-    TensorDict,
     TrainFreq,
 )
 from stable_baselines3.common.utils import update_learning_rate
@@ -31,10 +28,7 @@ from stable_baselines3.sac import policies as sb3_policies
 from stable_baselines3.sac.sac import SAC
 from torch.nn import functional as F
 
-from sb3_cure.archive import is_pickled_model, load_model, read_model, save_model
-from sb3_cure.buffer_files import is_pickled_buffer, load_buffer, save_buffer
 from sb3_cure.buffers import FrameStackReplayBuffer, skip_marked, why_not_skipping
-from sb3_cure.checkpoint import Run, resume, watch
 from sb3_cure.checks import (
     check_arguments,
     check_construction,
@@ -49,7 +43,6 @@ from sb3_cure.checks import (
     explaining_memory,
     make_env,
 )
-from sb3_cure.files import PathOrFile
 from sb3_cure.guards import (
     BadTransitionError,
     Guard,
@@ -62,13 +55,11 @@ from sb3_cure.guards import (
 from sb3_cure.metrics import Metrics, frame_stack_of, reconstruction_strip, told_frame_stack
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.overlap import OverlappedVecEnv
+from sb3_cure.persistence import Persistence
 from sb3_cure.policies import CnnPolicy, CuRePolicy, LatentCritic, MlpPolicy, TrunkActor
 from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
-from sb3_cure.serialization import ArchiveError
-from sb3_cure.settings import NEVER_SAVED, plain_arguments
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.values import is_integer
-from sb3_cure.weights import check_parameters
 
 SelfCuReSAC = TypeVar("SelfCuReSAC", bound="CuReSAC")
 
@@ -116,7 +107,7 @@ class EncoderPass:
     next_features: Callable[[], th.Tensor]
 
 
-class CuReSAC(SAC):
+class CuReSAC(Persistence, SAC):
     """Soft actor-critic from pixels, with SRL and a policy that seeks what the SRL does badly.
 
     Paper: "Seeking Visual Discomfort: Curiosity-driven Representations for Reinforcement Learning" (Aljalbout,
@@ -228,7 +219,7 @@ class CuReSAC(SAC):
     ):
         env = make_env(env, kwargs.get("verbose", 0))
         check_construction(self, policy, env, kwargs)
-        kwargs = plain_arguments(kwargs)
+        kwargs = _plain_arguments(kwargs)
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -277,7 +268,6 @@ class CuReSAC(SAC):
         self._warmed_up = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
-        self._run = Run()
         if overlap is True and self.env is not None:
             OverlappedVecEnv(self.env)  # for its refusal, now rather than in `learn`
         if _init_setup_model:
@@ -454,11 +444,6 @@ class CuReSAC(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        resumed = self._run.resumed
-        if resumed is not None:
-            # The interrupted call is gone on with, whose total is meant.
-            reset_num_timesteps = False
-            total_timesteps += resumed.started_at - self.num_timesteps
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -467,9 +452,6 @@ class CuReSAC(SAC):
         self._metrics.attach(self.logger)
         self._read_env_attributes()
         self._check_skipping()
-        self._run.watched = watch(callback)
-        if resumed is not None:
-            resumed.set_up(self)
         return total, callback
 
     def _check_skipping(self) -> None:
@@ -626,12 +608,6 @@ class CuReSAC(SAC):
         :param log_interval: Episodes between two dumps of the logger
         :return: What was collected
         """
-        run = self._run
-        if run.resumed is not None:
-            run.resumed.enter(self)
-            run.resumed = None
-        for look in run.before_rollout:
-            look()
         try:
             rollout = super().collect_rollouts(
                 self._overlapped or env,
@@ -935,18 +911,15 @@ class CuReSAC(SAC):
 
     def _learn(self, call: str, *arguments: Any) -> None:
         """SB3's ``learn``, with environments that overlap with the updates if they are to."""
-        run = self._run
         if self.overlap and self.env is not None:
             self._overlapped = OverlappedVecEnv(self.env)
+        self._call_name = call
         try:
-            with run.calling(call):
-                super().learn(*arguments)
-                self._guard.report(self)
-                if run.resumed is not None:  # nothing was left to do
-                    run.resumed.enter(self)
-                    run.resumed = None
+            super().learn(*arguments)
+            self._guard.report(self)
         finally:
             self._overlapped = None
+            del self._call_name
 
     def pretrain(
         self: SelfCuReSAC,
@@ -1104,154 +1077,21 @@ class CuReSAC(SAC):
 
     # ---------------------------------------------------------------- saving
 
-    def save(
-        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
-        """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
+    def _stateful_parts(self) -> dict[str, Any]:
+        parts = {"mixer": self._mixer, "metrics": self._metrics, "transition_guard": self._transition_guard}
+        return {name: part for name, part in parts.items() if part is not None}
 
-        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
-        it was, and ``load`` asks for it as ``custom_objects``.
-
-        :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
-        :param exclude: Names of settings that are not to be saved
-        :param include: Names of settings that are to be saved although they are not by default
-        :raises ValueError: if ``include`` names parts of the running model, which no archive holds
-        """
-        save_model(self, path, exclude, include)
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfCuReSAC],
-        path: PathOrFile,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        trusted: bool = False,
-        **kwargs: Any,
-    ) -> SelfCuReSAC:
-        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
-        imported.
-
-        :param path: Path with or without its suffix ``.zip``, or a binary file
-        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
-        :param device: Device of the networks
-        :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
-            ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
-            archive does not have are ignored
-        :param print_system_info: Whether to print of which system the model was saved, and of this one
-        :param force_reset: Whether to reset the environment before learning goes on
-        :param trusted: Also load what is pickled (by SB3's ``save``, or this package's before it needed no pickle),
-            which runs any code in it, and take settings that the class does not know
-        :param kwargs: Arguments of the constructor to change
-        :return: The model
-        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled or of another algorithm
-        """
-        env = make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
-        if trusted and is_pickled_model(path):
-            try:
-                return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-            except KeyError as error:
-                # SB3 takes parameters that `set_parameters` refuses for those of an old DQN, and misses its optimiser.
-                raise (error.__context__ if isinstance(error.__context__, ValueError) else error) from None
-        return load_model(  # type: ignore[return-value]
-            cls, path, env, device, custom_objects, print_system_info, force_reset, trusted, kwargs
-        )
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | pathlib.Path | io.BufferedIOBase | TensorDict,  # type: ignore[override]
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-    ) -> None:
-        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
-
-        :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
-        :param exact_match: Whether all of the model's parameters have to be there, and no others
-        :param device: As in SB3; the parameters stay on the model's device
-        :raises ArchiveError: (a ``ValueError``) if networks' parameters are not finite or of other sizes than the
-            model's, or a file's do not fit it otherwise; the model stays what it was
-        :raises RuntimeError: if the encoder's optimisers are of another ``update``; the model stays what it was
-        """
-        if isinstance(load_path_or_dict, dict):
-            # The rest is left to SB3, as states of optimisers of another version of torch; it tells of other names.
-            known = {name for name in self._get_torch_save_params()[0] if "optim" not in name}
-            shared = {k: v for k, v in load_path_or_dict.items() if k in known and isinstance(v, dict)}
-            check_parameters(self, shared, "the dictionary of parameters", exact_match=False)
-        else:
-            archive = read_model(load_path_or_dict, settings=False)
-            check_parameters(self, archive.params, archive.name, exact_match)
-            load_path_or_dict = archive.params
-        own = getattr(self.policy, "encoder_optimizer", None)  # SB3's policies have none
-        given = load_path_or_dict.get("policy.encoder_optimizer")
-        if exact_match and own is not None and isinstance(given, dict):
-            own.check_origin(given)
-        super().set_parameters(load_path_or_dict, exact_match, device)  # type: ignore[arg-type]
-
-    def save_replay_buffer(self, path: PathOrFile) -> None:
-        """Save the used part of the replay buffer, without pickle and without a copy in memory.
-
-        Buffers of classes that this package does not know, and ``HerReplayBuffer``, are pickled, as SB3 does.
-
-        :param path: Path, whose folder is made and which gets the suffix ``.pkl`` if it has none, or a binary file
-        :raises ValueError: if there is no replay buffer
-        """
-        if self.replay_buffer is None:
-            raise ValueError("save_replay_buffer was called on a model without one: load it with an environment.")
-        save_buffer(self.replay_buffer, path, super().save_replay_buffer)
-
-    def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
-        """Load a replay buffer, also one from a stranger. Where it is of another size, ``buffer_size`` becomes that.
-
-        :param path: Path with or without its suffix ``.pkl``, or a binary file
-        :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
-        :param trusted: Also load what is pickled, which runs any code in it
-        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled, or does not fit the model
-        """
-        if not is_pickled_buffer(path):
-            self.replay_buffer = load_buffer(self, path)
-        elif trusted:
-            super().load_replay_buffer(path, truncate_last_traj)
-        else:
-            name = f"'{path}'" if isinstance(path, str | pathlib.Path) else "the file"
-            raise ArchiveError(
-                f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
-                "is in a file: if you know where it comes from, load it with trusted=True."
-            )
-        rows = self.replay_buffer.buffer_size  # type: ignore[union-attr]
-        if rows != max(self.buffer_size // self.n_envs, 1):
-            self.buffer_size = rows * self.n_envs  # with which checkpoints and archives are loaded again
-
-    @classmethod
-    def resume(
-        cls: type[SelfCuReSAC],
-        path: str | pathlib.Path,
-        env: GymEnv,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ) -> SelfCuReSAC:
-        """Go on with a training that was killed, from the newest whole checkpoint of ``ExactCheckpoint``.
-
-        The same calls of ``learn`` and ``pretrain`` as before, with the same numbers of timesteps and the same
-        callbacks, then do what was left: those that were over are skipped, so that a script can be started again as it
-        is. Log files are gone on with where ``set_logger`` is called as before.
-
-        :param path: Folder of the checkpoints
-        :param env: Environments as those before: as many, of the same settings
-        :param device: Where to compute
-        :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
-        :param kwargs: Arguments of the constructor to change; training then no longer equals the one before
-        :return: The model
-        :raises CheckpointError: if there is no whole checkpoint, or the environments do not fit
-        """
-        env = make_env(env, kwargs.get("verbose", 0))  # type: ignore[assignment]
-        return resume(cls, path, env, custom_objects, device=device, **kwargs)  # type: ignore[return-value]
+    def _before_checkpoint(self) -> None:
+        if self._overlapped is not None:
+            self._overlapped.finish()
+        self._guard.report(self)  # nothing that is not finite is kept
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *NEVER_SAVED]
+        own = (
+            "_mixer _metrics _guard _transition_guard _task_agent _curious_agent _overlapped _is_pretrained _call_name"
+        )
+        derived = "ent_coef_tensor batch_norm_stats batch_norm_stats_target _computed_precision _compiles"
+        return [*super()._excluded_save_params(), *own.split(), *derived.split()]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()
@@ -1279,3 +1119,16 @@ def _polyak(source: th.nn.Module, target: th.nn.Module, tau: float | th.Tensor) 
         th._foreach_lerp_(parameters, goals, tau)
     for buffer, target_buffer in zip(source.buffers(), target.buffers(), strict=True):
         target_buffer.copy_(buffer)
+
+
+def _plain_arguments(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Arguments as SB3 takes them; of dictionaries copies, as SB3 writes into one."""
+    plain = dict(arguments)
+    for name, value in arguments.items():
+        if isinstance(value, Mapping) and name.endswith("_kwargs"):
+            plain[name] = dict(value)
+            if isinstance(value.get("net_arch"), tuple):
+                plain[name]["net_arch"] = list(value["net_arch"])
+        elif isinstance(value, bool | np.integer) and name in ("verbose", "seed", "stats_window_size"):
+            plain[name] = int(value)
+    return plain

@@ -1,5 +1,7 @@
 """Which actor acts: at every step of every environment the curious one with probability p_c (Algorithm 1)."""
 
+from typing import Any
+
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
@@ -54,3 +56,16 @@ class CuriousMixer:
         share = self.n_curious / self.n_steps if self.n_steps else float("nan")
         self.n_steps = self.n_curious = 0
         return share
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Its random stream and counts
+        """
+        return {"rng": self.rng.bit_generator.state, "n_steps": self.n_steps, "n_curious": self.n_curious}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``state_dict``
+        """
+        self.rng.bit_generator.state = state["rng"]
+        self.n_steps, self.n_curious = state["n_steps"], state["n_curious"]

@@ -41,9 +41,9 @@ except ModuleNotFoundError as missing:
     ) from missing
 
 from sb3_cure.allocator import tune_allocator
-from sb3_cure.archive import ObjectsMissing
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError, is_headless
+from sb3_cure.persistence import ObjectsMissing
 from sb3_cure.values import (
     arguments_of,
     check_folder,

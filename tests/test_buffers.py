@@ -26,7 +26,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_cure import buffers
 from sb3_cure.buffer_files import frame_rows, load_frame_rows
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.serialization import ArchiveError, read_state, write_state
+from sb3_cure.persistence import ArchiveError, read_state, write_state
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 PALETTE = 4

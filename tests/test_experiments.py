@@ -37,7 +37,7 @@ from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import checkout_commit, read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
 from sb3_cure.experiments.visitation import COLUMNS
-from sb3_cure.generations import Generations
+from sb3_cure.persistence.generations import Generations
 
 GRIDS = Path(__file__).parent.parent / "zoo_configs" / "experiments"
 TASK = "tests/PixelBox-v0"

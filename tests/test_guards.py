@@ -29,7 +29,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions
 from sb3_cure.encoder_optimizer import EncoderOptimizer
 from sb3_cure.guards import BadTransitionError, Guard, NonFiniteError, TransitionGuard
-from sb3_cure.serialization import read_state, write_state
+from sb3_cure.persistence import read_state, write_state
 from sb3_cure.srl import SRLHead, SRLOutput
 
 NAN, INF = float("nan"), float("inf")

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sb3_cure.serialization import read_state, write_state
+from sb3_cure.persistence import read_state, write_state
 
 # ------------------------------------------------------------------ round trip
 

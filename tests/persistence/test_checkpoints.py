@@ -34,14 +34,15 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from benchmarks import faults
-from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
+#from benchmarks import faults
+from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.persistence import checkpoints, files, generations, resume
 from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
-from sb3_cure.checkpoint import CheckpointError
+from sb3_cure.persistence import CheckpointError
 from sb3_cure.envs import FaultTolerantSubprocVecEnv
-from sb3_cure.generations import Draft, Generations
-from sb3_cure.serialization import read_state, write_state
+from sb3_cure.persistence.generations import Generations
+from sb3_cure.persistence import read_state, write_state
 
 
 @pytest.fixture(autouse=True)

@@ -40,7 +40,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer
 from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.encoders import VectorEncoder
-from sb3_cure.serialization import ArchiveError
+from sb3_cure.persistence import ArchiveError
 from sb3_cure.settings import DERIVED, NEVER_SAVED, SCHEMA
 from sb3_cure.zoo import ActingCuReSAC
 

@@ -1,7 +1,6 @@
-"""Files that are written whole or not at all, whatever happens meanwhile, and SB3's conventions for their names."""
+"""Files that are written whole or not at all, and SB3's conventions for their names."""
 
 import contextlib
-import errno
 import io
 import os
 import platform
@@ -9,14 +8,9 @@ import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 from stable_baselines3.common.save_util import open_path
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 
@@ -53,31 +47,16 @@ def flush_to_disk(path: Path) -> None:
         os.close(descriptor)
 
 
-def lock(file: IO[Any], shared: bool = False) -> None:
-    """Lock a file, which the end of the process unlocks, however it ends.
-
-    :param file: The open file
-    :param shared: Whether others may share the lock
-    :raises BlockingIOError: if another process holds it
-    :raises OSError: where there are no locks
-    """
-    if fcntl is None:
-        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
-    fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-
-
 @contextlib.contextmanager
-def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
-    """A file to write to, by SB3's conventions; one at a path is replaced when it is whole.
+def writing(path: PathOrFile, suffix: str) -> Iterator[BinaryIO]:
+    """Open a file for writing by SB3's conventions; one at a path is replaced when the new one is whole.
 
     :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
-    :return: Path to write under meanwhile, or the file
-    :raises ValueError: if it is neither
-    :raises OSError: if the folder cannot be one
+    :return: The open file
     """
     if not isinstance(path, str | Path):
-        yield open_path(_binary_file(path), "w")
+        yield open_path(path, "w")  # type: ignore[misc]
         return
     path = Path(path)
     if path.suffix == "":
@@ -89,10 +68,9 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[Any]:
     if not path.parent.exists():
         warnings.warn(f"Path '{path.parent}' does not exist. Will create it.", stacklevel=4)
         path.parent.mkdir(parents=True, exist_ok=True)
-    if not path.parent.is_dir():
-        raise NotADirectoryError(f"cannot write '{path}', as '{path.parent}' is a file: choose another path.")
-    with replacing(path) as beside:
-        yield beside
+    with replacing(path) as beside, beside.open("wb") as file:
+        yield file
+        file.flush()
 
 
 @contextlib.contextmanager
@@ -100,28 +78,18 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     """
     :param path: Path, with or without its suffix, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
-    :return: The open file, at its start, and what to call it
-    :raises ValueError: if it is neither
-    :raises OSError: if there is no such file
+    :return: The open file, at its start, and what to call it in messages
+    :raises FileNotFoundError: if there is no such file
     """
-    if not isinstance(path, str | Path):
-        _binary_file(path)
-    elif not any(map(os.path.exists, (path, f"{path}.{suffix}"))):
+    is_path = isinstance(path, str | Path)
+    if is_path and not any(map(os.path.exists, (path, f"{path}.{suffix}"))):  # SB3's own message names neither
         raise FileNotFoundError(
             f"there is neither a file '{path}' nor '{path}.{suffix}': give the path that it was saved to."
         )
-    elif os.path.isdir(path):
-        raise IsADirectoryError(f"'{path}' is a folder: give the path of a file in it.")
-    file = open_path(path, "r", suffix=suffix)
+    file: Any = open_path(path, "r", suffix=suffix)  # type: ignore[arg-type]
     try:
         file.seek(0)
-        yield file, f"'{path}'" if isinstance(path, str | Path) else "the file"  # type: ignore[misc]
+        yield file, f"'{path}'" if is_path else "the file"
     finally:
-        if isinstance(path, str | Path):
+        if is_path:
             file.close()
-
-
-def _binary_file(file: Any) -> io.BufferedIOBase:
-    if not isinstance(file, io.BufferedWriter | io.BufferedReader | io.BytesIO | io.BufferedRandom):
-        raise ValueError(f"got {file!r:.100} for a file, but expected a path, or a file that is open in binary mode.")
-    return file
