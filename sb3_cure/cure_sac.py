@@ -1087,9 +1087,7 @@ class CuReSAC(Persistence, SAC):
         self._guard.report(self)  # nothing that is not finite is kept
 
     def _excluded_save_params(self) -> list[str]:
-        own = (
-            "_mixer _metrics _guard _transition_guard _task_agent _curious_agent _overlapped _is_pretrained _call_name"
-        )
+        own = "_mixer _metrics _guard _transition_guard _task_agent _curious_agent _overlapped _is_pretrained"
         derived = "ent_coef_tensor batch_norm_stats batch_norm_stats_target _computed_precision _compiles"
         return [*super()._excluded_save_params(), *own.split(), *derived.split()]
 

@@ -175,8 +175,8 @@ def newest_usable(path: str | Path) -> tuple[Generation, list[Path]]:
     numbers = generations.numbers()
     if not numbers:
         raise CheckpointError(
-            f"there is no checkpoint in {path}: give the path of an ExactCheckpoint that has begun a training, or start "
-            "one."
+            f"there is no checkpoint in {path}: give the path of an ExactCheckpoint that has begun a training, or "
+            "start one."
         )
     reasons: list[str] = []
     without_frames = []

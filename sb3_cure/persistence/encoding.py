@@ -65,8 +65,8 @@ def refusing(name: str) -> Iterator[None]:
 
 def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
     """
-    :param value: None, bool, int, float, str, bytes, list, tuple, dict, deque, arrays, tensors, numbers of NumPy, paths,
-        spaces, SB3's schedules and noises, and what has a name
+    :param value: None, bool, int, float, str, bytes, list, tuple, dict, deque, arrays, tensors, numbers of NumPy,
+        paths, spaces, SB3's schedules and noises, and what has a name
     :param path: Where it is, which names its tensors
     :param tensors: Takes the arrays and tensors, contiguous
     :param named: Classes by name

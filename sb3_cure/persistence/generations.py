@@ -114,8 +114,8 @@ class Generations:
     def write(self, fill: Callable[[Path, int], dict[str, str]], keep: int) -> Generation:
         """Write the next generation, then remove what is no longer needed.
 
-        :param fill: Writes files into the folder that it gets, and segments with the number that it gets in their names;
-            returns the checksums of the segments that it needs, by name
+        :param fill: Writes files into the folder that it gets, and segments with the number that it gets in their
+            names; returns the checksums of the segments that it needs, by name
         :param keep: Number of latest generations to keep
         :return: What was written
         :raises OSError: if it could not be written; the generations are then as before

@@ -53,7 +53,7 @@ class Persistence(OffPolicyAlgorithm):
         """Finish what is under way, and raise if the model must not be kept."""
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "lr_schedule", "_run"]
+        return [*super()._excluded_save_params(), "lr_schedule", "_run", "_call_name"]
 
     # ----------------------------------------------------------------------------------------- models
 

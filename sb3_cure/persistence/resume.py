@@ -1,4 +1,4 @@
-"""What training depends on beside the model and its replay buffer: kept in checkpoints, and given back by ``resume``."""
+"""What training depends on beside the model and its replay buffer, kept in checkpoints and given back later."""
 
 import contextlib
 import copy
