@@ -1,15 +1,15 @@
 """Replay buffers in files without pickle, of which the used part is written and read without a copy in memory."""
 
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
-from sb3_cure.persistence.encoding import ArchiveError, read_state, refusing
-from sb3_cure.persistence.names import BUFFERS
+from sb3_cure.persistence.encoding import BUFFERS, ArchiveError, is_state, read_state, refusing, write_state
+from sb3_cure.persistence.files import PathOrFile, reading, writing
 
 _FRAME_COUNTERS = ("_n_valid", "_n_frames")
 _ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "marked")
@@ -55,17 +55,6 @@ def _flat(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
         elif isinstance(value, np.ndarray):
             flat[name] = value
     return flat
-
-
-def load_buffer(model: OffPolicyAlgorithm, file: Path | BinaryIO, name: str) -> ReplayBuffer:
-    """
-    :param model: The model that the replay buffer is for
-    :param file: File of a ``buffer_state``; arrays of a path are mapped while they are copied
-    :param name: What to call it
-    :return: A replay buffer of the model's class, of the size that was saved
-    :raises ArchiveError: if it does not fit the model or is damaged
-    """
-    return buffer_from_state(model, read_state(file, copy=False), name)
 
 
 def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: str) -> ReplayBuffer:
@@ -117,3 +106,43 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
 
 def _kind(array: Any) -> str:
     return f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else str(type(array).__name__)
+
+
+class SavesReplayBuffers(OffPolicyAlgorithm):
+    """Mixin for an algorithm of SB3: replay buffers in files without pickle."""
+
+    def save_replay_buffer(self, path: PathOrFile) -> None:
+        """Save the used part of the replay buffer, without pickle and without a copy in memory.
+
+        Buffers of classes that this package does not know, and ``HerReplayBuffer``, are pickled, as SB3 does.
+
+        :param path: Path, whose folder is made and which gets the suffix ``.pkl`` if it has none, or a binary file
+        """
+        buffer = self.replay_buffer
+        if buffer is None or not can_be_kept(type(buffer)):
+            super().save_replay_buffer(path)
+            return
+        with writing(path, "pkl") as file:
+            write_state(file, buffer_state(buffer))
+
+    def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
+        """Load a replay buffer, also one from a stranger.
+
+        :param path: Path with or without its suffix ``.pkl``, or a binary file
+        :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
+        :param trusted: Also load what is pickled, which runs any code in it
+        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled, or does not fit the model
+        """
+        with reading(path, "pkl") as (file, name):
+            if is_state(file):
+                file.seek(0)
+                # Of a path, arrays stay in the file until they are copied.
+                source = Path(file.name) if isinstance(path, str | Path) else file
+                self.replay_buffer = buffer_from_state(self, read_state(source, copy=False), name)
+            elif trusted:
+                super().load_replay_buffer(path, truncate_last_traj)
+            else:
+                raise ArchiveError(
+                    f"{name} is no replay buffer that was saved without pickle, and unpickling runs any code that is "
+                    "in a file: if you know where it comes from, load it with trusted=True."
+                )

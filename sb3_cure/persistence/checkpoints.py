@@ -267,22 +267,12 @@ class ExactCheckpoint(BaseCallback):
                     f"{name}.resume({str(self.path)!r}, env), or choose another path, or remove that folder."
                 )
             writer = CheckpointWriter(self.path)
-        with self._naming_the_folder():
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._run.leaving.callback(writer.generations.lock().release)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._run.leaving.callback(writer.generations.lock().release)
         self._writer = self._run.writers[self.path.resolve()] = writer
         self._run.leaving.enter_context(self._signals_noted())
         # Before any callback hears of the rollout: when it is resumed, all of them do.
         self._run.before_rollout.append(self._look)
-
-    @contextlib.contextmanager
-    def _naming_the_folder(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise CheckpointError(
-                f"ExactCheckpoint cannot write to {self.path} ({error.strerror}): choose another path."
-            ) from error
 
     def _on_training_start(self) -> None:
         for setting in ("overlap", "use_sde"):
@@ -302,8 +292,7 @@ class ExactCheckpoint(BaseCallback):
             )
         self._last_saved = self._last_tried = self.num_timesteps
         if self._run.resumed is None:
-            with self._naming_the_folder():
-                self._writer.write(self.model, self._run, self.keep)  # type: ignore[arg-type]
+            self._writer.write(self.model, self._run, self.keep)  # type: ignore[arg-type]
 
     def _look(self) -> None:
         if self.is_due() or self._signal is not None:

@@ -1,7 +1,8 @@
 """Values as JSON, with the arrays and tensors in them set apart, and files of both without pickle.
 
 JSON stands for itself; whatever it cannot express is an object whose only key begins with ``!`` and tells the type.
-Reading runs no code of a file and imports nothing: tensors are read by safetensors, objects are those of ``_KINDS``.
+Reading runs no code of a file and imports nothing that it names: tensors are read by safetensors, objects are those of
+``_KINDS``, classes those of ``NAMED`` and the policies that a model registers.
 """
 
 import contextlib
@@ -20,11 +21,19 @@ import torch as th
 from gymnasium import spaces
 from safetensors import safe_open
 from safetensors.torch import load as load_tensors
+from stable_baselines3.common import buffers as sb3_buffers
+from stable_baselines3.common import torch_layers
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
-from stable_baselines3.common.type_aliases import TrainFreq
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from torch.nn.modules import activation
 
-from sb3_cure.persistence.names import NAMED, NUMBERS, name_of
+from sb3_cure import encoders
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.srl import SRL_HEADS
 
 #: Of the format of what is written
 VERSION = 2
@@ -58,6 +67,69 @@ def refusing(name: str) -> Iterator[None]:
     except Exception as error:  # hostile bytes fail in many ways
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".rstrip(".")
         raise ArchiveError(f"{name} is damaged, or was not written by this package ({reason}).") from error
+
+
+# ---------------------------------------------------------------------- names
+
+#: Replay buffers that are written without pickle
+BUFFERS: tuple[type[sb3_buffers.ReplayBuffer], ...] = (
+    FrameStackReplayBuffer,
+    SkippingReplayBuffer,
+    sb3_buffers.ReplayBuffer,
+    sb3_buffers.DictReplayBuffer,
+    sb3_buffers.NStepReplayBuffer,
+)
+#: Types of the numbers in arrays
+NUMBERS: tuple[type[np.generic], ...] = (
+    *(np.bool_, np.float16, np.float32, np.float64, np.complex64),
+    *(np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
+)
+
+
+def _of_module(module: Any, base: type) -> list[type]:
+    return [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, base)]
+
+
+def name_of(value: Any) -> str:
+    """
+    :param value: A class, or a member of an enumeration
+    :return: What files call it
+    """
+    if value in NUMBERS:
+        return f"numpy.{np.dtype(value).name}"  # `bool` or `bool_`, by NumPy's version
+    return str(value) if isinstance(value, Enum) else f"{value.__module__}.{value.__qualname__}"
+
+
+#: Classes and members of enumerations by their names
+NAMED: dict[str, Any] = {
+    name_of(value): value
+    for value in (
+        *BUFFERS,
+        *NUMBERS,
+        HerReplayBuffer,
+        encoders.PixelEncoder,
+        encoders.VectorEncoder,
+        torch_layers.FlattenExtractor,
+        torch_layers.NatureCNN,
+        torch_layers.CombinedExtractor,
+        RMSpropTFLike,
+        *SRL_HEADS.values(),
+        *_of_module(activation, th.nn.Module),
+        *_of_module(th.optim, th.optim.Optimizer),
+        *GoalSelectionStrategy,
+        *TrainFrequencyUnit,
+    )
+}
+
+
+def named_by(model_class: type) -> dict[str, Any]:
+    """
+    :param model_class: An algorithm
+    :return: What its archives may name: ``NAMED``, and the policies that it and its base classes register
+    """
+    registered = [vars(base).get("policy_aliases", {}).values() for base in model_class.__mro__]
+    policies = {base for policies in registered for policy in policies for base in policy.__mro__}
+    return NAMED | {name_of(policy): policy for policy in policies if issubclass(policy, BasePolicy)}
 
 
 # ------------------------------------------------------------------- values
@@ -144,6 +216,11 @@ def _revived(kind: type, attributes: dict[str, Any]) -> Any:
     return value
 
 
+def _arguments(names: str, space: Any) -> dict[str, Any]:
+    """Those that a space was made with."""
+    return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
+
+
 _BY_ATTRIBUTES = (
     *(ConstantSchedule, FloatSchedule, LinearSchedule),
     *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
@@ -157,32 +234,17 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "bytes": (bytes, lambda value: np.frombuffer(value, np.uint8), lambda array: array.tobytes()),
     "Path": (type(Path()), str, Path),
     "TrainFreq": (TrainFreq, list, lambda parts: TrainFreq(*parts)),
-    "Box": (
-        spaces.Box,
-        lambda space: [space.low, space.high, list(space.shape), space.dtype.type],
-        lambda parts: spaces.Box(parts[0], parts[1], tuple(parts[2]), parts[3]),
-    ),
-    "Discrete": (
-        spaces.Discrete,
-        lambda space: [int(space.n), int(space.start), space.dtype.type],
-        lambda parts: spaces.Discrete(parts[0], start=parts[1], dtype=parts[2]),
-    ),
+    "Box": (spaces.Box, partial(_arguments, "low high shape"), lambda arguments: spaces.Box(**arguments)),
+    "Discrete": (spaces.Discrete, partial(_arguments, "n start"), lambda arguments: spaces.Discrete(**arguments)),
     "MultiDiscrete": (
         spaces.MultiDiscrete,
-        lambda space: [space.nvec, space.start, space.dtype.type],
-        lambda parts: spaces.MultiDiscrete(parts[0], start=parts[1], dtype=parts[2]),
+        partial(_arguments, "nvec start"),
+        lambda arguments: spaces.MultiDiscrete(**arguments),
     ),
-    "MultiBinary": (
-        spaces.MultiBinary,
-        lambda space: space.n if isinstance(space.n, int) else list(space.n),
-        spaces.MultiBinary,
-    ),
-    "Dict": (
-        spaces.Dict,
-        lambda space: [list(item) for item in space.spaces.items()],
-        lambda items: spaces.Dict(OrderedDict(items)),  # in this order, where a dict would be sorted
-    ),
-    "Tuple": (spaces.Tuple, lambda space: list(space.spaces), spaces.Tuple),
+    "MultiBinary": (spaces.MultiBinary, lambda space: space.n, spaces.MultiBinary),
+    # Its items in this order, where a dict would be sorted
+    "Dict": (spaces.Dict, lambda space: OrderedDict(space.spaces), spaces.Dict),
+    "Tuple": (spaces.Tuple, lambda space: space.spaces, spaces.Tuple),
     **{kind.__name__: (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
 }
 _TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()}

@@ -1,14 +1,13 @@
-"""Files that are written whole or not at all, and SB3's conventions for their names."""
+"""Files that are written whole or not at all."""
 
 import contextlib
 import io
 import os
 import platform
 import threading
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, TypeAlias, cast
 
 from stable_baselines3.common.save_util import open_path
 
@@ -49,25 +48,18 @@ def flush_to_disk(path: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: PathOrFile, suffix: str) -> Iterator[BinaryIO]:
-    """Open a file for writing by SB3's conventions; one at a path is replaced when the new one is whole.
+    """Open a file for writing; one at a path is replaced when the new one is whole.
 
     :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: The open file
     """
     if not isinstance(path, str | Path):
-        yield open_path(path, "w")  # type: ignore[misc]
+        yield cast(BinaryIO, open_path(path, "w"))
         return
-    path = Path(path)
-    if path.suffix == "":
-        path = Path(f"{path}.{suffix}")
-    if path.is_dir():
-        warnings.warn(f"Path '{path}' is a folder. Will save instead to {path}_2", stacklevel=4)
-        path = Path(f"{path}_2")
+    path = Path(path) if Path(path).suffix else Path(f"{path}.{suffix}")
     path = path.resolve() if path.is_symlink() else path  # what a link leads to is written, not the link
-    if not path.parent.exists():
-        warnings.warn(f"Path '{path.parent}' does not exist. Will create it.", stacklevel=4)
-        path.parent.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as beside, beside.open("wb") as file:
         yield file
         file.flush()
@@ -79,17 +71,9 @@ def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
     :param path: Path, with or without its suffix, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: The open file, at its start, and what to call it in messages
-    :raises FileNotFoundError: if there is no such file
     """
-    is_path = isinstance(path, str | Path)
-    if is_path and not any(map(os.path.exists, (path, f"{path}.{suffix}"))):  # SB3's own message names neither
-        raise FileNotFoundError(
-            f"there is neither a file '{path}' nor '{path}.{suffix}': give the path that it was saved to."
-        )
     file: Any = open_path(path, "r", suffix=suffix)  # type: ignore[arg-type]
-    try:
-        file.seek(0)
+    is_path = isinstance(path, str | Path)
+    file.seek(0)
+    with file if is_path else contextlib.nullcontext():
         yield file, f"'{path}'" if is_path else "the file"
-    finally:
-        if is_path:
-            file.close()

@@ -1,34 +1,22 @@
 """Saving, loading and exact resume for any of SB3's off-policy algorithms."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.persistence.archive import (
-    Stateful,
-    is_pickled_model,
-    lay_out_moments,
-    load_model,
-    read_parameters,
-    save_model,
-)
-from sb3_cure.persistence.buffers import buffer_state, can_be_kept, load_buffer
+from sb3_cure.persistence.archive import SavesModels
+from sb3_cure.persistence.buffers import SavesReplayBuffers
 from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_usable
-from sb3_cure.persistence.encoding import ArchiveError, is_state, write_state
-from sb3_cure.persistence.files import PathOrFile, reading, writing
 from sb3_cure.persistence.resume import Resumption, Run, watch
 
 Self = TypeVar("Self", bound="Persistence")
 
 
-class Persistence(OffPolicyAlgorithm):
+class Persistence(SavesModels, SavesReplayBuffers):
     """Mixin for an algorithm of SB3: ``class MySAC(Persistence, SAC)``.
 
     Models are saved as JSON and safetensors, replay buffers as safetensors; loading runs no code of a file and imports
@@ -43,137 +31,11 @@ class Persistence(OffPolicyAlgorithm):
         self._run = Run()
         super().__init__(*args, **kwargs)
 
-    # ------------------------------------------------------------- what an algorithm may say of itself
-
-    def _stateful_parts(self) -> dict[str, Stateful]:
-        """Objects with a state beside tensors and settings, such as a generator, by name: saved and resumed."""
-        return {}
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_run", "_call_name"]
 
     def _before_checkpoint(self) -> None:
         """Finish what is under way, and raise if the model must not be kept."""
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "lr_schedule", "_run", "_call_name"]
-
-    # ----------------------------------------------------------------------------------------- models
-
-    def save(
-        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
-    ) -> None:
-        """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
-
-        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
-        it was, and ``load`` asks for it as ``custom_objects``.
-
-        :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
-        :param exclude: Names of settings that are not to be saved
-        :param include: As in SB3; an archive holds everything but parts of the running model, so that this is refused
-        :raises ValueError: if ``include`` names parts of the running model
-        """
-        save_model(self, self._stateful_parts(), path, exclude, include)
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[Self],
-        path: PathOrFile,
-        env: GymEnv | str | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        trusted: bool = False,
-        **kwargs: Any,
-    ) -> Self:
-        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
-        imported. (Settings may still ask for more memory than there is.)
-
-        :param path: Path with or without its suffix ``.zip``, or a binary file
-        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
-        :param device: Device of the networks
-        :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
-            ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
-            archive does not have are ignored
-        :param print_system_info: Whether to print of which system the model was saved, and of this one
-        :param force_reset: Whether to reset the environment before learning goes on
-        :param trusted: Also load what SB3's ``save`` has pickled, which runs any code in it
-        :param kwargs: Settings to change
-        :return: The model
-        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile or pickled
-        """
-        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
-        if trusted and is_pickled_model(path):
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        model, states = load_model(
-            cls,
-            path,
-            env,  # type: ignore[arg-type]
-            device,
-            custom_objects,
-            print_system_info,
-            force_reset,
-            kwargs,
-        )
-        for name, part in model._stateful_parts().items():
-            if name in states:
-                part.load_state_dict(states[name])
-        return model
-
-    def set_parameters(
-        self,
-        load_path_or_dict: Any,
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-    ) -> None:
-        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
-
-        :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
-        :param exact_match: Whether all of the model's parameters have to be there, and no others
-        :param device: As in SB3; the parameters stay on the model's device
-        """
-        if not isinstance(load_path_or_dict, dict):
-            load_path_or_dict = read_parameters(load_path_or_dict) or load_path_or_dict
-        try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
-        finally:
-            lay_out_moments(self)
-
-    # --------------------------------------------------------------------------------- replay buffers
-
-    def save_replay_buffer(self, path: PathOrFile) -> None:
-        """Save the used part of the replay buffer, without pickle and without a copy in memory.
-
-        Buffers of classes that this package does not know, and ``HerReplayBuffer``, are pickled, as SB3 does.
-
-        :param path: Path, whose folder is made and which gets the suffix ``.pkl`` if it has none, or a binary file
-        """
-        assert self.replay_buffer is not None, "The replay buffer is not defined"
-        if not can_be_kept(type(self.replay_buffer)):
-            return super().save_replay_buffer(path)
-        with writing(path, "pkl") as file:
-            write_state(file, buffer_state(self.replay_buffer))
-
-    def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
-        """Load a replay buffer, also one from a stranger.
-
-        :param path: Path with or without its suffix ``.pkl``, or a binary file
-        :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
-        :param trusted: Also load what is pickled, which runs any code in it
-        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile, pickled, or does not fit the model
-        """
-        with reading(path, "pkl") as (file, name):
-            if is_state(file):
-                file.seek(0)
-                self.replay_buffer = load_buffer(self, file if name == "the file" else Path(file.name), name)
-                return
-        if not trusted:
-            raise ArchiveError(
-                f"{name} is no replay buffer that was saved without pickle, and unpickling runs any code that is in a "
-                "file: if you know where it comes from, load it with trusted=True."
-            )
-        super().load_replay_buffer(path, truncate_last_traj)
-
-    # ------------------------------------------------------------------------------------------ resume
 
     @classmethod
     def resume(

@@ -9,7 +9,7 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -29,13 +29,6 @@ from sb3_cure.persistence.archive import Stateful
 from sb3_cure.persistence.encoding import encode, write_tensors
 
 
-class WatchedCallback(NamedTuple):
-    """A callback of the running ``learn``, and what its attributes were when the first one with it began."""
-
-    callback: BaseCallback
-    before: dict[str, bytes]
-
-
 class Run:
     """What a model knows of the training that it is in, beside what it saves."""
 
@@ -45,7 +38,7 @@ class Run:
         #: What a resumed model has yet to restore
         self.resumed: Resumption | None = None
         #: Callbacks of the running ``learn``
-        self.watched: list[WatchedCallback] = []
+        self.watched: list[BaseCallback] = []
         #: Called before each rollout, between an update and the next step
         self.before_rollout: list[Callable[[], None]] = []
         #: What is to be undone when the running ``learn`` ends
@@ -108,7 +101,7 @@ def training_state(model: OffPolicyAlgorithm, run: Run, environments_may_be_gone
         "random": random_state(model),
         "environments": environments,
         "logger": _logger_state(model.logger),
-        "callbacks": [[type(watched.callback).__name__, _changed(watched)] for watched in run.watched],
+        "callbacks": [[type(callback).__name__, _changed(callback)] for callback in run.watched],
     }
 
 
@@ -133,7 +126,7 @@ class Resumption:
         """Agent steps at which the interrupted call began."""
         return self._kept["_num_timesteps_at_start"]
 
-    def set_up(self, model: OffPolicyAlgorithm, watched: list[WatchedCallback], continues: bool) -> None:
+    def set_up(self, model: OffPolicyAlgorithm, watched: list[BaseCallback], continues: bool) -> None:
         """Attributes of callbacks, files of the logger and what was not yet logged.
 
         :param model: The model, at the end of its ``_setup_learn``
@@ -144,7 +137,7 @@ class Resumption:
         if continues:
             model._num_timesteps_at_start = self.started_at
         saved = list(self.state["callbacks"])
-        for callback, _ in watched:
+        for callback in watched:
             entry = next((entry for entry in saved if entry[0] == type(callback).__name__), None)
             if entry is not None:
                 saved.remove(entry)
@@ -267,7 +260,7 @@ def _continue_logs(model: OffPolicyAlgorithm, folder: Path, state: dict[str, Any
 _AT_FIRST = "_sb3_cure_at_first"
 
 
-def watch(callback: BaseCallback) -> list[WatchedCallback]:
+def watch(callback: BaseCallback) -> list[BaseCallback]:
     """
     :param callback: The callback of a ``learn`` that begins
     :return: All callbacks in it, to see later what has changed in them
@@ -277,7 +270,7 @@ def watch(callback: BaseCallback) -> list[WatchedCallback]:
         # A callback may serve several calls, of which those that are over will be skipped.
         if not hasattr(each, _AT_FIRST):
             setattr(each, _AT_FIRST, {name: content for name, (_, content) in _attributes(each).items()})
-    return [WatchedCallback(each, getattr(each, _AT_FIRST)) for each in callbacks]
+    return callbacks
 
 
 def _walk(callback: BaseCallback) -> list[BaseCallback]:
@@ -304,10 +297,10 @@ def _attributes(callback: BaseCallback) -> dict[str, tuple[Any, bytes]]:
     return found
 
 
-def _changed(watched: WatchedCallback) -> dict[str, Any]:
+def _changed(callback: BaseCallback) -> dict[str, Any]:
     """A callback's counters and the like: attributes that differ from those before its first ``learn``."""
-    now = _attributes(watched.callback)
-    return {name: value for name, (value, content) in now.items() if watched.before.get(name) != content}
+    before = getattr(callback, _AT_FIRST)
+    return {name: value for name, (value, now) in _attributes(callback).items() if before.get(name) != now}
 
 
 def _restore_callback(callback: BaseCallback, changed: dict[str, Any]) -> None:
