@@ -161,7 +161,8 @@ def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[
         return {"!number": [name_of(kind), inside(value.item(), path)]}
     if isinstance(value, np.ndarray) and (dtype := value.dtype.newbyteorder("=")).type in NUMBERS:
         array = np.ascontiguousarray(value, dtype).reshape(value.shape)
-        array = array if array.flags.writeable else array.copy()  # of which torch would warn
+        # What torch does not take: single elements may keep a negative stride.
+        array = array if array.flags.writeable and min(array.strides, default=0) >= 0 else array.copy()
         return {"!array": _keep(th.from_numpy(array), path, tensors)}
     if isinstance(value, th.Tensor) and value.layout is th.strided and value.dtype in _DTYPES:
         return {"!tensor": _keep(value, path, tensors)}
