@@ -34,7 +34,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-#from benchmarks import faults
+# from benchmarks import faults
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.persistence import checkpoints, files, generations, resume
 from sb3_cure.buffers import transitions
