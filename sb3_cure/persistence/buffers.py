@@ -135,7 +135,6 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
         """
         with reading(path, "pkl") as (file, name):
             if is_state(file):
-                file.seek(0)
                 # Of a path, arrays stay in the file until they are copied.
                 source = Path(file.name) if isinstance(path, str | Path) else file
                 self.replay_buffer = buffer_from_state(self, read_state(source, copy=False), name)

@@ -312,6 +312,7 @@ def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]
             with safe_open(file, "pt") as opened:  # type: ignore[no-untyped-call]
                 metadata, get = opened.metadata(), opened.get_tensor
                 return _decoded(metadata, (lambda name: get(name).clone()) if copy else get)
+        file.seek(0)  # type: ignore[union-attr]
         data = file.read()  # type: ignore[union-attr]
         tensors = load_tensors(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
