@@ -13,8 +13,7 @@ import psutil
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.checkpoint import CheckpointWriter
-from sb3_cure.generations import CHUNK
+from sb3_cure.persistence.checkpoints import CHUNK, CheckpointWriter
 
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
@@ -66,7 +65,7 @@ def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
         _collect(model, BUFFER_SIZE)
         with tempfile.TemporaryDirectory(dir=directory) as folder:
             writer = CheckpointWriter(folder)
-            generation = writer.write(model, keep=KEEP)
+            generation = writer.write(model, model._run, KEEP)
             times: dict[str, list[float]] = {name: [] for name in ("at once", "in pieces", "checkpoint")}
             extra = []
             for number in range(repeats + KEEP):
@@ -78,16 +77,17 @@ def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
                     if name == "checkpoint":
                         resident = _peak_mb(reset=True)
                         start = time.perf_counter()
-                        generation = writer.write(model, keep=KEEP)
+                        generation = writer.write(model, model._run, KEEP)
                         times[name].append(time.perf_counter() - start)
                         extra.append(_peak_mb() - resident)
                     else:
                         at_once = 2**40 if name == "at once" else CHUNK
                         times[name].append(_write_frames(model, n_frames, at_once, Path(folder), number))
             times = {name: values[KEEP:] for name, values in times.items()}  # from when files are also removed
-            new_mb = (generation.segments[-1].size + sum(entry.size for entry in generation.files)) / 1e6
+            newest = max((Path(folder) / "segments").iterdir(), key=lambda path: path.stat().st_mtime).stat().st_size
+            new_mb = (newest + sum(path.stat().st_size for path in generation.folder.iterdir())) / 1e6
         results[networks] = {
-            "new_frames_mb": round(generation.segments[-1].size / 1e6),
+            "new_frames_mb": round(newest / 1e6),
             "all_that_is_written_mb": round(new_mb),
             "frames_at_once_s": round(statistics.median(times["at once"]), 3),
             "frames_in_pieces_s": round(statistics.median(times["in pieces"]), 3),

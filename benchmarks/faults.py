@@ -32,8 +32,9 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import transitions
-from sb3_cure.checkpoint import CheckpointWriter, _load_random_state, _random_state
 from sb3_cure.experiments.files import describe_run, write_json
+from sb3_cure.persistence.checkpoints import CheckpointWriter
+from sb3_cure.persistence.resume import load_random_state, random_state
 
 #: Generations to keep, in the folder that the faults hit
 KEEP = 2
@@ -166,11 +167,11 @@ class Site:
         writer = CheckpointWriter(self.before)
         for _ in range(3):
             model.learn(21, reset_num_timesteps=False)
-            writer.write(model, KEEP)
+            writer.write(model, model._run, KEEP)
         self.former = _resume(self.before)[0]
         self.model, self.writer = model, writer
         model.learn(21, reset_num_timesteps=False)
-        self.random = _random_state(model)
+        self.random = random_state(model)
         self.points = self._write(self.before, self.after, None, "")
         self.newest = _resume(self.after)[0]
 
@@ -185,11 +186,11 @@ class Site:
         reading, writing = os.pipe()
         child = os.fork()
         if child == 0:
-            _load_random_state(self.model, self.random)  # resuming has changed it meanwhile
+            load_random_state(self.model, self.random)  # resuming has changed it meanwhile
             count = 0
             try:
                 with _failing(target, point, kind) as counter:
-                    self.writer.write(self.model, KEEP)
+                    self.writer.write(self.model, self.model._run, KEEP)
                 count = counter()
             except OSError as error:
                 if error.errno != errno.ENOSPC:
@@ -240,9 +241,9 @@ class Site:
         return Outcome(fault, resumed, resumed in allowed)
 
     def _only_of_newest(self, file: str) -> bool:
-        manifests = sorted(self.after.glob("generation-*/manifest.json"))
-        users = [path for path in manifests if Path(file).name in path.read_text()]
-        return users == manifests[-1:]
+        checksums = sorted(self.after.glob("generation-*/SHA256SUMS"))
+        users = [path for path in checksums if Path(file).name in path.read_text()]
+        return users == checksums[-1:]
 
     def _what_resumes(self) -> str:
         digest, steps, said = _resume(self.work)
@@ -255,7 +256,7 @@ class Site:
             warnings.simplefilter("ignore")
             model = CuReSAC.resume(self.work, _Dots(), device="cpu")
         model.set_logger(Logger(None, []))
-        model._run.writers[self.work.absolute()].write(model, KEEP)
+        model._run.writers[self.work.resolve()].write(model, model._run, KEEP)
         _, again, later = _resume(self.work)
         if again != steps or later:
             return f"{resumed}, and then {again} instead of {steps} steps, saying {later}"

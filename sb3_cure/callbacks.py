@@ -23,12 +23,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, unwrap_vec_w
 
 from sb3_cure import diagnostics
 from sb3_cure.buffers import transitions, unmarked
-from sb3_cure.checkpoint import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of, check_frame
 from sb3_cure.evaluation import ACTORS, evenly_measured, run_episodes, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
+from sb3_cure.persistence import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.policies import encoder_of
 from sb3_cure.values import check_folder, is_integer, is_number
 

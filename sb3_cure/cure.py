@@ -642,10 +642,15 @@ class CuRe(OffPolicyAlgorithm):
 
     def _stateful_parts(self) -> dict[str, Any]:
         """What has a state besides tensors and settings, by name."""
-        return {"mixer": self._mixer}
+        return {"mixer": self._mixer, "metrics": self._metrics}
+
+    def _before_checkpoint(self) -> None:
+        """Nothing that is not finite is kept."""
+        self._guard.report()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_metrics", "_guard", "_mixer", "_critics"]
+        made_anew = ["_metrics", "_guard", "_mixer", "_critics", "_computed_precision", "_compiles", "ent_coef_tensor"]
+        return [*super()._excluded_save_params(), *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

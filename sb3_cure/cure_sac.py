@@ -8,12 +8,13 @@ from stable_baselines3.sac.sac import SAC
 
 from sb3_cure.critics import TwinQ
 from sb3_cure.cure import CuRe
+from sb3_cure.persistence import Persistence
 from sb3_cure.policies import CnnPolicy, MlpPolicy
 from sb3_cure.pretraining import Pretraining
 from sb3_cure.vec_env.model import ModelEnvironments
 
 
-class CuReSAC(Pretraining, ModelEnvironments, CuRe, SAC):  # type: ignore[misc]
+class CuReSAC(Pretraining, Persistence, ModelEnvironments, CuRe, SAC):  # type: ignore[misc]
     """Soft actor-critic from pixels, with state representation learning and a policy that seeks what it does badly.
 
     All arguments are described at ``CuRe``.

@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_cure import policies
 from sb3_cure.critics import TruncatedQuantiles
 from sb3_cure.cure import CuRe
+from sb3_cure.persistence import Persistence
 from sb3_cure.pretraining import Pretraining
 from sb3_cure.vec_env.model import ModelEnvironments
 
@@ -25,7 +26,7 @@ class MlpPolicy(policies.MlpPolicy):
     critics = TruncatedQuantiles
 
 
-class CuReTQC(Pretraining, ModelEnvironments, CuRe, TQC):  # type: ignore[misc]
+class CuReTQC(Pretraining, Persistence, ModelEnvironments, CuRe, TQC):  # type: ignore[misc]
     """Truncated quantile critics from pixels, with state representation learning and a curious policy.
 
     All arguments are described at ``CuRe``; ``top_quantiles_to_drop_per_net`` is TQC's.

@@ -80,6 +80,18 @@ class Metrics(KVWriter):
     def close(self) -> None:
         """Nothing is open."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What was recorded since the last dump
+        """
+        return {"sums": {key: value.cpu() for key, value in self._sums.items()}, "counts": dict(self._counts)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``state_dict``
+        """
+        self._sums, self._counts = dict(state["sums"]), dict(state["counts"])
+
 
 @th.no_grad()
 def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:

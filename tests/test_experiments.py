@@ -38,7 +38,7 @@ from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import checkout_commit, read_rows, write_csv
 from sb3_cure.experiments.grid import Grid, GridError, load_grid, short_name
 from sb3_cure.experiments.visitation import COLUMNS
-from sb3_cure.generations import Generations
+from sb3_cure.persistence.generations import Generations
 
 GRIDS = Path(__file__).parent.parent / "zoo_configs" / "experiments"
 TASK = "tests/PixelBox-v0"
@@ -558,14 +558,14 @@ def test_a_pretrained_cell_that_was_killed_ends_like_one_that_was_not(
 
 def test_a_head_of_ones_own_is_named_by_its_class(tmp_path: Path) -> None:
     """A grid trains, keeps and loads a user's head like the package's own."""
-    overrides = {"srl": "test_save_load.Denoising"}
+    overrides = {"srl": "persistence.test_save_load.Denoising"}
     (cell,) = load_grid(
         write_grid(tmp_path, budget=160, methods={"own": {"config": "zoo.yml", "overrides": overrides}})
     ).cells
     folder = run_cell(cell, tmp_path, pictures=False)
     loaded = CuReSAC.load(folder / "model.zip", custom_objects=cell.custom_objects())
     assert type(loaded.policy.srl).__name__ == "Denoising"
-    assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "test_save_load.Denoising"
+    assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "persistence.test_save_load.Denoising"
 
 
 CAMERA = """

@@ -1,8 +1,10 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
+import errno
 import itertools
 import json
 import math
+import os
 import platform
 import shutil
 import time
@@ -10,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import gymnasium as gym
 import numpy as np
@@ -26,7 +28,11 @@ from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json,
 from sb3_cure.experiments.grid import DONE, Cell, GridError, comparable, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
-from sb3_cure.files import lock
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 #: Evaluations start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
@@ -396,6 +402,19 @@ def write_progress(folder: Path, **progress: Any) -> None:
     """
     with suppress(OSError):
         write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
+
+
+def lock(file: IO[Any], shared: bool = False) -> None:
+    """Lock a file, which the end of the process unlocks, however it ends.
+
+    :param file: The open file
+    :param shared: Whether others may share the lock
+    :raises BlockingIOError: if another process holds it
+    :raises OSError: where there are no locks
+    """
+    if fcntl is None:
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+    fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
 
 
 def _keep_config(cell: Cell, folder: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import torch as th
 
 import sb3_cure
-from sb3_cure.files import replacing
+from sb3_cure.persistence.files import replacing
 
 Row = dict[str, Any]
 #: What decides what is computed: algorithms, physics, pixels

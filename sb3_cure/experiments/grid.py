@@ -15,10 +15,10 @@ import gymnasium as gym
 import torch as th
 import yaml
 
-from sb3_cure.buffer_files import can_be_kept
 from sb3_cure.checks import check_arguments, check_curious_agent, check_parts, check_shared_encoder_space
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
+from sb3_cure.persistence.buffers import can_be_kept
 from sb3_cure.values import arguments_of, entry_for, import_environments, is_integer
 
 #: The file that tells that a cell is finished

@@ -17,14 +17,14 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_cure.archive import is_pickled_model
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, check_settings, write_progress
 from sb3_cure.experiments.files import describe_run, read_rows, write_csv, write_json
 from sb3_cure.experiments.grid import DONE, Cell, Grid, GridError, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
-from sb3_cure.files import replacing
+from sb3_cure.persistence import is_pickled_model
+from sb3_cure.persistence.files import replacing
 
 #: Updates of a common head: an autoencoder tells little before some thousands of them
 COMMON_UPDATES = 3000

@@ -37,7 +37,7 @@ from sb3_cure.experiments.tables import (
     ratio_text,
 )
 from sb3_cure.experiments.visit_statistics import HEADS, Coverage, ErrorSummary, state_coverage, summarise_errors
-from sb3_cure.files import replacing
+from sb3_cure.persistence.files import replacing
 
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only

@@ -101,6 +101,14 @@ class ModelEnvironments(OffPolicyAlgorithm):
             self.logger.record("rollout/bad_transitions", self.env.n_bad)
         super().dump_logs()
 
+    def _before_checkpoint(self) -> None:
+        if self._overlapped is not None:
+            self._overlapped.finish()
+        super()._before_checkpoint()  # type: ignore[misc]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_overlapped"]
+
     def _stateful_parts(self) -> dict[str, Any]:
         parts = super()._stateful_parts()  # type: ignore[misc]
         return {**parts, "environments": self.env} if isinstance(self.env, FiniteCheck) else parts

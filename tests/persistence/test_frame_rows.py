@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
+from sb3_cure.buffer_files import frame_rows, load_frame_rows
+from sb3_cure.serialization import ArchiveError, read_state, write_state
 from test_buffers import ACTIONS, Twins, assert_equal, random_events, seeded_sample
 
-from sb3_cure.buffer_files import frame_rows, load_frame_rows
 from sb3_cure.buffers import FrameStackReplayBuffer
-from sb3_cure.serialization import ArchiveError, read_state, write_state
 
 FAULTS = ("step", "step", "terminate", "break", "jump", "fault", "fault")
 #: What a field of a file may have become

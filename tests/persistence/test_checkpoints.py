@@ -3,11 +3,12 @@
 import collections
 import contextlib
 import csv
+import hashlib
 import itertools
 import multiprocessing
 import os
+import pickle
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -25,6 +26,7 @@ import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -35,20 +37,20 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from benchmarks import faults
-from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
+from benchmarks.fuzz import watching
+from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
-from sb3_cure.checkpoint import CheckpointError
+from sb3_cure.persistence import ArchiveError, CheckpointError, Persistence, read_state
+from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
-from sb3_cure.generations import Draft, Generations
-from sb3_cure.serialization import read_state, write_state
 
 
 @pytest.fixture(autouse=True)
 def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """A kill of the process, unlike a loss of power, does not need it."""
-    for module in (files, generations):
-        monkeypatch.setattr(module, "flush_to_disk", lambda path: None)
+    for module in ("files", "generations", "checkpoints"):
+        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
 
 
 @dataclass
@@ -194,9 +196,18 @@ def reference(name: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return _REFERENCE[name]
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("calls", [1, 31, 57])
-def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
+@pytest.mark.parametrize(
+    ("name", "calls"),
+    [
+        *((name, 31) for name in CASES),
+        ("rae, joint", 1),
+        ("rae, joint", 57),
+        ("schedules, noise, alternating", 57),
+        ("pretraining", 1),
+        ("pretraining", 57),
+    ],
+)
+def test_interrupted_training_goes_on_bit_for_bit(
     name: str, calls: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     expected = reference(name, tmp_path_factory)
@@ -207,11 +218,9 @@ def test_an_interrupted_training_goes_on_as_if_nothing_had_been(
     assert differences(expected, outcome(train(CASES[name], tmp_path, True), tmp_path)) == []
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(kills=st.lists(st.integers(1, 25), min_size=1, max_size=4), save_freq=st.integers(1, 30))
-def test_any_number_of_kills_at_any_steps(
-    kills: list[int], save_freq: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_any_kills_at_any_steps(kills: list[int], save_freq: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     case = Case(vectors, policy="MlpPolicy", save_freq=save_freq, steps=40)
     if "kills" not in _REFERENCE:
         folder = tmp_path_factory.mktemp("reference")
@@ -238,10 +247,10 @@ def _wait_for_generation(folder: Path, number: int, process: Any) -> None:
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize(
-    ("name", "delay"), [("rae, joint", 0.0), ("rae, joint", 0.05), ("curl, sequential", 0.02), ("workers", 0.03)]
-)
-def test_kill_9(name: str, delay: float, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+@pytest.mark.parametrize(("name", "delay"), [("rae, joint", 0.0), ("curl, sequential", 0.02), ("workers", 0.03)])
+def test_kill_9_loses_nothing(
+    name: str, delay: float, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     expected = reference(name, tmp_path_factory)
     child = multiprocessing.get_context("fork").Process(target=_train_in_child, args=(name, tmp_path))
     child.start()
@@ -253,6 +262,11 @@ def test_kill_9(name: str, delay: float, tmp_path: Path, tmp_path_factory: pytes
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)  # workers that were forked do not notice that their parent is gone
     assert differences(expected, outcome(train(CASES[name], tmp_path, True), tmp_path)) == []
+
+
+def newest_steps(kept: Generations) -> int:
+    """Agent steps after which the newest checkpoint was taken."""
+    return read_state(kept.folder(kept.numbers()[-1]) / "state.safetensors")["num_timesteps"]
 
 
 SCRIPT = textwrap.dedent(
@@ -292,7 +306,7 @@ def what_the_script_leaves(folder: Path) -> tuple[Any, Any]:
     return state_of(CuReSAC.load(folder / "final", device="cpu")), rows
 
 
-def test_kill_9_of_a_script_on_real_pixels(tmp_path: Path) -> None:
+def test_killed_script_is_started_again(tmp_path: Path) -> None:
     """The whole story in a user's words: the same script, started again."""
     for name in ("whole", "killed"):
         (tmp_path / name).mkdir()
@@ -306,7 +320,7 @@ def test_kill_9_of_a_script_on_real_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 1)])
-def test_signals_are_obeyed_after_a_checkpoint(
+def test_signals_leave_a_checkpoint(
     number: int, status: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     expected = reference("rae, joint", tmp_path_factory)
@@ -317,19 +331,17 @@ def test_signals_are_obeyed_after_a_checkpoint(
     child.join()
     assert child.exitcode == status  # of a KeyboardInterrupt multiprocessing makes 1, and a shell 130
     kept = Generations(tmp_path / "checkpoints")
-    assert 0 < kept.read(kept.numbers()[-1]).about["num_timesteps"] < 60
+    assert 0 < newest_steps(kept) < 60
     assert differences(expected, outcome(train(CASES["rae, joint"], tmp_path, True), tmp_path)) == []
 
 
-def test_a_signal_that_the_environments_do_not_survive_still_leaves_a_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_signal_that_ends_workers_leaves_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in a terminal, or a cluster's SIGTERM, also reaches the workers."""
 
     class Stop(BaseCallback):
         def _on_step(self) -> bool:
             if self.num_timesteps == 31:
-                monkeypatch.setattr(checkpoint, "vec_env_state", gone)
+                monkeypatch.setattr("sb3_cure.persistence.resume.vec_env_state", gone)
                 signal.raise_signal(signal.SIGTERM)
             return True
 
@@ -340,11 +352,11 @@ def test_a_signal_that_the_environments_do_not_survive_still_leaves_a_checkpoint
         train(CASES["vectors"], tmp_path, False, Stop())
     monkeypatch.undo()
     kept = Generations(tmp_path / "checkpoints")
-    assert kept.read(kept.numbers()[-1]).about["num_timesteps"] == 31
+    assert newest_steps(kept) == 31
     assert train(CASES["vectors"], tmp_path, True).num_timesteps == 60
 
 
-def test_a_signal_in_the_last_step_is_obeyed(tmp_path: Path) -> None:
+def test_signal_in_the_last_step_is_obeyed(tmp_path: Path) -> None:
     class Stop(BaseCallback):
         def _on_step(self) -> bool:
             if self.num_timesteps == 60:
@@ -358,25 +370,24 @@ def test_a_signal_in_the_last_step_is_obeyed(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------- contents
 
 
-def test_frames_are_written_once_and_forgotten_with_the_ring(tmp_path: Path) -> None:
+def test_frames_are_written_once(tmp_path: Path) -> None:
     case = Case(pixels(), {"buffer_size": 40}, steps=100, save_freq=10)
     model = train(case, tmp_path)
     kept = Generations(tmp_path / "checkpoints")
     numbers = kept.numbers()
     assert len(numbers) == 3 and numbers[-1] == 10
     frame_bytes = int(np.prod(model.replay_buffer.frame_shape))
-    newest = kept.read(numbers[-1])
-    sizes = {name: kept.segments.joinpath(name).stat().st_size for name, _, _ in newest.about["frames"]}
-    for name, first, last in newest.about["frames"]:
-        assert sizes[name] == (last - first) * frame_bytes
-    spans = [(first, last) for _, first, last in newest.about["frames"]]
+    segments = read_state(kept.folder(numbers[-1]) / "state.safetensors")["buffer"]["segments"]
+    for name, first, last in segments:
+        assert kept.segments.joinpath(name).stat().st_size == (last - first) * frame_bytes
+    spans = [(first, last) for _, first, last in segments]
     assert all(one[1] == other[0] for one, other in itertools.pairwise(spans))
     # No more is kept than the ring holds and what the older generations and the oldest segment need.
     frames = sum(path.stat().st_size for path in kept.segments.iterdir()) / frame_bytes
     assert frames <= model.replay_buffer.frame_capacity + 4 * 15
 
 
-def test_a_checkpoint_does_not_disturb_training(tmp_path: Path) -> None:
+def test_checkpoints_do_not_disturb_training(tmp_path: Path) -> None:
     often, seldom = (
         outcome(train(Case(pixels(), save_freq=save_freq), tmp_path / str(save_freq)), tmp_path / str(save_freq))
         for save_freq in (1, 1000)
@@ -385,7 +396,7 @@ def test_a_checkpoint_does_not_disturb_training(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["before", "after", "inside"])
-def test_the_place_of_the_checkpoint_among_callbacks_does_not_matter(place: str, tmp_path: Path) -> None:
+def test_order_of_callbacks_does_not_matter(place: str, tmp_path: Path) -> None:
     class Rollouts(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
@@ -468,28 +479,35 @@ def test_callbacks_go_on_counting(case: str, kill_at: int, tmp_path: Path) -> No
     assert at_end(whole) == at_end(resumed)
 
 
-def test_numbers_of_callbacks_may_change_their_type(tmp_path: Path) -> None:
-    """As counters become floats of NumPy; texts may be paths, and stay as they are, which is said."""
+def test_changed_attributes_of_callbacks_come_back(tmp_path: Path) -> None:
+    """Whatever their types became, dictionaries of any kind too; not what has no plain type, and not what is private."""
 
     class Best(BaseCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.best, self.total, self.found, self.where = -np.inf, 0, False, "nowhere"
+            self.best, self.found, self.where = -np.inf, False, "nowhere"
+            self.seen: dict[str, int] = collections.Counter()
+            self.history: list[float] = []
+            self.given, self._secret, self.own = "at first", 0, object()
 
         def _on_step(self) -> bool:
-            self.best, self.total = np.float32(self.num_timesteps), self.total + 0.5
-            self.found, self.where = np.bool_(True), f"step {self.num_timesteps}"
+            self.best, self.found, self.where = np.float32(self.num_timesteps), np.bool_(True), "somewhere"
+            self.seen["steps"] += 1
+            self.history.append(0.1 * self.num_timesteps)
+            self._secret, self.own = self.num_timesteps, object()
             return True
 
-    env = vectors()
-    tiny_model("MlpPolicy", env).learn(20, callback=[ExactCheckpoint(10, tmp_path), Best()])
-    best = Best()
-    with pytest.warns(UserWarning, match="does not give Best its former where: texts are left as they are"):
-        CuReSAC.resume(tmp_path, env).learn(20, callback=[ExactCheckpoint(10, tmp_path), best])
-    assert (float(best.best), best.total, bool(best.found), best.where) == (20, 10.0, True, "nowhere")
+    env, first, best = vectors(), Best(), Best()
+    best.given = "now"
+    tiny_model("MlpPolicy", env).learn(20, callback=[ExactCheckpoint(10, tmp_path), first])
+    CuReSAC.resume(tmp_path, env).learn(20, callback=[ExactCheckpoint(10, tmp_path), best])
+    assert (best.best, best.found, best.where, best.seen, best.history, best.given, best._secret) == (
+        *(20, True, "somewhere", {"steps": 20}, first.history, "now", 0),
+    )
+    assert type(best.seen) is collections.Counter and type(best.best) is np.float32
 
 
-def test_a_replay_buffer_that_was_loaded_is_the_one_that_checkpoints_hold(tmp_path: Path) -> None:
+def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
     """Its frames, which no former checkpoint has, and its size."""
     other = tiny_model("CnnPolicy", PixelBox(), seed=5, buffer_size=70).learn(60)
     other.save_replay_buffer(tmp_path / "other.pkl")
@@ -497,7 +515,6 @@ def test_a_replay_buffer_that_was_loaded_is_the_one_that_checkpoints_hold(tmp_pa
     model.learn(40, callback=ExactCheckpoint(20, tmp_path / "kept"))
     model.load_replay_buffer(tmp_path / "other.pkl")
     model.learn(20, callback=ExactCheckpoint(20, tmp_path / "kept"), reset_num_timesteps=False)
-    assert model.buffer_size == 70
     ours, theirs = model.replay_buffer, CuReSAC.resume(tmp_path / "kept", PixelBox()).replay_buffer
     assert theirs.buffer_size == 70 and theirs._n_frames == ours._n_frames
     rows = np.arange(theirs.size())
@@ -520,7 +537,7 @@ class NoState(gym.Wrapper):
     """Keeps to itself what it is like."""
 
 
-def test_environments_that_keep_their_state_to_themselves_begin_a_new_episode(tmp_path: Path) -> None:
+def test_secretive_environments_begin_a_new_episode(tmp_path: Path) -> None:
     case = Case(lambda: DummyVecEnv([lambda: Monitor(NoState(PixelBox(episode_length=7)))]))
     with pytest.warns(UserWarning, match="NoState.*begins with a new episode"), pytest.raises(Killed):
         train(case, tmp_path, False, KillAt(31))
@@ -533,7 +550,7 @@ def test_environments_that_keep_their_state_to_themselves_begin_a_new_episode(tm
     assert steps == [7, 14, 21, 31, 38, 45, 52, 59]
 
 
-def test_a_log_that_nothing_goes_on_with_is_told(tmp_path: Path) -> None:
+def test_abandoned_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(Killed):
         train(CASES["vectors"], tmp_path, False, KillAt(40))
     model = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu")
@@ -541,51 +558,27 @@ def test_a_log_that_nothing_goes_on_with_is_told(tmp_path: Path) -> None:
         model.learn(60)
 
 
-@pytest.mark.parametrize("why", ["main thread", "thread limit"])
-def test_checkpoints_need_no_second_thread(why: str, tmp_path: Path) -> None:
-    """There can be none when the main thread has ended while a training goes on in another, or at a limit."""
-    program = f"""
-import sys, threading
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_checkpoint import CASES, Path, train
-
-def refuse(*_):
-    raise RuntimeError("can't start new thread")
-
-def run():
-    threading.main_thread().join() if {why!r} == "main thread" else setattr(threading.Thread, "start", refuse)
-    train(CASES["frames on disk, small ring"], Path({str(tmp_path)!r}))
-    print("done", flush=True)
-
-threading.Thread(target=run).start() if {why!r} == "main thread" else run()
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300)
-    assert done.stdout.strip().endswith("done"), done.stderr
-    kept = Generations(tmp_path / "checkpoints")
-    assert kept.numbers() == [3, 4, 5]
-    assert all(kept.damaged(kept.read(number)) == [] for number in kept.numbers())
-
-
 def script(folder: Path, resume: bool, kill_at: int = 0) -> CuReSAC:
-    """One that pretrains, and learns twice."""
+    """One that pretrains, learns, and learns on."""
     env = pixels()()
     model = CuReSAC.resume(folder / "checkpoints", env) if resume else tiny_model("CnnPolicy", env)
     model.set_logger(configure(str(folder / "logs"), ["csv"]))
     kill = KillAt(kill_at)
-    for call, steps in ((model.pretrain, 25), (model.learn, 30), (model.learn, 20)):
-        call(steps, callback=[kill, ExactCheckpoint(8, folder / "checkpoints")], log_interval=1)
+    for call, steps, resets in ((model.pretrain, 25, True), (model.learn, 30, True), (model.learn, 20, False)):
+        callbacks = [kill, ExactCheckpoint(8, folder / "checkpoints")]
+        call(steps, callback=callbacks, log_interval=1, reset_num_timesteps=resets)
     return model
 
 
 @pytest.mark.parametrize("kill_at", [12, 40, 57, 70])
-def test_a_script_of_several_calls_goes_on_in_the_right_one(kill_at: int, tmp_path: Path) -> None:
+def test_scripts_go_on_in_the_right_call(kill_at: int, tmp_path: Path) -> None:
     expected = outcome(script(tmp_path / "whole", False), tmp_path / "whole")
     with pytest.raises(Killed):
         script(tmp_path / "killed", False, kill_at)
     assert differences(expected, outcome(script(tmp_path / "killed", True), tmp_path / "killed")) == []
 
 
-def test_a_finished_training_can_be_resumed_and_continued(tmp_path: Path) -> None:
+def test_finished_training_can_be_continued(tmp_path: Path) -> None:
     case = CASES["rae, joint"]
     for name, resumes in (("whole", False), ("resumed", True)):
         model = train(case, tmp_path / name)
@@ -598,7 +591,40 @@ def test_a_finished_training_can_be_resumed_and_continued(tmp_path: Path) -> Non
     assert results[0]["log"] == results[1]["log"]
 
 
-def test_a_learn_that_failed_can_be_called_again(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_learning_on_after_resume_means_more_steps(tmp_path: Path) -> None:
+    """As everywhere in SB3; without that word it means the total of the interrupted call."""
+    for case in ("more", "total"):
+        with pytest.raises(Killed):
+            train(CASES["vectors"], tmp_path / case, False, KillAt(30))
+    model = CuReSAC.resume(tmp_path / "more" / "checkpoints", vectors(), device="cpu")
+    assert model.num_timesteps == 24
+    assert model.learn(20, reset_num_timesteps=False).num_timesteps == 44
+    assert model.learn(5, reset_num_timesteps=False).num_timesteps == 49
+    assert CuReSAC.resume(tmp_path / "total" / "checkpoints", vectors()).learn(40).num_timesteps == 40
+
+
+class SafeTD3(Persistence, TD3):
+    """An algorithm of SB3 that can be resumed."""
+
+
+def test_other_algorithms_go_on_bit_for_bit(tmp_path: Path) -> None:
+    """The mixin needs nothing of CuReSAC."""
+    results = []
+    for name, kills in (("whole", False), ("killed", True)):
+        arguments: Any = dict(learning_starts=5, buffer_size=60, seed=0, device="cpu", policy_kwargs=dict(net_arch=[4]))
+        model = SafeTD3("MlpPolicy", vectors(), **arguments)
+        callback = ExactCheckpoint(8, tmp_path / name)
+        if kills:
+            with pytest.raises(Killed):
+                model.learn(40, callback=[callback, KillAt(21)])
+            model = SafeTD3.resume(tmp_path / name, vectors(), device="cpu")
+            callback = ExactCheckpoint(8, tmp_path / name)
+        model.learn(40, callback=callback)
+        results.append({**state_of(model), "rewards": model.replay_buffer.rewards, "steps": model.num_timesteps})
+    assert differences(*results) == []
+
+
+def test_failed_learn_can_be_called_again(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     expected = reference("rae, joint", tmp_path_factory)
     with pytest.raises(Killed):
         train(CASES["rae, joint"], tmp_path, False, KillAt(33))
@@ -610,7 +636,7 @@ def test_a_learn_that_failed_can_be_called_again(tmp_path: Path, tmp_path_factor
     assert differences(expected, outcome(model, tmp_path)) == []
 
 
-def test_the_log_of_a_run_goes_on_in_its_own_folder(tmp_path: Path) -> None:
+def test_tensorboard_goes_on_in_its_folder(tmp_path: Path) -> None:
     """TensorBoard's runs are numbered, and another one has begun since."""
     board = tmp_path / "boards"
 
@@ -632,60 +658,32 @@ def test_the_log_of_a_run_goes_on_in_its_own_folder(tmp_path: Path) -> None:
     assert before.items() <= {path: path.stat().st_size for path in (board / "CuReSAC_2").iterdir()}.items()
 
 
-def test_what_a_stranger_put_into_a_checkpoint_reaches_no_file_and_no_code(tmp_path: Path) -> None:
-    """Forged logs and attributes of callbacks: nothing is written elsewhere, nothing but counters is taken."""
+class Payload:
+    """Unpickled, it would write a file."""
+
+    def __reduce__(self) -> tuple:
+        return os.system, (f"touch {Path(__file__).parent}/executed",)
+
+
+@pytest.mark.parametrize("name", ["model.zip", "state.safetensors"])
+def test_hostile_checkpoint_runs_no_code(name: str, tmp_path: Path) -> None:
+    """Its checksums are those of the author's files."""
     train(CASES["vectors"], tmp_path)
     kept = Generations(tmp_path / "checkpoints")
     folder = kept.folder(kept.numbers()[-1])
-    state = read_state(folder / "state.zip")
-    state["logger"]["files"] = [{"name": str(tmp_path / "stolen.txt"), "keys": []}]
-    state["logger"]["boards"] = ["../../elsewhere"]
-    name = "EveryNTimesteps"
-    forged = {"n_steps": "seven", "last_time_trigger": 3, "_on_step": 5, "on_step": 5, "n_calls": 77, "new": 1}
-    state["callbacks"] = [{"class": name, "changed": forged}]
-    write_state(folder / "state.zip", state)
-
-    def copy(draft: Draft) -> dict[str, Any]:
-        for path in folder.iterdir():
-            if path.name != "manifest.json":
-                shutil.copy(path, draft.folder)
-        return {"frames": []}
-
-    kept.write(copy, 1)
-    model = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu")
-    callback = EveryNTimesteps(1000, PeriodicCallback(1000))
-    with pytest.warns(UserWarning, match="nothing goes on with"):
-        model.learn(60, callback=callback)
-    assert not (tmp_path / "stolen.txt").exists() and not (tmp_path / "elsewhere").exists()
-    assert (callback.n_calls, callback.last_time_trigger, callback.n_steps) == (77, 3, 1000)
-    assert callable(callback.on_step) and not hasattr(callback, "new")
-
-
-def test_a_callback_that_cannot_be_kept_does_not_stop_training(tmp_path: Path) -> None:
-    class Odd(BaseCallback):
-        def __init__(self) -> None:
-            super().__init__()
-            self.seen: dict[str, int] = collections.Counter()
-            self.history: list[float] = []
-
-        def _on_step(self) -> bool:
-            self.seen["steps"] += 1
-            self.history += [0.1 * self.num_timesteps] * 5000
-            return True
-
-    odd = Odd()
-    with pytest.warns(UserWarning, match="do not keep seen of Odd"):
-        model = train(CASES["vectors"], tmp_path, False, odd)
-    resumed, again = CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu"), Odd()
-    with pytest.warns(UserWarning):
-        resumed.learn(60, callback=again)
-    assert model.num_timesteps == 60 and again.history == odd.history and len(odd.history) == 300_000
+    (folder / name).write_bytes(pickle.dumps(Payload()))
+    digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    lines = [line for line in (folder / "SHA256SUMS").read_text().splitlines() if not line.endswith(name)]
+    (folder / "SHA256SUMS").write_text("\n".join([*lines, f"{digest}  {name}"]) + "\n")
+    with watching() as events, pytest.raises(ArchiveError):
+        CuReSAC.resume(tmp_path / "checkpoints", vectors(), device="cpu")
+    assert events == [] and not (Path(__file__).parent / "executed").exists()
 
 
 # ------------------------------------------------------------------------------------------------ refusals
 
 
-def test_another_training_may_not_write_over_checkpoints(tmp_path: Path) -> None:
+def test_other_trainings_checkpoints_are_kept(tmp_path: Path) -> None:
     train(CASES["vectors"], tmp_path)
     before = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     with pytest.raises(CheckpointError, match=r"holds checkpoints of another training.*CuReSAC\.resume"):
@@ -693,30 +691,21 @@ def test_another_training_may_not_write_over_checkpoints(tmp_path: Path) -> None
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == before
 
 
-def test_two_processes_may_not_write_to_one_folder(tmp_path: Path) -> None:
-    with Generations(tmp_path).locked():
+def test_one_process_writes_to_a_folder(tmp_path: Path) -> None:
+    with Generations(tmp_path).lock():
         with pytest.raises(CheckpointError, match="another process writes checkpoints"):
             tiny_model("MlpPolicy", VectorBox()).learn(5, callback=ExactCheckpoint(5, tmp_path))
-
-
-def test_full_disk_is_known_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = type("Usage", (), {"free": 10_000})
-    monkeypatch.setattr("shutil.disk_usage", lambda path: usage)
-    model = tiny_model("MlpPolicy", VectorBox())
-    with pytest.raises(CheckpointError, match=r"will need up to .* GB, but only 0\.00 GB are free"):
-        model.learn(5, callback=ExactCheckpoint(5, tmp_path))
-    assert model.num_timesteps == 0
 
 
 def test_unwritable_folder_is_known_before_training(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     model = tiny_model("MlpPolicy", VectorBox())
-    with pytest.raises(CheckpointError, match=r"cannot write to .*choose another path"):
+    with pytest.raises(OSError):
         model.learn(5, callback=ExactCheckpoint(5, tmp_path / "file" / "below"))
     assert model.num_timesteps == 0
 
 
-def test_other_numbers_of_environments_are_refused(tmp_path: Path) -> None:
+def test_other_number_of_environments_is_refused(tmp_path: Path) -> None:
     train(CASES["rae, joint"], tmp_path)
     with pytest.raises(CheckpointError, match=r"got 4 environments, but .* of a training with 1"):
         CuReSAC.resume(tmp_path / "checkpoints", pixels(4)())
@@ -730,9 +719,9 @@ def test_no_checkpoint_is_said(tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------- faults
 
 
-def test_no_fault_costs_more_than_the_checkpoint_that_it_hits(tmp_path: Path) -> None:
+def test_faults_cost_one_checkpoint_at_most(tmp_path: Path) -> None:
     """The campaign of benchmarks/faults.py, with a part of its failing writes."""
-    outcomes = faults.campaign(tmp_path, points=50)
+    outcomes = faults.campaign(tmp_path, points=15)
     assert [outcome for outcome in outcomes if not outcome.expected] == []
-    assert len(outcomes) >= 200
+    assert len(outcomes) >= 90
     assert {outcome.resumed for outcome in outcomes} == {"newest", "former", "without some frames"}

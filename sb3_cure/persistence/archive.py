@@ -1,0 +1,293 @@
+"""Models as a ``.zip`` of JSON and safetensors, which can be loaded from strangers.
+
+``data`` is the JSON of the settings, in which the tensors of ``tensors.safetensors`` are named. What is no data (a
+function, a user's class) is there as a placeholder that tells what it was, and ``load`` asks for it.
+"""
+
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Iterator
+from typing import Any, BinaryIO, Protocol, TypeVar, cast
+
+import stable_baselines3
+import torch as th
+from safetensors.torch import load as load_tensors
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
+
+from sb3_cure.persistence.encoding import VERSION, ArchiveError, decode, encode, named_by, refusing, write_tensors
+from sb3_cure.persistence.files import PathOrFile, reading, writing
+
+Self = TypeVar("Self", bound="SavesModels")
+
+_DATA, _TENSORS, _SYSTEM_INFO = "data", "tensors.safetensors", "system_info.txt"
+_PLACEHOLDER = "!not saved"
+#: What torch's optimisers keep as one number for each parameter
+_COUNTS = ("step", "eta", "mu", "mu_product")
+
+
+class Stateful(Protocol):
+    """A part of a model with a state beside tensors and settings."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: Its state: values that ``encode`` knows
+        """
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``state_dict``
+        """
+
+
+class ObjectsMissing(ArchiveError):
+    """What no archive holds, such as a head of the user's own, was not given to ``load``.
+
+    :param name: What to call the file
+    :param missing: What each of the settings was
+    """
+
+    def __init__(self, name: str, missing: dict[str, str]):
+        needed = ", ".join(f"{key!r}: ..." for key in missing)
+        super().__init__(
+            f"{name} was saved with what no archive holds ({'; '.join(missing.values())}): give it to load with "
+            f"custom_objects={{{needed}}}."
+        )
+        self.name = name
+        self.missing = missing
+
+
+class ModelArchive:
+    """A model's file, its tensors read.
+
+    :param file: The file
+    :param name: What to call it
+    :raises ArchiveError: if it is damaged or hostile
+    """
+
+    def __init__(self, file: BinaryIO, name: str):
+        self.name = name
+        with refusing(name):
+            archive = zipfile.ZipFile(file)
+            members = archive.infolist()
+            if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+                raise ArchiveError(f"{name} has compressed members, which may expand without limit: it is not read.")
+            if sum(member.file_size for member in members) > file.seek(0, os.SEEK_END):
+                raise ArchiveError(f"{name} declares more bytes than it has: it is damaged, or hostile.")
+            self.content = json.loads(archive.read(_DATA))
+            self.is_pickled = "format" not in self.content  # but attributes of the model, as SB3 writes them
+            if not self.is_pickled and self.content["format"] != VERSION:
+                raise ArchiveError(f"{name} has the format {self.content['format']!r:.20}, not {VERSION}.")
+            self._tensors = {} if self.is_pickled else load_tensors(archive.read(_TENSORS))
+            self.system_info = "" if self.is_pickled else archive.read(_SYSTEM_INFO).decode(errors="replace")
+
+    def read(self, part: str) -> dict[str, Any]:
+        """
+        :param part: ``"parameters"``, ``"variables"`` or ``"parts"``
+        :return: States by name
+        """
+        with refusing(self.name):
+            return decode(self.content[part], self._tensors.__getitem__)
+
+    def settings(self, model_class: type, given: dict[str, Any], not_needed: Iterable[str]) -> dict[str, Any]:
+        """
+        :param model_class: The class that the settings are for
+        :param given: Settings in place of the archive's
+        :param not_needed: Names of settings that may be missing
+        :return: Settings by name
+        :raises ObjectsMissing: if there are placeholders that nothing was given for
+        """
+        with refusing(self.name):
+            nodes = self.content["settings"]
+            settings = {key: value for key, value in given.items() if key in nodes}
+            missing, named = {}, named_by(model_class)
+            for key, node in nodes.items():
+                if key not in settings and isinstance(node, dict) and _PLACEHOLDER in node:
+                    missing[key] = node[_PLACEHOLDER][:200]
+                elif key not in settings:
+                    settings[key] = decode(node, self._tensors.__getitem__, named)
+            if needed := {key: what for key, what in missing.items() if key not in not_needed}:
+                raise ObjectsMissing(self.name, needed)
+            return settings
+
+
+def is_pickled_model(path: PathOrFile) -> bool:
+    """
+    :param path: A model's file
+    :return: Whether SB3's own ``save`` wrote it, so that its settings are pickled
+    """
+    with reading(path, "zip") as (file, name):
+        return ModelArchive(file, name).is_pickled
+
+
+class SavesModels(OffPolicyAlgorithm):
+    """Mixin for an algorithm of SB3: ``save``, ``load`` and ``set_parameters`` without pickle."""
+
+    def _stateful_parts(self) -> dict[str, Stateful]:
+        """Objects with a state beside tensors and settings, such as a generator, by name: saved and resumed."""
+        return {}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "lr_schedule"]  # which set-up makes of learning_rate
+
+    def save(
+        self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
+    ) -> None:
+        """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
+
+        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
+        it was, and ``load`` asks for it as ``custom_objects``.
+
+        :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
+        :param exclude: Names of settings that are not to be saved
+        :param include: Refused but for settings: an archive holds all of these, and no other part of a running model
+        :raises ValueError: if ``include`` names parts of the running model
+        """
+        excluded = {*self._excluded_save_params()}
+        if impossible := sorted(excluded & {*(include or ())}):
+            raise ValueError(
+                f"save was called with include={impossible}, which an archive does not hold: leave it out."
+            )
+        state_dicts, variables = self._get_torch_save_params()
+        left_out = excluded | {*(exclude or ())} | {name.split(".")[0] for name in [*state_dicts, *variables]}
+        tensors: dict[str, th.Tensor] = {}
+        named = named_by(type(self))
+        settings = {}
+        for name, value in vars(self).items():
+            if name not in left_out:
+                try:
+                    settings[name] = encode(value, name, tensors, named)
+                except TypeError as error:
+                    settings[name] = {_PLACEHOLDER: str(error)}
+        content = {
+            # Without the versions of modules, which an OrderedDict of torch carries
+            "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
+            "variables": {name: recursive_getattr(self, name) for name in variables},
+            "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
+        }
+        data = {"format": VERSION, "settings": settings}
+        data |= {name: encode(part, name, tensors) for name, part in content.items()}
+        with writing(path, "zip") as target, zipfile.ZipFile(target, "w") as archive:
+            archive.writestr(_DATA, json.dumps(data, indent=1))
+            with archive.open(_TENSORS, "w", force_zip64=True) as member:
+                write_tensors(cast(BinaryIO, member), tensors)
+            archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
+            archive.writestr(_SYSTEM_INFO, get_system_info(print_info=False)[1])
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[Self],
+        path: PathOrFile,
+        env: GymEnv | str | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        trusted: bool = False,
+        **kwargs: Any,
+    ) -> Self:
+        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
+        imported. (Its settings may still ask for more memory than there is.)
+
+        :param path: Path with or without its suffix ``.zip``, or a binary file
+        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
+        :param device: Device of the networks
+        :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
+            ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
+            archive does not have are ignored
+        :param print_system_info: Whether to print of which system the model was saved, and of this one
+        :param force_reset: Whether to reset the environment before learning goes on
+        :param trusted: Also load what SB3's ``save`` has pickled, which runs any code in it
+        :param kwargs: Settings to change
+        :return: The model
+        :raises ArchiveError: (a ``ValueError``) if the file is damaged, hostile or pickled
+        """
+        env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
+        with reading(path, "zip") as (file, name):
+            archive = ModelArchive(file, name)
+        if archive.is_pickled and trusted:
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if archive.is_pickled:
+            raise ArchiveError(
+                f"{name} holds pickled settings, as SB3 saves them, and unpickling runs any code that is in them: if "
+                "you know where it comes from, load it with trusted=True (and save it again, which needs no pickle)."
+            )
+        if print_system_info:
+            get_system_info()
+            print("".join(char for char in archive.system_info if char.isprintable() or char == "\n"))
+        settings = archive.settings(cls, custom_objects or {}, kwargs)
+        if kwargs.get("policy_kwargs", settings.get("policy_kwargs")) != settings.get("policy_kwargs"):
+            raise ValueError(f"load got other policy_kwargs than {name} was saved with: leave them out.")
+        if env is not None:
+            env = cls._wrap_env(env, settings.get("verbose", 0))
+            check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
+            settings["n_envs"] = env.num_envs
+            if force_reset:
+                settings["_last_obs"] = None
+        model = cls(settings["policy_class"], env, device=device, _init_setup_model=False)  # type: ignore[arg-type, call-arg]
+        for key in settings:
+            # A callback, say, may have set further attributes; none may hide a method or a part of the model.
+            if hasattr(cls, key) or key in model._excluded_save_params():
+                raise ArchiveError(f"{name} has {key:.50}, which is no setting: it is damaged, or of another version.")
+        vars(model).update(settings)
+        if unknown := kwargs.keys() - vars(model).keys() - archive.content["settings"].keys():
+            raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
+        vars(model).update(kwargs)
+        model._setup_model()
+        model.set_parameters(archive.read("parameters"), exact_match=True, device=device)
+        variables, states = archive.read("variables"), archive.read("parts")
+        with refusing(name):
+            for key in model._get_torch_save_params()[1]:
+                recursive_getattr(model, key).data.copy_(variables[key])
+            for key, part in model._stateful_parts().items():
+                if key in states:
+                    part.load_state_dict(states[key])
+        if model.use_sde:
+            model.policy.reset_noise()  # type: ignore[operator]
+        return model
+
+    def set_parameters(
+        self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
+
+        :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
+        :param exact_match: Whether all of the model's parameters have to be there, and no others
+        :param device: As in SB3; the parameters stay on the model's device
+        """
+        if not isinstance(load_path_or_dict, dict):
+            with reading(load_path_or_dict, "zip") as (file, name):
+                archive = ModelArchive(file, name)
+            load_path_or_dict = load_path_or_dict if archive.is_pickled else archive.read("parameters")
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        finally:
+            for optimizer in self._optimizers():
+                _lay_out_moments(optimizer)
+
+    def _optimizers(self) -> Iterator[th.optim.Optimizer]:
+        for name in self._get_torch_save_params()[0]:
+            owner = recursive_getattr(self, name)
+            # What is no optimiser itself may hold some by name.
+            held = [owner, *getattr(owner, "optimizers", {}).values()]
+            yield from (each for each in held if isinstance(each, th.optim.Optimizer))
+
+
+def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
+    """Give moments the strides of their parameters: fused Adam steps both in the order of memory."""
+    for parameter, state in optimizer.state.items():
+        for key, value in state.items():
+            if not isinstance(value, th.Tensor) or (key in _COUNTS and value.dim() == 0):
+                continue
+            if value.shape != parameter.shape:
+                optimizer.state.clear()  # a fused step would write beyond them
+                raise ArchiveError(
+                    f"an optimiser got {key:.20} of shape {tuple(value.shape)!s:.50} for a parameter of shape "
+                    f"{tuple(parameter.shape)}: the parameters are of a model with other settings."
+                )
+            state[key] = th.empty_like(parameter, dtype=value.dtype).copy_(value)

@@ -1,0 +1,327 @@
+"""Values as JSON, with the arrays and tensors in them set apart, and files of both without pickle.
+
+JSON stands for itself; whatever it cannot express is an object whose only key begins with ``!`` and tells the type.
+Reading runs no code of a file and imports nothing that it names: tensors are read by safetensors, objects are those of
+``_KINDS``, classes those of ``NAMED`` and the policies that a model registers.
+"""
+
+import contextlib
+import json
+import math
+import struct
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from safetensors import safe_open
+from safetensors.torch import load as load_tensors
+from stable_baselines3.common import buffers as sb3_buffers
+from stable_baselines3.common import torch_layers
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
+from torch.nn.modules import activation
+
+from sb3_cure import encoders
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.intrinsic import INTRINSIC_REWARDS
+from sb3_cure.srl import SRL_HEADS
+
+#: Of the format of what is written
+VERSION = 2
+_DTYPES = {
+    **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
+    **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64", th.complex64: "C64"},
+    **{th.uint8: "U8", th.uint16: "U16", th.uint32: "U32", th.uint64: "U64"},
+}
+
+
+class ArchiveError(ValueError):
+    """A file is not what it should be, in one sentence.
+
+    :param sentence: It may quote the file, whose control characters are left out
+    """
+
+    def __init__(self, sentence: str):
+        super().__init__("".join(filter(str.isprintable, sentence)))
+
+
+@contextlib.contextmanager
+def refusing(name: str) -> Iterator[None]:
+    """Whatever goes wrong while a file is read becomes an ``ArchiveError``.
+
+    :param name: What to call the file
+    """
+    try:
+        yield
+    except ArchiveError:
+        raise
+    except Exception as error:  # hostile bytes fail in many ways
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".rstrip(".")
+        raise ArchiveError(f"{name} is damaged, or was not written by this package ({reason}).") from error
+
+
+# ---------------------------------------------------------------------- names
+
+#: Replay buffers that are written without pickle
+BUFFERS: tuple[type[sb3_buffers.ReplayBuffer], ...] = (
+    FrameStackReplayBuffer,
+    SkippingReplayBuffer,
+    sb3_buffers.ReplayBuffer,
+    sb3_buffers.DictReplayBuffer,
+    sb3_buffers.NStepReplayBuffer,
+)
+#: Types of the numbers in arrays
+NUMBERS: tuple[type[np.generic], ...] = (
+    *(np.bool_, np.float16, np.float32, np.float64, np.complex64),
+    *(np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
+)
+
+
+def _of_module(module: Any, base: type) -> list[type]:
+    return [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, base)]
+
+
+def name_of(value: Any) -> str:
+    """
+    :param value: A class, or a member of an enumeration
+    :return: What files call it
+    """
+    if value in NUMBERS:
+        return f"numpy.{np.dtype(value).name}"  # `bool` or `bool_`, by NumPy's version
+    return str(value) if isinstance(value, Enum) else f"{value.__module__}.{value.__qualname__}"
+
+
+#: Classes and members of enumerations by their names
+NAMED: dict[str, Any] = {
+    name_of(value): value
+    for value in (
+        *BUFFERS,
+        *NUMBERS,
+        HerReplayBuffer,
+        encoders.PixelEncoder,
+        encoders.VectorEncoder,
+        torch_layers.FlattenExtractor,
+        torch_layers.NatureCNN,
+        torch_layers.CombinedExtractor,
+        RMSpropTFLike,
+        *SRL_HEADS.values(),
+        *INTRINSIC_REWARDS.values(),
+        *_of_module(activation, th.nn.Module),
+        *_of_module(th.optim, th.optim.Optimizer),
+        *GoalSelectionStrategy,
+        *TrainFrequencyUnit,
+    )
+}
+
+
+def named_by(model_class: type) -> dict[str, Any]:
+    """
+    :param model_class: An algorithm
+    :return: What its archives may name: ``NAMED``, and the policies that it and its base classes register
+    """
+    registered = [vars(base).get("policy_aliases", {}).values() for base in model_class.__mro__]
+    policies = {base for policies in registered for policy in policies for base in policy.__mro__}
+    return NAMED | {name_of(policy): policy for policy in policies if issubclass(policy, BasePolicy)}
+
+
+# ------------------------------------------------------------------- values
+
+
+def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
+    """
+    :param value: None, bool, int, float, str, bytes, list, tuple, dict, deque, arrays, tensors, numbers of NumPy,
+        paths, spaces, SB3's schedules and noises, and what has a name
+    :param path: Where it is, which names its tensors
+    :param tensors: Takes the arrays and tensors, contiguous
+    :param named: Classes by name
+    :return: JSON
+    :raises TypeError: for any other value, saying what it is
+    """
+    kind = type(value)
+    inside = partial(encode, tensors=tensors, named=named)
+    if value is None or kind in (bool, int, str):
+        return value
+    if kind is float:
+        return value if math.isfinite(value) else {"!float": str(value)}
+    if kind is list:
+        return [inside(item, f"{path}.{i}") for i, item in enumerate(value)]
+    if kind is dict and all(type(key) is str and not key.startswith("!") for key in value):
+        return {key: inside(item, f"{path}.{key}") for key, item in value.items()}
+    if isinstance(value, np.str_):
+        return str(value)
+    if isinstance(value, NUMBERS):
+        return {"!number": [name_of(kind), inside(value.item(), path)]}
+    if isinstance(value, np.ndarray) and (dtype := value.dtype.newbyteorder("=")).type in NUMBERS:
+        array = np.ascontiguousarray(value, dtype).reshape(value.shape)
+        # What torch does not take: single elements may keep a negative stride.
+        array = array if array.flags.writeable and min(array.strides, default=0) >= 0 else array.copy()
+        return {"!array": _keep(th.from_numpy(array), path, tensors)}
+    if isinstance(value, th.Tensor) and value.layout is th.strided and value.dtype in _DTYPES:
+        return {"!tensor": _keep(value, path, tensors)}
+    if kind in _TAGS:
+        return {f"!{_TAGS[kind]}": inside(_KINDS[_TAGS[kind]][1](value), path)}
+    name = name_of(value) if isinstance(value, Enum) or hasattr(value, "__qualname__") else ""
+    if name and named.get(name) is value:
+        return {"!name": name}
+    what = "class" if isinstance(value, type) else "function"
+    raise TypeError(f"{path} is the {what} {name}" if name else f"{path} is of the type {name_of(kind)}")
+
+
+def _keep(tensor: th.Tensor, path: str, tensors: dict[str, th.Tensor]) -> str:
+    while path in tensors:
+        path += "'"
+    tensors[path] = tensor.detach().cpu().resolve_conj().resolve_neg().contiguous()
+    return path
+
+
+def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
+    """
+    :param node: JSON of ``encode``
+    :param tensors: Gives a tensor by its name
+    :param named: Classes by name
+    :return: The value; arrays and tensors are contiguous, on the CPU
+    :raises Exception: of many kinds, for what ``encode`` did not write
+    """
+    if isinstance(node, list):
+        return [decode(item, tensors, named) for item in node]
+    if not isinstance(node, dict):
+        return node
+    if not any(key.startswith("!") for key in node):
+        return {key: decode(item, tensors, named) for key, item in node.items()}
+    ((tag, content),) = node.items()
+    if tag == "!float":
+        return float(content)
+    if tag == "!number":
+        return {name_of(kind): kind for kind in NUMBERS}[content[0]](decode(content[1], tensors, named))
+    if tag == "!array":
+        return tensors(content).numpy()
+    if tag == "!tensor":
+        return tensors(content)
+    if tag == "!name":
+        return named[content]
+    return _KINDS[tag[1:]][2](decode(content, tensors, named))
+
+
+def _revived(kind: type, attributes: dict[str, Any]) -> Any:
+    """An object of a class whose state is its attributes."""
+    value = object.__new__(kind)
+    vars(value).update(attributes)
+    return value
+
+
+def _arguments(names: str, space: Any) -> dict[str, Any]:
+    """Those that a space was made with."""
+    return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
+
+
+_BY_ATTRIBUTES = (
+    *(ConstantSchedule, FloatSchedule, LinearSchedule),
+    *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
+)
+#: By tag: the class, what a value is made of, and how it is made of that again
+_KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "tuple": (tuple, list, tuple),
+    "dict": (dict, lambda value: [list(item) for item in value.items()], dict),
+    "OrderedDict": (OrderedDict, lambda value: [list(item) for item in value.items()], OrderedDict),
+    "deque": (deque, lambda value: [value.maxlen, list(value)], lambda parts: deque(parts[1], parts[0])),
+    "bytes": (bytes, lambda value: np.frombuffer(value, np.uint8), lambda array: array.tobytes()),
+    "Path": (type(Path()), str, Path),
+    "TrainFreq": (TrainFreq, list, lambda parts: TrainFreq(*parts)),
+    "Box": (spaces.Box, partial(_arguments, "low high shape"), lambda arguments: spaces.Box(**arguments)),
+    "Discrete": (spaces.Discrete, partial(_arguments, "n start"), lambda arguments: spaces.Discrete(**arguments)),
+    "MultiDiscrete": (
+        spaces.MultiDiscrete,
+        partial(_arguments, "nvec start"),
+        lambda arguments: spaces.MultiDiscrete(**arguments),
+    ),
+    "MultiBinary": (spaces.MultiBinary, lambda space: space.n, spaces.MultiBinary),
+    # Its items in this order, where a dict would be sorted
+    "Dict": (spaces.Dict, lambda space: OrderedDict(space.spaces), spaces.Dict),
+    "Tuple": (spaces.Tuple, lambda space: space.spaces, spaces.Tuple),
+    **{kind.__name__: (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
+}
+_TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()}
+
+
+# -------------------------------------------------------------------- files
+
+
+def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write a safetensors file, one tensor after the other.
+
+    The library's own writers need a path, or a second copy of everything in memory.
+
+    :param file: Where to write
+    :param tensors: Contiguous tensors on the CPU, by name
+    :param metadata: Texts for the header
+    """
+    header: dict[str, Any] = {} if metadata is None else {"__metadata__": metadata}
+    by_alignment = sorted(tensors.items(), key=lambda item: -item[1].itemsize)
+    end = 0
+    for name, tensor in by_alignment:
+        start, end = end, end + tensor.nbytes
+        header[name] = {"dtype": _DTYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    file.write(struct.pack("<Q", len(text)) + text)
+    for _, tensor in by_alignment:
+        # Not `view(-1)`: that keeps odd strides of single elements, which cannot be viewed as bytes.
+        file.write(tensor.as_strided((tensor.numel(),), (1,)).view(th.uint8).numpy().data)
+
+
+def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
+    """Write nested values into one safetensors file, whose header holds all that is no array.
+
+    :param file: Path to write to (not atomically: see ``replacing``), or a binary file
+    :param state: What ``encode`` knows
+    :raises TypeError: for anything else; the file is not touched then
+    """
+    tensors: dict[str, th.Tensor] = {}
+    metadata = {"format": f"sb3_cure {VERSION}", "state": json.dumps(encode(state, "state", tensors))}
+    with open(file, "wb") if isinstance(file, str | Path) else contextlib.nullcontext(file) as stream:
+        write_tensors(stream, tensors, metadata)
+
+
+def is_state(file: BinaryIO) -> bool:
+    """
+    :param file: A binary file, at its start
+    :return: Whether it may be one of ``write_state``, rather than a pickle
+    """
+    return file.read(9)[8:] == b"{"
+
+
+def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]:
+    """Read what ``write_state`` wrote.
+
+    :param file: Path, or a binary file
+    :param copy: Whether arrays are copied into memory; else those of a path stay mapped to the file
+    :return: The state
+    :raises ArchiveError: if the file is anything else
+    """
+    is_path = isinstance(file, str | Path)
+    with refusing(f"'{file}'" if is_path else "the file"):
+        if is_path:
+            with safe_open(file, "pt") as opened:  # type: ignore[no-untyped-call]
+                metadata, get = opened.metadata(), opened.get_tensor
+                return _decoded(metadata, (lambda name: get(name).clone()) if copy else get)
+        file.seek(0)  # type: ignore[union-attr]
+        data = file.read()  # type: ignore[union-attr]
+        tensors = load_tensors(data)
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+        return _decoded(metadata, tensors.__getitem__)
+
+
+def _decoded(metadata: dict[str, str] | None, tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
+    if metadata is None or metadata.get("format") != f"sb3_cure {VERSION}":
+        raise ArchiveError(f"the file holds no state of version {VERSION}: another version of this package wrote it.")
+    return decode(json.loads(metadata["state"]), tensors)

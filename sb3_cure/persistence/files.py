@@ -1,0 +1,79 @@
+"""Files that are written whole or not at all."""
+
+import contextlib
+import io
+import os
+import platform
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias, cast
+
+from stable_baselines3.common.save_util import open_path
+
+PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Write a file beside another, which it replaces in one go when all of it is on the disk.
+
+    Killed, out of disk space or with an exception in between, the old file stays as it was.
+
+    :param path: File to write or to replace, in a folder that exists
+    :return: Name to write under meanwhile, in the same folder
+    """
+    path = Path(path)
+    # Another name for each thread, process and machine: several may write the same file.
+    beside = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}.{threading.get_ident()}")
+    try:
+        yield beside
+        flush_to_disk(beside)
+        beside.replace(path)
+        flush_to_disk(path.parent)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def flush_to_disk(path: Path) -> None:
+    """
+    :param path: File or folder: what was written to it is on the disk after this call
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def writing(path: PathOrFile, suffix: str) -> Iterator[BinaryIO]:
+    """Open a file for writing; one at a path is replaced when the new one is whole.
+
+    :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
+    :param suffix: ``"zip"`` or ``"pkl"``
+    :return: The open file
+    """
+    if not isinstance(path, str | Path):
+        yield cast(BinaryIO, open_path(path, "w"))
+        return
+    path = Path(path) if Path(path).suffix else Path(f"{path}.{suffix}")
+    path = path.resolve() if path.is_symlink() else path  # what a link leads to is written, not the link
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside, beside.open("wb") as file:
+        yield file
+        file.flush()
+
+
+@contextlib.contextmanager
+def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
+    """
+    :param path: Path, with or without its suffix, or a binary file
+    :param suffix: ``"zip"`` or ``"pkl"``
+    :return: The open file, at its start, and what to call it in messages
+    """
+    file: Any = open_path(path, "r", suffix=suffix)  # type: ignore[arg-type]
+    is_path = isinstance(path, str | Path)
+    file.seek(0)
+    with file if is_path else contextlib.nullcontext():
+        yield file, f"'{path}'" if is_path else "the file"
