@@ -159,6 +159,8 @@ class CuRe(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
+        for name in ("policy_kwargs", "replay_buffer_kwargs"):  # SB3 writes into them
+            kwargs[name] = dict(kwargs.get(name) or {})
         super().__init__(  # type: ignore[call-arg]
             policy,
             env,

@@ -74,6 +74,8 @@ class EncoderUpdate:
             self.add_source(source)
         #: Within what the encoder runs; the algorithm puts its own here
         self.autocast: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
+        #: Share of each source in what moved the encoder's parameters when that was measured last
+        self.shares: dict[str, th.Tensor] = {}
         self._n_updates = 0
         self.begin(th.empty(0), th.empty(0))
 
@@ -91,6 +93,7 @@ class EncoderUpdate:
         """
         self.optimizers.pop(source, None)
         del self.mean_squares[source], self.weights[source]
+        self.shares = {}
 
     def begin(self, views: th.Tensor, next_views: th.Tensor) -> None:
         """Begin an update, and forget one that was not brought to its end.
@@ -169,14 +172,15 @@ class EncoderUpdate:
     def end(self) -> dict[str, th.Tensor]:
         """End an update.
 
-        :return: Norm of each source's gradient at the latents, and now and then the share of each source in what moved
-            the encoder's parameters, by their logged names (detached scalars; the shares add up to 1)
+        :return: Norm of each source's gradient at the latents, and the share of each source in what moved the encoder's
+            parameters when that was measured last, by their logged names (detached scalars; the shares add up to 1)
         """
         self._n_updates += 1
-        metrics = {f"latent_grad_norm_{source}": norm for source, norm in self.gradient_norms.items()}
         if self._sizes:
             total = th.stack(list(self._sizes.values())).sum().clamp(min=1e-30)
-            metrics |= {f"encoder_share_{source}": size / total for source, size in self._sizes.items()}
+            self.shares = {source: size / total for source, size in self._sizes.items()}
+        metrics = {f"latent_grad_norm_{source}": norm for source, norm in self.gradient_norms.items()}
+        metrics |= {f"encoder_share_{source}": share for source, share in self.shares.items()}
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
@@ -188,6 +192,7 @@ class EncoderUpdate:
             "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
             "weights": dict(self.weights),
             "n_updates": self._n_updates,
+            "shares": dict(self.shares),
         }
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
@@ -209,4 +214,4 @@ class EncoderUpdate:
             optimizer.load_state_dict(state["optimizers"][name])
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
         self.weights = dict(state["weights"])
-        self._n_updates = state["n_updates"]
+        self._n_updates, self.shares = state["n_updates"], dict(state["shares"])

@@ -75,7 +75,7 @@ def test_interrupted_overlap_leaves_usable_environments() -> None:
         model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0)
         step = model._gradient_step
 
-        def interrupted(batch: Any) -> None:
+        def interrupted(*arguments: Any) -> None:
             raise KeyboardInterrupt
 
         model._gradient_step = interrupted
@@ -111,10 +111,10 @@ def test_no_transition_spans_an_interrupt_while_workers_step() -> None:
         model = tiny_model("MlpPolicy", venv, overlap=True)
         step = model._gradient_step
 
-        def interrupted(batch: Any) -> None:
+        def interrupted(*arguments: Any) -> None:
             if model.num_timesteps == 20:
                 raise KeyboardInterrupt
-            step(batch)
+            step(*arguments)
 
         model._gradient_step = interrupted
         with pytest.raises(KeyboardInterrupt):
@@ -133,7 +133,7 @@ def test_an_interrupt_is_told_although_it_has_ended_the_workers() -> None:
     venv = SubprocVecEnv([PixelBox])
     model = tiny_model("CnnPolicy", venv, overlap=True, warmup_updates=0)
 
-    def interrupted(batch: Any) -> None:
+    def interrupted(*arguments: Any) -> None:
         for process in venv.processes:
             process.kill()
             process.join()

@@ -194,8 +194,8 @@ def test_alternating_schedule(update: str) -> None:
         "CnnPolicy", PixelBox(), update=update, srl_schedule="alternating", srl_period=3, actor_update_interval=1,
         target_update_interval=100,
     ).learn(10)  # fmt: skip
-    model.train(1, batch_size=8)  # the one that updates the targets
-    for n_updates in range(1, 13):
+    model.train(4, batch_size=8)  # among them those that update the targets
+    for n_updates in range(4, 16):
         names = moved(model, lambda: model.train(1, batch_size=8))
         if n_updates // 3 % 2 == 0:
             assert names == {"encoder", "srl"}
@@ -317,7 +317,7 @@ def test_random_second_actor_is_uniform() -> None:
     """``curiosity="random"``: uniform within the bounds of the actions, and nothing is trained for it."""
     env = RecordingBox(low=-1.0, high=3.0)
     model = acting_model(env, curiosity="random", curiosity_prob=1.0)
-    assert model.policy.curious.actor is None
+    assert model.policy.curious is None
     model.learn(500)
     actions = np.array(env.actions[10:]).ravel()
     counts, _ = np.histogram(actions, bins=8, range=(-1, 3))
@@ -338,7 +338,7 @@ def test_random_second_actor_mixes() -> None:
 def test_bonus_has_one_actor() -> None:
     """``curiosity="bonus"``: there is no second actor, whatever p_c is."""
     model = acting_model(PixelBox(), curiosity="bonus", curiosity_prob=1.0)
-    assert model.policy.curious.actor is None
+    assert model.policy.curious is None
     model.learn(20)
     np.testing.assert_allclose(stored_actions(model)[10:], -1, atol=1e-3)
 
@@ -649,10 +649,11 @@ def test_metrics_are_means_between_dumps(monkeypatch: pytest.MonkeyPatch) -> Non
     recorded: dict[str, list[float]] = {}
     record = Metrics.record
 
-    def spy(self: Metrics, logger: Logger, values: dict[str, th.Tensor]) -> None:
+    def spy(self: Metrics, values: dict[str, th.Tensor], agent: str = "task") -> None:
         for key, value in values.items():
-            recorded.setdefault(key, []).append(float(value.detach()))
-        record(self, logger, values)
+            prefix = "train/" if agent == "task" else f"train/{agent}_"
+            recorded.setdefault(prefix + key, []).append(float(value.detach()))
+        record(self, values, agent)
 
     monkeypatch.setattr(Metrics, "record", spy)
     means: list[dict[str, float]] = []
@@ -685,10 +686,10 @@ def test_metrics_of_models_that_share_a_logger() -> None:
         model = tiny_model("MlpPolicy", VectorBox(), seed=seed)
         model.set_logger(logger)
         recorded = []
-        write = model._log
-        model._log = lambda values, recorded=recorded, write=write: (recorded.append(values), write(values))
+        record = model._metrics.record
+        model._metrics.record = lambda values, *rest, all=recorded, record=record: (all.append(values), record(values, *rest))
         model.learn(35, log_interval=1)  # the last 15 updates are not written
-    losses = [float(values["train/srl_loss"].detach()) for values in recorded if "train/srl_loss" in values]
+    losses = [float(values["srl_loss"].detach()) for values in recorded if "srl_loss" in values]
     assert len(dumps.dumps) == 2
     assert dumps.dumps[1]["train/srl_loss"] == pytest.approx(np.mean(losses[:9]), rel=1e-5)
 

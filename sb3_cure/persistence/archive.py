@@ -129,7 +129,8 @@ class SavesModels(OffPolicyAlgorithm):
 
     def _stateful_parts(self) -> dict[str, Stateful]:
         """Objects with a state beside tensors and settings, such as a generator, by name: saved and resumed."""
-        return {}
+        parts: dict[str, Stateful] = getattr(super(), "_stateful_parts", dict)()
+        return parts
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule"]  # which set-up makes of learning_rate

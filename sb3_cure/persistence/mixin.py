@@ -34,6 +34,10 @@ class Persistence(SavesModels, SavesReplayBuffers):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_run", "_call_name"]
 
+    def _before_checkpoint(self) -> None:
+        """Finish what is under way, and raise if the model must not be kept."""
+        getattr(super(), "_before_checkpoint", lambda: None)()
+
     @classmethod
     def resume(
         cls: type[Self],
