@@ -118,8 +118,8 @@ class PixelBox(VectorBox):
         self.frames = list(state["frames"])
 
 
-def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
-    """The smallest CuReSAC that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
+def tiny_model(policy: str, env: Any, algorithm: type[CuReSAC] = CuReSAC, **kwargs: Any) -> CuReSAC:
+    """The smallest model that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
 
     Networks are tiny unless ``policy_kwargs`` says otherwise. What SB3's SAC takes under its name has its meaning.
     """
@@ -134,7 +134,7 @@ def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
     )
     defaults.update(kwargs)
     defaults["policy_kwargs"] = {**policy_kwargs, **kwargs.get("policy_kwargs", {})}
-    return CuReSAC(policy, env, **defaults)
+    return algorithm(policy, env, **defaults)
 
 
 def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
