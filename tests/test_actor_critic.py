@@ -157,7 +157,12 @@ def test_learning_rate_reaches_every_optimiser(factor: float) -> None:
 def test_temperature_without_a_model() -> None:
     """An agent by itself: a learned or a fixed one, as SB3 reads ``ent_coef``."""
     policy = tiny_model("MlpPolicy", VectorBox(), curiosity=None).policy
-    for ent_coef, start, learned in (("auto", 1.0, True), ("auto_0.25", 0.25, True), (0.5, 0.5, False), ("0.5", 0.5, False)):
+    for ent_coef, start, learned in (
+        ("auto", 1.0, True),
+        ("auto_0.25", 0.25, True),
+        (0.5, 0.5, False),
+        ("0.5", 0.5, False),
+    ):
         agent = ActorCritic(policy.actor, policy.critic)
         agent.set_temperature(ent_coef, 1e-3, th.device("cpu"))
         assert float(agent.temperature()) == pytest.approx(start)

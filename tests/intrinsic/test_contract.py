@@ -190,7 +190,9 @@ def test_networks_begin_alike_under_every_reward() -> None:
         assert all(th.equal(value, state[name]) for name, value in states[0].items())
 
 
-@pytest.mark.parametrize("intrinsic", ["novelty", nn.Linear, Forward(VectorBox().observation_space, VectorBox().action_space, 8)])
+@pytest.mark.parametrize(
+    "intrinsic", ["novelty", nn.Linear, Forward(VectorBox().observation_space, VectorBox().action_space, 8)]
+)
 def test_unknown_reward_is_refused(intrinsic: Any) -> None:
     with pytest.raises(ValueError, match="intrinsic"):
         tiny_model("MlpPolicy", VectorBox(), intrinsic=intrinsic)

@@ -47,7 +47,9 @@ def test_standardised_reward_against_float64(
     exact = [batch.astype(np.float64) for batch in batches]
     deviation = np.sqrt(running([np.var(b) if center else np.mean(b**2) for b in exact], decay))
     mean = exact[-1].mean() if center else 0
-    np.testing.assert_allclose(actual, beta * np.clip((exact[-1] - mean) / deviation, -clip, clip), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        actual, beta * np.clip((exact[-1] - mean) / deviation, -clip, clip), rtol=1e-3, atol=1e-4
+    )
 
 
 def test_rewards_are_centred_while_errors_fall() -> None:
@@ -93,7 +95,9 @@ def test_without_normalisation_the_reward_is_the_papers(beta: float, center: boo
         scaled(scale, batch)
     errors = np.float32([0.0, 1e-3, 7.0, 4e4])
     before = {name: value.clone() for name, value in scale.state_dict().items()}
-    np.testing.assert_array_equal(scaled(scale, errors, beta, normalize=False, center=center), np.float32(beta) * errors)
+    np.testing.assert_array_equal(
+        scaled(scale, errors, beta, normalize=False, center=center), np.float32(beta) * errors
+    )
     assert all(th.equal(value, before[name]) for name, value in scale.state_dict().items())
 
 
