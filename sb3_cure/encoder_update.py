@@ -157,16 +157,22 @@ class EncoderUpdate:
         if not self._pulls:
             return
         losses: dict[str, th.Tensor] = {}
+        trained = [parameter for parameter in self.encoder.parameters() if parameter.requires_grad]
+        measures = self._n_updates % SHARE_INTERVAL == 0 and bool(trained)
         for source, pulls in self._pulls.items():
             for latents, gradient in pulls:  # the gradient of (latents * g).sum() at the latents is g
                 losses[source] = losses.get(source, 0) + (latents * gradient).sum()
-            if self._n_updates % SHARE_INTERVAL == 0:
-                moved = th.autograd.grad(losses[source], list(self.encoder.parameters()), retain_graph=True)
+            if measures and self.mode == "joint":
+                moved = th.autograd.grad(losses[source], trained, retain_graph=True, materialize_grads=True)
                 self._sizes[source] = th.stack(th._foreach_norm(moved)).norm()
         optimizer = self.optimizers["joint" if self.mode == "joint" else source]
         factor = len(losses) ** 0.5 if self.mode == "joint" else 1.0
         update_learning_rate(optimizer, self.learning_rate * factor)
+        before = [p.detach().clone() for p in trained] if measures and self.mode == "sequential" else []
         optimize("encoder", th.stack(list(losses.values())).sum(), optimizer)
+        if before:  # each source has an Adam, whose step is not as long as the gradient
+            with th.no_grad():
+                self._sizes[source] = th.stack(th._foreach_norm(th._foreach_sub(trained, before))).norm()
         self._pulls, self._runs = {}, {}
 
     def end(self) -> dict[str, th.Tensor]:

@@ -103,8 +103,10 @@ class Pretraining(CuRe):
         policy.to(self.device)
         if self._compiles:
             policy.compile_networks()
-        if self.curiosity_encoder_grad:
-            policy.encoder_update.add_source("curious")
+        update = policy.encoder_update
+        for source in self._policy_choices()["encoder_sources"]:
+            if source not in update.mean_squares:
+                update.add_source(source)
         self._setup_temperatures()
 
     def _end_pretraining(self) -> None:
@@ -114,9 +116,11 @@ class Pretraining(CuRe):
         self.task, self.curiosity = self._before_pretraining["task"], self._before_pretraining["curiosity"]
         self._before_pretraining = None
         if policy.curious is not None and not self._has_curious_agent:
-            policy.curious = policy.intrinsic = None
-            if self.curiosity_encoder_grad:
-                policy.encoder_update.remove_source("curious")
+            policy.curious = None
+            if self.curiosity != "bonus":  # which has the reward, too
+                policy.intrinsic = None
+            for source in policy.encoder_update.mean_squares.keys() - set(self._policy_choices()["encoder_sources"]):
+                policy.encoder_update.remove_source(source)
         policy.default_agent = self._policy_choices()["default_agent"]
         self.replay_buffer.reset()  # type: ignore[union-attr]
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0

@@ -120,8 +120,8 @@ class PixelBox(VectorBox):
         self.frames = list(state["frames"])
 
 
-def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
-    """The smallest CuReSAC that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
+def tiny_model(policy: str, env: Any, algorithm: type[CuReSAC] = CuReSAC, **kwargs: Any) -> CuReSAC:
+    """The smallest model that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
 
     Networks are tiny unless ``policy_kwargs`` says otherwise. What SB3's SAC takes under its name has its meaning.
     """
@@ -136,7 +136,7 @@ def tiny_model(policy: str, env: Any, **kwargs: Any) -> CuReSAC:
     )
     defaults.update(kwargs)
     defaults["policy_kwargs"] = {**policy_kwargs, **kwargs.get("policy_kwargs", {})}
-    return CuReSAC(policy, env, **defaults)
+    return algorithm(policy, env, **defaults)
 
 
 def samples_of(model: CuReSAC, batch_size: int) -> Samples:

@@ -11,12 +11,12 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.layers import conv_sizes
+from sb3_cure.layers import conv_sizes, preprocess
 from sb3_cure.srl.autoencoder import PixelDecoder
 
 
@@ -100,7 +100,7 @@ def test_delta_orthogonal_initialisation(module: nn.Module) -> None:
 def test_actors_and_critics_are_initialised_alike() -> None:
     """Orthogonal linear maps and zero biases in both agents (SAC-AE), not torch's default."""
     policy = tiny_model("CnnPolicy", PixelBox()).policy
-    for network in (policy.actor, policy.critic, policy.curious_actor, policy.curious_critic):
+    for network in (policy.actor, policy.critic, policy.curious.actor, policy.curious.critic):
         layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
         assert len(layers) >= 4
         for layer in layers:
@@ -126,30 +126,22 @@ def test_smallest_image(height: int, width: int, n_layers: int) -> None:
 
 def test_an_image_that_is_too_small_is_refused_with_the_size_that_would_do() -> None:
     """The sentence names the smallest size, which works."""
-    with pytest.raises(
-        ValueError, match=r"14x20 pixels are too small for 4 convolutions .*at least 15x15: use a larger"
-    ):
+    with pytest.raises(ValueError, match=r"14x20 pixels are too small for 4 convolutions, which need at least 15x15"):
         PixelEncoder(image_space(3, 14, 20))
     space = image_space(3, 15, 20)
     assert PixelEncoder(space, n_filters=2)(images(space)).shape == (2, 50)
-
-
-@pytest.mark.parametrize("argument", ["features_dim", "n_filters", "n_layers"])
-def test_sizes_below_one_are_refused(argument: str) -> None:
-    with pytest.raises(ValueError, match=rf"{argument}=0.*each must be at least 1: change features_extractor_kwargs"):
-        PixelEncoder(image_space(), **{argument: 0})
 
 
 @pytest.mark.parametrize("features_dim", [1, 2])
 def test_too_few_latents_are_refused(features_dim: int) -> None:
     """LayerNorm makes 0 of one number, and of two their order: no observation would be told from another."""
     for make in (lambda **k: PixelEncoder(image_space(), **k), lambda **k: VectorEncoder(spaces.Box(-1, 1, (7,)), **k)):
-        with pytest.raises(ValueError, match=rf"features_dim is {features_dim}, .* use a features_dim of at least 3"):
+        with pytest.raises(ValueError, match=rf"features_dim is {features_dim}, .* use at least 3"):
             make(features_dim=features_dim)
 
 
 def test_pixel_encoder_refuses_vectors() -> None:
-    with pytest.raises(ValueError, match=r"shape \(7,\), but needs images .*: use 'MlpPolicy' for vectors"):
+    with pytest.raises(ValueError, match=r"shape \(7,\): use 'MlpPolicy' for vectors"):
         PixelEncoder(spaces.Box(-1, 1, (7,)))
 
 
@@ -201,7 +193,13 @@ class SumOfVector(BaseFeaturesExtractor):
     [
         ("CnnPolicy", PixelBox(), NatureCNN, {"features_dim": 16}, {"srl": "rae"}),
         ("CnnPolicy", PixelBox(), NatureCNN, {"features_dim": 16}, {"srl": "curl"}),
-        ("CnnPolicy", PixelBox(), MeanColour, {}, {"srl": "curl", "srl_kwargs": {"crop_size": 24}}),
+        (
+            "CnnPolicy",
+            PixelBox(),
+            MeanColour,
+            {},
+            {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 24}},
+        ),
         ("MlpPolicy", VectorBox(), SumOfVector, {}, {"srl": "rae"}),
     ],
     ids=["nature-rae", "nature-curl", "own-curl-crop", "own-vector"],
@@ -265,20 +263,21 @@ def test_log_probability_is_that_of_the_squashed_gaussian() -> None:
     mu, sigma = mean.double().numpy(), np.exp(log_std.double().numpy())
     gaussian = -0.5 * ((u - mu) / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2 * np.pi)
     expected = (gaussian - np.log(1 - np.tanh(u) ** 2)).sum(axis=1)
-    np.testing.assert_allclose(log_prob.numpy(), expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(log_prob[:, 0].numpy(), expected, rtol=1e-3, atol=1e-3)
 
 
 def test_bf16_stays_within_the_hidden_layers() -> None:
     """Under autocast hidden layers compute in bf16; latents, Q, log-probabilities, targets and losses are fp32."""
-    model = tiny_model("CnnPolicy", PixelBox(), precision="bf16")
+    model = tiny_model("CnnPolicy", PixelBox(), precision="bf16", policy_kwargs={"net_arch": [16, 16]})
     policy = model.policy
     observations = th.randint(256, (4, 6, 36, 36), dtype=th.uint8, generator=th.Generator().manual_seed(0))
-    batch = ReplayBufferSamples(observations, th.zeros(4, 2), observations, th.zeros(4, 1), th.zeros(4, 1))
+    zeros = th.zeros(4, 1)
+    batch = Samples(observations, th.zeros(4, 2), observations, zeros, zeros, views=observations)
     hidden: list[th.dtype] = []
     for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[0]):
         layer.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     for q_net in policy.critic.q_networks:
-        q_net[0].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
+        q_net[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     policy.srl.decoder.linear.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
 
     def compute() -> dict[str, th.Tensor]:
@@ -291,7 +290,7 @@ def test_bf16_stays_within_the_hidden_layers() -> None:
         loss, error = policy.srl.loss(batch, latents)
         own = policy.actor.features_extractor(features)
         actor = {"own": own, "actions": actions, "log_prob": log_prob, "mean": mean, "log_std": log_std}
-        return {**actor, "latents": latents, "q0": q_values[0], "q1": q_values[1], "loss": loss, "error": error}
+        return {**actor, "latents": latents, "q": q_values, "loss": loss, "error": error}
 
     with th.no_grad(), model._autocast():
         halves = compute()
@@ -304,6 +303,43 @@ def test_bf16_stays_within_the_hidden_layers() -> None:
         if name not in ("loss", "error"):
             th.testing.assert_close(value, full[name], rtol=0.05, atol=0.05)
     assert {parameter.dtype for parameter in policy.parameters()} == {th.float32}
+
+
+@pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_preprocessing_leaves_its_input_alone(channels: int, memory_format: th.memory_format) -> None:
+    """Also of floats, which a caller may still own."""
+    space = image_space(channels, 20)
+    given = th.full((2, channels, 20, 20), 200.0).contiguous(memory_format=memory_format)
+    scaled = preprocess(given, space)
+    assert (given == 200).all() and scaled.max() == th.tensor(200.0) / 255
+
+
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_pretrained_extractor_may_be_frozen(update: str) -> None:
+    """Its parameters stay, everything that reads its features learns."""
+
+    class Frozen(SumOfVector):
+        def __init__(self, observation_space: spaces.Space):
+            super().__init__(observation_space)
+            self.requires_grad_(False)
+
+    model = tiny_model(
+        "MlpPolicy",
+        VectorBox(),
+        update=update,
+        policy_kwargs={"features_extractor_class": Frozen, "features_extractor_kwargs": {}},
+    )
+    policy = model.policy
+    modules = {"encoder": policy.encoder, "head": policy.srl, "critic": policy.critic, "actor": policy.actor}
+    before = {name: [p.detach().clone() for p in module.parameters()] for name, module in modules.items()}
+    model.learn(13)
+    changed = {
+        name
+        for name, module in modules.items()
+        if not all(th.equal(a, b) for a, b in zip(before[name], module.parameters(), strict=True))
+    }
+    assert changed == {"head", "critic", "actor"}
 
 
 def test_bf16_and_fp32_train_alike() -> None:

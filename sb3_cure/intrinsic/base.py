@@ -78,13 +78,14 @@ class RewardScale(nn.Module):
         :param reward: Raw reward of each sample, [B]
         :param beta: Factor of the reward, beta in the paper
         :param normalize: Whether to standardise; False is the paper's letter
-        :param center: Whether the mean is subtracted when standardising; not for a bonus on top of a task's reward,
-            which would make long episodes neither better nor worse
+        :param center: Whether the mean is subtracted when standardising. Not for a bonus on top of a task's reward,
+            which would make long episodes neither better nor worse: it is divided by its root mean square, as in
+            units of its deviation an error that varies little would be clipped to a constant
         :return: Scaled reward, [B, 1]
         """
         if normalize:
             mean = reward.mean()
-            variance = (reward - mean).square().mean()
+            variance = (reward - mean if center else reward).square().mean()
             # A spread below a thousandth of the rewards' size is rounding: rewards that are all alike earn nothing.
             variance = th.maximum(variance, 1e-6 * reward.square().mean())
             finite = variance.isfinite()

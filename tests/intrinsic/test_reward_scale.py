@@ -1,0 +1,171 @@
+"""How an intrinsic reward is scaled: minus the batch's mean, divided by a debiased running deviation, times beta."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_cure.intrinsic import RewardScale
+
+ERRORS = st.lists(st.lists(st.floats(0, 1e9, width=32), min_size=1, max_size=6), min_size=1, max_size=20)
+
+
+def error_batches(n: int, size: int = 16, seed: int = 0) -> list[np.ndarray]:
+    """Errors as an autoencoder's: falling from 1e-1 towards 1e-3 while it learns."""
+    rng = np.random.default_rng(seed)
+    return [((1e-3 + 1e-1 * 0.95**i) * rng.gamma(2.0, size=size)).astype(np.float32) for i in range(n)]
+
+
+def scaled(
+    scale: RewardScale, batch: np.ndarray, beta: float = 1.0, normalize: bool = True, center: bool = True
+) -> np.ndarray:
+    reward = scale(th.as_tensor(batch), beta, normalize, center)
+    assert reward.shape == (len(batch), 1)
+    return reward[:, 0].numpy()
+
+
+def running(numbers: Sequence[float], decay: float) -> float:
+    """Mean under exponentially falling weights that add up to 1."""
+    weights = decay ** np.arange(len(numbers) - 1, -1, -1.0)
+    return float(np.average(numbers, weights=weights))
+
+
+@pytest.mark.parametrize("center", [True, False])
+@pytest.mark.parametrize("n_batches", [1, 2, 30, 400])
+@pytest.mark.parametrize("beta, clip, decay", [(1.0, 5.0, 0.99), (0.3, 0.5, 0.9)])
+def test_standardised_reward_against_float64(
+    n_batches: int, beta: float, clip: float, decay: float, center: bool
+) -> None:
+    """From the very first batch on, i.e. without the bias of averages that start at zero."""
+    scale, batches = RewardScale(decay, clip), error_batches(n_batches)
+    for batch in batches:
+        actual = scaled(scale, batch, beta, center=center)
+    exact = [batch.astype(np.float64) for batch in batches]
+    deviation = np.sqrt(running([np.var(b) if center else np.mean(b**2) for b in exact], decay))
+    mean = exact[-1].mean() if center else 0
+    np.testing.assert_allclose(
+        actual, beta * np.clip((exact[-1] - mean) / deviation, -clip, clip), rtol=1e-3, atol=1e-4
+    )
+
+
+def test_rewards_are_centred_while_errors_fall() -> None:
+    """By the mean of the batch: a running one lags behind, so that learning would look like punishment."""
+    scale, means = RewardScale(clip=1e9), []
+    for batch in error_batches(600, size=64):
+        means.append(scaled(scale, batch).mean())
+    assert np.abs(means).max() < 1e-3
+
+
+def test_bonus_is_scaled_but_never_negative() -> None:
+    """Its mean stays positive, its size is of order beta, and the order of errors of a batch is kept."""
+    scale = RewardScale()
+    for batch in error_batches(50):
+        bonus = scaled(scale, batch, beta=2.0, center=False)
+        assert bonus.min() > 0 and 0.1 < bonus.mean() < 10
+        assert np.array_equal(bonus.argsort(), batch.argsort()) or bonus.max() == 10
+
+
+def test_bonus_tells_errors_apart_that_vary_little() -> None:
+    """An untrained autoencoder's, of which the deviation is a fortieth of the mean."""
+    errors = np.float32(0.07) + np.linspace(-1, 1, 16, dtype=np.float32) * np.float32(2e-3)
+    bonus = scaled(RewardScale(), errors, center=False)
+    assert (np.diff(bonus) > 0).all() and bonus.mean() == pytest.approx(1, rel=0.01)
+
+
+@pytest.mark.parametrize("beta", [0.0, 1.0, 2.5])
+def test_outliers_are_clipped_at_five_deviations(beta: float) -> None:
+    """By default to +-5, before beta scales."""
+    scale = RewardScale()
+    for _ in range(200):
+        scaled(scale, error_batches(1)[0])
+    batch = np.concatenate([error_batches(1)[0], np.float32([1e4])])
+    assert scaled(scale, batch, beta).max() == 5 * beta
+
+
+@pytest.mark.parametrize("center", [True, False])
+@pytest.mark.parametrize("beta", [0.0, 1.0, 0.37])
+def test_without_normalisation_the_reward_is_the_papers(beta: float, center: bool) -> None:
+    """Exactly beta times the error, whatever was seen before, and large errors are not clipped."""
+    scale = RewardScale()
+    for batch in error_batches(3):
+        scaled(scale, batch)
+    errors = np.float32([0.0, 1e-3, 7.0, 4e4])
+    before = {name: value.clone() for name, value in scale.state_dict().items()}
+    np.testing.assert_array_equal(
+        scaled(scale, errors, beta, normalize=False, center=center), np.float32(beta) * errors
+    )
+    assert all(th.equal(value, before[name]) for name, value in scale.state_dict().items())
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-9, 1.7e-3, np.log(128), 7.3e4])
+@pytest.mark.parametrize("n_batches", [1, 300])
+@pytest.mark.parametrize("size", [1, 128])
+def test_constant_errors_are_worth_nothing(error: float, n_batches: int, size: int) -> None:
+    """Where all errors are equal nothing is novel: the reward is 0, not NaN, nor rounding errors blown up to +-5."""
+    scale, errors = RewardScale(), np.full(size, error, np.float32)
+    for _ in range(n_batches):
+        rewards = scaled(scale, errors)
+    assert np.isfinite(rewards).all()
+    assert np.abs(rewards).max() < 0.01
+
+
+@given(ERRORS, st.floats(0, 10), st.booleans())
+@settings(deadline=None)
+def test_rewards_are_always_finite_and_bounded(batches: list[list[float]], beta: float, center: bool) -> None:
+    """Whatever finite errors came, and in the order of the errors of a batch."""
+    scale = RewardScale()
+    for batch in batches:
+        errors = np.float32(batch)
+        rewards = scaled(scale, errors, beta, center=center)
+        assert np.isfinite(rewards).all()
+        assert np.abs(rewards).max() <= 5 * beta * (1 + 1e-6)
+        assert (np.diff(rewards[errors.argsort()]) >= 0).all()
+
+
+def test_broken_errors_leave_the_statistics_alone() -> None:
+    """On a GPU what is not finite is noticed later; the average must not remember it."""
+    scale = RewardScale()
+    scaled(scale, error_batches(1)[0])
+    before = {name: value.clone() for name, value in scale.state_dict().items()}
+    scaled(scale, np.float32([1.0, np.nan, np.inf]))
+    assert all(th.equal(value, before[name]) for name, value in scale.state_dict().items())
+
+
+def test_errors_are_only_read() -> None:
+    errors = th.tensor([1.0, 2.0, 4.0], requires_grad=True)
+    assert not RewardScale()(errors, 1.0, True, True).requires_grad
+    assert errors.tolist() == [1.0, 2.0, 4.0]
+
+
+def test_statistics_travel_in_the_state_dict() -> None:
+    """A restored module pays the same reward, and goes on with the same averages."""
+    first, second = RewardScale(), RewardScale()
+    for batch in error_batches(20):
+        scaled(first, batch)
+    second.load_state_dict(first.state_dict())
+    for seed in (1, 2):
+        (later,) = error_batches(1, seed=seed)
+        expected = scaled(first, later)
+        np.testing.assert_array_equal(scaled(second, later), expected)
+        assert not np.array_equal(scaled(RewardScale(), later), expected)
+
+
+def test_statistics_belong_to_the_policy() -> None:
+    """They are part of the policy's state, and every update of the curious agent moves them."""
+    model = tiny_model("MlpPolicy", VectorBox()).learn(15)
+    state = model.policy.state_dict()
+    assert float(state["scale.weight"]) == pytest.approx(1 - 0.99**model._n_updates, rel=1e-4)
+    assert float(state["scale.variance"]) > 0
+
+
+@pytest.mark.parametrize("curiosity, centred", [("separate", True), ("bonus", False)])
+def test_the_agents_reward_is_centred_the_bonus_is_not(curiosity: str, centred: bool) -> None:
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, curiosity_beta=0.5).learn(20)
+    logged = {name: float(value) for name, value in model._metrics.latest.items()}
+    mean, spread = logged["train/curious_reward_mean"], logged["train/curious_reward_std"]
+    assert spread > 0
+    assert abs(mean) < 1e-3 if centred else 0.25 < mean < 1

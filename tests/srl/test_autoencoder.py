@@ -1,0 +1,315 @@
+"""The autoencoder: loss against straight-line code, errors without noise, shapes, and a fit on real frames."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from srl_for_tests import batch_of, image_space, make, noise_images, randomise, seeded
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_cure import make_dmc_env
+from sb3_cure.encoders import PixelEncoder, VectorEncoder
+from sb3_cure.srl import RAE, get_srl_class
+
+# ---------------------------------------------------------------- the autoencoder's loss
+
+
+@pytest.mark.parametrize("bits", [1, 3, 5, 8])
+def test_dithered_target(bits: int) -> None:
+    """Each pixel is cut to its highest bits and moved by uniform noise within that step; scaled to [-0.5, 0.5]."""
+    space = image_space()
+    _, head = make(RAE, space, bits=bits)
+    observations = noise_images(space, 32)
+    width = 256 // 2**bits
+    steps = np.floor(observations.numpy() / width)
+    th.manual_seed(0)
+    target = head.target(observations, dither=True)
+    assert target.dtype == th.float32
+    dither = (target.double().numpy() + 0.5) * 2**bits - steps
+    assert dither.min() > -1e-4 and dither.max() < 1 + 1e-4
+    # Uniform: mean 1/2, variance 1/12, every tenth equally likely; five standard deviations.
+    n = dither.size
+    assert abs(dither.mean() - 0.5) < 5 / np.sqrt(12 * n)
+    assert dither.var() == pytest.approx(1 / 12, rel=0.01)
+    counts, _ = np.histogram(dither, bins=10, range=(0, 1))
+    # The noise has 256 levels, of which a tenth of the range holds 25 or 26.
+    assert np.abs(counts - n / 10).max() < 0.025 * n / 10 + 5 * np.sqrt(0.09 * n)
+    # Independent from pixel to pixel, of the pixel itself, and from draw to draw.
+    again = (head.target(observations, dither=True).double().numpy() + 0.5) * 2**bits - steps
+    pairs = [(dither[..., 1:], dither[..., :-1]), (dither, observations.numpy()), (dither, again)]
+    for first, second in pairs:
+        assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 5 / np.sqrt(first.size)
+
+
+@pytest.mark.parametrize("bits", [1, 5, 8])
+def test_undithered_target_is_the_mean_of_the_dithered(bits: int) -> None:
+    """(floor(o / width) + 1/2) / 2^bits - 1/2, where the dither would average out."""
+    space = image_space()
+    _, head = make(RAE, space, bits=bits)
+    observations = noise_images(space)
+    expected = (np.floor(observations.numpy() / 2.0 ** (8 - bits)) + 0.5) / 2.0**bits - 0.5
+    np.testing.assert_allclose(head.target(observations, dither=False).numpy(), expected, rtol=0, atol=1e-6)
+    mean = th.stack([head.target(observations, dither=True) for _ in range(400)]).mean(dim=0).numpy()
+    # A mean of 400 dithers, at 62000 pixels: six standard deviations.
+    assert np.abs(mean - expected).max() < 6 / np.sqrt(12 * 400) / 2**bits
+
+
+@pytest.mark.parametrize("latent_penalty", [1e-6, 0.3])
+def test_rae_loss_against_straight_line_code(latent_penalty: float) -> None:
+    """Eq. 2 as meant: mean squared error of each image + lambda_z * mean of half the squared norm of the latents."""
+    space = image_space()
+    encoder, head = make(RAE, space, latent_penalty=latent_penalty)
+    randomise(head)
+    batch = batch_of(noise_images(space))
+    latents = encoder(head.preprocess(batch.observations))
+    th.manual_seed(3)
+    target = head.target(batch.observations, dither=True).numpy()
+    th.manual_seed(3)
+    loss, error = head.loss(batch, latents)
+    drawn, z = head.decoder(latents).detach().double().numpy(), latents.detach().double().numpy()
+    expected = [np.mean((drawn[i] - target[i]) ** 2) for i in range(8)]
+    assert error.shape == (8,)
+    assert not error.requires_grad and loss.requires_grad
+    np.testing.assert_allclose(error.numpy(), expected, rtol=1e-5)
+    penalty = np.mean([0.5 * np.dot(z[i], z[i]) for i in range(8)])
+    assert float(loss.detach()) == pytest.approx(np.mean(expected) + latent_penalty * penalty, rel=1e-5)
+
+
+def test_rae_defaults_are_sac_aes() -> None:
+    """5 bits, latent penalty 1e-6, decoder weight decay 1e-7, and 1000 updates after the warm-up."""
+    space = image_space()
+    encoder, head = make(RAE, space)
+    batch = batch_of(noise_images(space))
+    latents = encoder(head.preprocess(batch.observations)).detach()
+    loss, error = head.loss(batch, latents)
+    penalty = 0.5 * float((latents**2).sum(dim=1).mean())
+    # The latents of a LayerNorm have a penalty of the order of their number, hence well above rounding.
+    assert float((loss - error.mean()).detach()) == pytest.approx(1e-6 * penalty, rel=0.05)
+    levels = head.target(th.arange(256, dtype=th.uint8).view(1, 1, 16, 16), dither=False).unique()
+    assert len(levels) == 32
+    assert get_srl_class("rae").warmup_updates == 1000
+    assert get_srl_class("curl").warmup_updates == 0
+
+
+@pytest.mark.parametrize("weight_decay", [0.0, 0.5])
+def test_weight_decay_is_the_decoders_alone(weight_decay: float) -> None:
+    """lambda_theta acts through the optimiser of the head: L2 on the decoder's weights, none on the encoder's."""
+    kwargs = {"srl_kwargs": {"decoder_weight_decay": weight_decay, "latent_penalty": 0.0}, "curiosity": None}
+    policy_kwargs = {"optimizer_class": th.optim.SGD}
+    model = tiny_model("CnnPolicy", PixelBox(), learning_rate=0.1, policy_kwargs=policy_kwargs, **kwargs)
+    policy = model.policy
+    assert policy.srl.optimizer.param_groups[0]["weight_decay"] == weight_decay
+    optimizers = [*policy.encoder_update.optimizers.values(), policy.critic.optimizer, policy.actor.optimizer]
+    assert all(group["weight_decay"] == 0 for optimizer in optimizers for group in optimizer.param_groups)
+    before = [parameter.detach().clone() for parameter in policy.srl.parameters()]
+    policy.srl.optimizer.zero_grad()
+    batch = batch_of(noise_images(model.observation_space))
+    policy.srl.loss(batch, policy.encode(batch.observations)).loss.backward()
+    gradients = [parameter.grad.clone() for parameter in policy.srl.parameters()]
+    policy.srl.optimizer.step()
+    for parameter, old, gradient in zip(policy.srl.parameters(), before, gradients, strict=True):
+        th.testing.assert_close(parameter.detach(), old - 0.1 * (gradient + weight_decay * old))
+
+
+# ---------------------------------------------------------------- the autoencoder's error
+
+
+class Draw(th.nn.Module):
+    """A decoder that draws what it was told to, whatever the latents."""
+
+    def __init__(self, images: th.Tensor):
+        super().__init__()
+        self.images = images
+
+    def forward(self, latents: th.Tensor) -> th.Tensor:
+        return self.images.expand(len(latents), -1, -1, -1)
+
+
+def test_rae_error_has_no_noise() -> None:
+    """A perfect reconstruction scores 0, where the training loss keeps the dither's variance; it repeats."""
+    space = image_space()
+    _, head = make(RAE, space)
+    batch, latents = batch_of(noise_images(space)), th.zeros(8, 7)
+    perfect = (th.div(batch.observations, 8, rounding_mode="floor") + 0.5) / 32 - 0.5
+    head.decoder = Draw(perfect)
+    assert float(head.error(batch, latents).max()) < 1e-12
+    assert float(head.loss(batch, latents).error.mean()) == pytest.approx(1 / 12 / 32**2, rel=0.02)
+    head.decoder = Draw(perfect + 0.1 * th.arange(8).view(8, 1, 1, 1))
+    errors = head.error(batch, latents)
+    assert not errors.requires_grad
+    np.testing.assert_allclose(errors.numpy(), (0.1 * np.arange(8)) ** 2, atol=1e-6)
+    assert th.equal(errors, head.error(batch, latents))
+
+
+def test_rae_reconstructions_are_images() -> None:
+    """What is drawn, back in 0-255: a perfect reconstruction is the observation up to its lost bits."""
+    space = image_space()
+    _, head = make(RAE, space)
+    observations = noise_images(space)
+    head.decoder = Draw(head.target(observations, dither=False))
+    drawn = head.reconstruct(th.zeros(8, 7))
+    assert drawn.dtype == th.uint8
+    assert int((drawn.int() - observations.int()).abs().max()) <= 4
+    head.decoder = Draw(th.tensor([-9.0, 9.0]).view(2, 1, 1, 1).expand(2, *space.shape))
+    assert head.reconstruct(th.zeros(2, 7)).flatten(1).unique(dim=1).tolist() == [[0], [255]]
+
+
+@pytest.mark.parametrize("height, width", [(84, 84), (36, 36), (45, 45), (37, 50)])
+@pytest.mark.parametrize("frames, colours", [(1, 1), (3, 1), (2, 3)])
+@pytest.mark.parametrize("n_layers", [1, 4])
+def test_decoder_draws_what_the_encoder_sees(height: int, width: int, frames: int, colours: int, n_layers: int) -> None:
+    """Any size, number of frames, RGB or grey, number of layers: same shape, same number of channels inside."""
+    space = image_space(frames * colours, height, width)
+    encoder = PixelEncoder(space, features_dim=5, n_filters=3, n_layers=n_layers)
+    head = RAE(encoder, space)
+    batch = batch_of(noise_images(space, 2))
+    latents = encoder(head.preprocess(batch.observations))
+    assert head.decoder(latents).shape == (2, *space.shape)
+    assert head.reconstruct(latents).shape == (2, *space.shape)
+    kernels = [tuple(p.shape) for p in head.decoder.parameters() if p.dim() == 4]
+    assert kernels == [(3, 3, 3, 3)] * (n_layers - 1) + [(3, frames * colours, 3, 3)]
+    with th.no_grad():
+        # Positive throughout, so that no ReLU hides anything: the whole picture depends on the latents.
+        for parameter in head.decoder.parameters():
+            parameter.uniform_(0, 0.5, generator=seeded(parameter.numel()))
+        first, second = head.decoder(th.rand(2, 5, generator=seeded(0)))
+    # (As in SAC-AE, the last row and column of an even size are beyond the reach of a stride of 2 from either side.)
+    reach = [size - 1 + size % 2 for size in (height, width)]
+    assert bool((first != second)[:, : reach[0], : reach[1]].all())
+
+
+@given(st.integers(1, 5), st.integers(0, 30), st.integers(0, 30), st.integers(1, 2))
+@settings(deadline=None, max_examples=50)
+def test_decoder_shapes(n_layers: int, extra_height: int, extra_width: int, channels: int) -> None:
+    """From the smallest image that the encoder takes."""
+    space = image_space(channels, 4 * n_layers - 1 + extra_height, 4 * n_layers - 1 + extra_width)
+    encoder = PixelEncoder(space, features_dim=3, n_filters=2, n_layers=n_layers)
+    latents = encoder(th.rand(1, *space.shape))
+    assert RAE(encoder, space).decoder(latents).shape == (1, *space.shape)
+
+
+def test_vector_autoencoder() -> None:
+    """Vectors are drawn as they are: no bits, no dither; error per sample, and a fit that learns them."""
+    space = spaces.Box(-3, 3, (5,), np.float32)
+    th.manual_seed(0)
+    encoder = VectorEncoder(space, features_dim=8, hidden_dim=32)
+    head = RAE(encoder, space, latent_penalty=0.0)
+    observations = th.rand(64, 5, generator=seeded(0)) * 6 - 3
+    batch = batch_of(observations)
+    latents = encoder(observations)
+    loss, error = head.loss(batch, latents)
+    assert error.shape == (64,) and not error.requires_grad
+    expected = ((head.decoder(latents).detach() - observations) ** 2).mean(dim=1)
+    th.testing.assert_close(error, expected)
+    th.testing.assert_close(loss.detach(), expected.mean())
+    assert th.equal(head.error(batch, latents), error)
+    assert head.reconstruct(latents).shape == (64, 5)
+    optimizer = th.optim.Adam([*encoder.parameters(), *head.parameters()], lr=3e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        head.loss(batch, encoder(observations)).loss.backward()
+        optimizer.step()
+    variance = float(((observations - observations.mean(dim=0)) ** 2).mean())
+    assert float(head.error(batch, encoder(observations)).mean()) < 0.2 * variance
+
+
+@pytest.mark.parametrize("augmentation", ["shift", "crop"])
+def test_decoder_is_to_draw_the_views(augmentation: str) -> None:
+    """What the encoder saw, not the stored images: a perfect drawing of the views has no error."""
+    kwargs: dict[str, Any] = {"augmentation_kwargs": {"size": 28}} if augmentation == "crop" else {}
+    model = tiny_model("CnnPolicy", PixelBox(), augmentation=augmentation, curiosity=None, **kwargs)
+    policy = model.policy
+    head: Any = policy.srl
+    observations = noise_images(model.observation_space, 8)  # type: ignore[arg-type]
+    views = policy.augmentation(observations)
+    latents = policy.encoder(policy.preprocess(views))
+    assert head.reconstruct(latents).shape == views.shape == (8, *policy.augmentation.view_space.shape)
+    head.decoder = Draw(head.target(views, dither=False))
+    assert float(head.error(batch_of(observations, views), latents).max()) < 1e-12
+    assert float(head.error(batch_of(observations, views.roll(1, 0)), latents).min()) > 1e-3
+    assert float(head.loss(batch_of(observations, views), latents).error.max()) < 1e-3
+
+
+@pytest.mark.parametrize("bits", [0, 9])
+def test_bits_of_a_pixel_are_one_to_eight(bits: int) -> None:
+    """Otherwise the target would be noise alone, or images that were never seen."""
+    with pytest.raises(ValueError, match="bits is"):
+        make(RAE, image_space(), bits=bits)
+
+
+def test_vector_autoencoder_trains_in_the_agent() -> None:
+    """``MlpPolicy`` trains it like any head."""
+    model = tiny_model("MlpPolicy", VectorBox())
+    before = {name: value.clone() for name, value in model.policy.srl.state_dict().items()}  # type: ignore[union-attr]
+    model.learn(13)
+    after = model.policy.srl.state_dict()  # type: ignore[union-attr]
+    assert all(not th.equal(before[key], after[key]) for key in before)
+
+
+# ---------------------------------------------------------------- real frames
+
+
+@pytest.fixture(scope="module")
+def frames() -> th.Tensor:
+    """Single frames of finger-spin under random actions, [400, 3, 36, 36]: 20 short episodes, one after the other."""
+    env = make_dmc_env("finger", "spin", image_size=36, frame_stack=1, seed=0)
+    env.action_space.seed(0)
+    collected = [env.reset()[0]]
+    while len(collected) < 400:
+        episode_ends = len(collected) % 20 == 0
+        collected.append(env.reset()[0] if episode_ends else env.step(env.action_space.sample())[0])
+    env.close()
+    return th.as_tensor(np.array(collected))
+
+
+def test_rae_learns_to_draw_real_frames(frames: th.Tensor) -> None:
+    """On frames of episodes that it has not seen its error falls well below that of the mean image.
+
+    A decoder that draws the same background whatever the latents cannot pass: not even if its picture is the mean of
+    the very frames on which it is judged.
+    """
+    train, held_out = frames[:300], frames[300:]
+    model = tiny_model(
+        "CnnPolicy",
+        PixelBox(frame_stack=1),
+        srl="rae",
+        curiosity=None,
+        srl_schedule="alternating",
+        srl_period=10**9,
+        learning_rate=3e-3,
+        policy_kwargs={"features_extractor_kwargs": {"n_filters": 16}},
+        buffer_size=len(train),
+        replay_buffer_class=ReplayBuffer,
+    )
+    model.learn(10)
+    model.replay_buffer.reset()
+    for frame in train.numpy():
+        model.replay_buffer.add(frame, frame, np.zeros(2), np.zeros(1), np.zeros(1), [{}])
+    assert model.replay_buffer.full
+    head = model.policy.srl
+
+    @th.no_grad()
+    def error() -> float:
+        return float(head.error(batch_of(held_out), model.policy.encode(held_out)).mean())
+
+    own, errors = head.decoder, {}
+    background, mean = train.median(dim=0).values[None], head.target(train, dither=False).mean(dim=0)
+    best = head.target(held_out, dither=False).mean(dim=0)
+    pictures = {"mean": mean, "background": head.target(background, dither=False), "held-out mean": best}
+    for name, picture in pictures.items():
+        head.decoder = Draw(picture)
+        errors[name] = error()
+    head.decoder = own
+
+    def well_below_the_mean_image(value: float) -> bool:
+        return value < 0.6 * errors["mean"]
+
+    assert not any(well_below_the_mean_image(value) for value in errors.values())
+    assert not well_below_the_mean_image(error())
+    model.train(600, batch_size=16)
+    assert well_below_the_mean_image(error())

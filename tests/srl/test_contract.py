@@ -1,0 +1,323 @@
+"""What a head is given, and what is done with what it returns."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from torch import nn
+from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_once
+
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import Samples
+from sb3_cure.encoders import Encoder
+from sb3_cure.srl import RAE, SRLHead, SRLOutput, get_srl_class
+
+UPDATES = pytest.mark.parametrize("update", ["joint", "sequential"])
+ENCODER = {"trunk", "projection"}
+AGENTS = {"critic", "actor", "actor projection", "temperature"}
+BOTH_AGENTS = AGENTS | {f"curious {name}" for name in AGENTS}
+
+
+class Positions(SRLHead):
+    """A user's head: draws a vector from the latents."""
+
+    def __init__(self, encoder: Encoder, observation_space: Any, width: int = 8):
+        super().__init__(encoder, observation_space)
+        size = observation_space.shape[0]
+        self.decode = nn.Sequential(nn.Linear(encoder.features_dim, width), nn.ReLU(), nn.Linear(width, size))
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        error = (self.decode(latents) - batch.views).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+class Forward(SRLHead):
+    """Predicts the next latents, which get a gradient, too; keeps what it was given."""
+
+    needs_next_latents = True
+
+    def __init__(self, encoder: Encoder, observation_space: Any):
+        super().__init__(encoder, observation_space)
+        self.predict = nn.Linear(encoder.features_dim + 2, encoder.features_dim)
+        self.given: list[tuple[th.Tensor, th.Tensor]] = []
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        assert next_latents is not None
+        self.given.append((latents, next_latents))
+        error = (self.predict(th.cat([latents, batch.actions], dim=1)) - next_latents).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+@UPDATES
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+def test_users_head_trains(algorithm: str, update: str) -> None:
+    """With its arguments; it and the encoder learn, and its error pays the curious agent."""
+    model = filled_model(algorithm, srl=Positions, srl_kwargs={"width": 12}, update=update)
+    assert model.policy.srl.decode[0].out_features == 12
+    before = groups(model)
+    first = train_once(model)
+    assert moved(before, groups(model)) == ENCODER | {"head"} | BOTH_AGENTS
+    assert first["curious_reward_raw_mean"] == first["srl_error"]
+    for _ in range(10):
+        last = train_once(model, rl=False)
+    assert last["srl_loss"] < first["srl_loss"]
+
+
+def test_head_is_given_the_stored_batch_and_its_views() -> None:
+    """Latents are the encoder's of the views, in fp32; the other fields are what the buffer holds."""
+    seen: list[tuple[Samples, th.Tensor]] = []
+
+    class Spy(RAE):
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            assert next_latents is None
+            seen.append((batch, latents))
+            return super().loss(batch, latents)
+
+    model = filled_model(pixels=True, srl=Spy, augmentation="shift", learning_rate=0.0)
+    logged = train_once(model)
+    ((batch, latents),) = seen
+    np.random.seed(1)
+    for ours, stored in zip(batch[:5], model.replay_buffer.sample(BATCH)[:5], strict=True):
+        assert th.equal(ours, stored)
+    assert batch.views.dtype == th.uint8 and not th.equal(batch.views, batch.observations)
+    th.testing.assert_close(latents, model.policy.encoder(batch.views.float() / 255))
+    assert latents.dtype == th.float32 and latents.requires_grad
+    assert logged["srl_error"] == logged["curious_reward_raw_mean"]
+
+
+# ---------------------------------------------------------------- next latents
+
+
+@UPDATES
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_head_that_needs_next_latents_gets_them(precision: str, update: str) -> None:
+    """With their gradient: the encoder moves along both."""
+    model = filled_model(srl=Forward, update=update, precision=precision, curiosity=None, learning_rate=0.01)
+    encoder = model.policy.encoder
+    before = [parameter.detach().clone() for parameter in encoder.parameters()]
+    np.random.seed(1)
+    batch = model.replay_buffer.sample(BATCH)
+    latents, following = encoder(batch.observations), encoder(batch.next_observations)
+    loss, _ = model.policy.srl.loss(Samples(*batch, views=batch.observations), latents, following)
+    along = th.autograd.grad(loss, list(encoder.parameters()), retain_graph=True)
+    at_latents = th.autograd.grad(loss, [latents, following])
+    model.policy.srl.given.clear()
+    train_once(model, rl=False)
+    ((now, then),) = model.policy.srl.given
+    assert now.grad.any() and then.grad.any()
+    assert now.dtype == then.dtype == th.float32
+    if precision == "fp32":
+        size = 1.0 if update == "sequential" else float(th.cat(at_latents).norm())
+        for parameter, old, gradient in zip(encoder.parameters(), before, along, strict=True):
+            th.testing.assert_close(parameter.detach(), old - 0.01 * gradient / size)
+
+
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_transition_head_always_sees_the_true_transition(target: str) -> None:
+    """``curiosity_target`` shows it nothing else: its error is of (s, a, s') either way."""
+    model = filled_model(srl=Forward, curiosity_target=target, learning_rate=0.0)
+    logged = train_once(model)
+    assert len(model.policy.srl.given) == 1
+    assert logged["curious_reward_raw_mean"] == logged["srl_error"]
+
+
+@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
+@pytest.mark.parametrize("pixels, augmentation", [(False, None), (True, "shift")])
+def test_reward_may_be_about_the_next_observation(pixels: bool, augmentation: str | None, curiosity: str) -> None:
+    """The head then judges views of it by the encoder as it is, in a second pass that trains nothing."""
+    seen: list[tuple[Samples, th.Tensor]] = []
+
+    class Spy(RAE):
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            seen.append((batch, latents))
+            return super().loss(batch, latents)
+
+    arguments: dict[str, Any] = dict(curiosity=curiosity, augmentation=augmentation, learning_rate=0.0)
+    model = filled_model(pixels=pixels, srl=Spy, curiosity_target="next_observation", **arguments)
+    logged = train_once(model)
+    (shown, _), (following, latents) = seen
+    assert th.equal(following.observations, shown.next_observations)
+    assert following.views.shape == shown.views.shape and not latents.requires_grad
+    th.testing.assert_close(latents, model.policy.encoder(model.policy.preprocess(following.views)))
+    assert augmentation is not None or th.equal(following.views, shown.next_observations)
+    assert logged["curious_reward_raw_mean"] != logged["srl_error"]
+
+
+# ---------------------------------------------------------------- precision and what is returned
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_heads_run_in_fp32_unless_they_say_otherwise(mixed: bool) -> None:
+    """Its error would otherwise be left with bf16's eight bits without a word."""
+    formats: list[th.dtype] = []
+
+    class Mixed(Positions):
+        mixed_precision = mixed
+
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            formats.append(self.decode[0](latents).dtype)
+            return super().loss(batch, latents)
+
+    for target in ("observation", "next_observation"):
+        train_once(filled_model(srl=Mixed, precision="bf16", curiosity_target=target))
+    assert formats == [th.bfloat16 if mixed else th.float32] * 3
+
+
+def returns(change: Any) -> type[SRLHead]:
+    class Returns(Positions):
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            error = (self.decode(latents) - batch.views).square().mean(dim=1)
+            return SRLOutput(error.mean(), change(error))
+
+    return Returns
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda e: e, lambda e: e.detach()[:, None], lambda e: e.detach().mean(), lambda e: e.detach()[:-1]],
+    ids=["graph", "column", "scalar", "short"],
+)
+def test_error_is_one_number_per_sample_detached(change: Any) -> None:
+    """Anything else would be broadcast, or train the encoder by the curious reward, without a word."""
+    model = filled_model(srl=returns(change))
+    before = groups(model)
+    with pytest.raises(ValueError, match=r"Returns.loss returned an error of shape .* one number per sample, detached"):
+        train_once(model)
+    assert not moved(before, groups(model))
+
+
+@pytest.mark.parametrize("kind", [th.bfloat16, th.float64])
+def test_error_may_have_any_number_format(kind: th.dtype) -> None:
+    logged = train_once(filled_model(srl=returns(lambda error: error.detach().to(kind))))
+    assert np.isfinite(list(logged.values())).all()
+
+
+class Norm(SRLHead):
+    """No parameters of its own: small latents."""
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        error = latents.square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+@UPDATES
+def test_head_without_parameters_trains_the_encoder(update: str) -> None:
+    model = filled_model(srl=Norm, update=update)
+    assert model.policy.srl.optimizer is None
+    before = groups(model)
+    train_once(model, rl=False)
+    assert moved(before, groups(model)) == ENCODER
+
+
+# ---------------------------------------------------------------- after each step
+
+
+@UPDATES
+@pytest.mark.parametrize("schedule", ["simultaneous", "alternating"])
+def test_after_step_follows_each_update_of_the_head(schedule: str, update: str) -> None:
+    """The head's own step has been made by then; in updates of actors and critics alone it is not called."""
+    weights: list[th.Tensor] = []
+
+    class Average(Positions):
+        def after_step(self) -> None:
+            weights.append(self.decode[0].weight.detach().clone())
+
+    model = filled_model(srl=Average, srl_schedule=schedule, srl_period=1, update=update)
+    start = model.policy.srl.decode[0].weight.detach().clone()
+    model.train(4, BATCH)
+    assert len(weights) == 4
+    assert all(not th.equal(a, b) for a, b in zip([start, *weights], weights, strict=False))
+    assert th.equal(weights[-1], model.policy.srl.decode[0].weight)
+
+
+# ---------------------------------------------------------------- what belongs to whom
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_head_does_not_own_the_encoder(srl: str) -> None:
+    """Its parameters and its state are its own: nothing is trained or saved twice."""
+    policy = tiny_model("CnnPolicy", PixelBox(), srl=srl).policy
+    encoders = {id(p) for module in (policy.encoder, policy.encoder_target) for p in module.parameters()}
+    assert not encoders & {id(p) for p in policy.srl.parameters()}
+    assert not any("encoder" in key for key in policy.srl.state_dict())
+    assert policy.srl.encoder is policy.encoder
+    assert policy.srl.target_encoder is policy.encoder_target
+
+
+@UPDATES
+def test_head_that_holds_the_encoder_trains_it_no_more(update: str) -> None:
+    """Kept as a part, as modules usually are: it is still the encoder's optimiser alone that steps it."""
+
+    class Holder(RAE):
+        def __init__(self, encoder: Any, observation_space: Any, **kwargs: Any):
+            super().__init__(encoder, observation_space, **kwargs)
+            self.parts = nn.ModuleList([encoder.projection])
+
+    models = [filled_model(srl=kind, update=update) for kind in (RAE, Holder)]
+    for model in models:
+        train_once(model)
+    ours, theirs = (list(model.policy.encoder.parameters()) for model in models)
+    assert equal(ours, theirs)
+
+
+def test_target_encoder_is_the_moving_average() -> None:
+    """Of the encoder, at its own rate; never trained by gradients."""
+    model = filled_model(srl=Positions, encoder_tau=0.25)
+    policy = model.policy
+    old = [parameter.clone() for parameter in policy.encoder_target.parameters()]
+    train_once(model, rl=False)
+    for target, parameter, before in zip(
+        policy.srl.target_encoder.parameters(), policy.encoder.parameters(), old, strict=True
+    ):
+        th.testing.assert_close(target, 0.75 * before + 0.25 * parameter.detach())
+
+
+def test_networks_begin_alike_under_every_head() -> None:
+    """So that arms with different heads are paired: whatever a head draws, the others' weights are the seed's."""
+
+    class Greedy(RAE):
+        """Draws many random numbers."""
+
+        def __init__(self, *arguments: Any, **settings: Any):
+            super().__init__(*arguments, **settings)
+            th.rand(1000)
+
+    env, settings = PixelBox(size=36), dict(seed=3)
+    heads: list[Any] = ["rae", "curl", Greedy]
+    weights = [tiny_model("CnnPolicy", env, srl=head, **settings).policy.state_dict() for head in heads]
+    others = {name for name in weights[0] if not name.startswith("srl.")}
+    assert {name.split(".")[0] for name in others} >= {"encoder", "task", "curious"}
+    for policy in weights[1:]:
+        assert all(th.equal(weights[0][name], policy[name]) for name in others)
+    another = tiny_model("CnnPolicy", env, srl="rae", seed=4).policy.state_dict()
+    drawn = [name for name in weights[0] if name.startswith("srl.decoder") and name.endswith("weight")]
+    assert drawn and not any(th.equal(weights[0][name], another[name]) for name in drawn), "heads have a seed, too"
+
+
+def test_measuring_trains_nothing() -> None:
+    """``error`` and ``reconstruct`` change no state and need no gradient."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl="rae").learn(12)
+    policy, before = model.policy, copy.deepcopy(model.policy.state_dict())
+    observations = th.as_tensor(model.replay_buffer.sample(4).observations)
+    latents = policy.encode(observations)
+    batch = Samples(*model.replay_buffer.sample(4), views=observations)
+    error = policy.srl.error(batch, latents)
+    assert error.shape == (4,) and not error.requires_grad
+    policy.srl.reconstruct(latents)
+    assert not differences(before, policy.state_dict())
+
+
+@pytest.mark.parametrize("srl", ["simsiam", Positions.__mro__[-1], 3])
+def test_unknown_head_is_refused(srl: Any) -> None:
+    with pytest.raises(ValueError, match="srl is"):
+        get_srl_class(srl)
+
+
+def test_head_instance_is_refused() -> None:
+    """It would be shared by models, with another model's encoder."""
+    policy = tiny_model("MlpPolicy", VectorBox()).policy
+    with pytest.raises(ValueError, match=r"srl is"):
+        CuReSAC("MlpPolicy", VectorBox(), srl=Norm(policy.encoder, policy.observation_space))  # type: ignore[arg-type]

@@ -1,0 +1,320 @@
+"""The contrastive head: InfoNCE against straight-line code, and an error that does not depend on the batch."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from gymnasium import spaces
+from srl_for_tests import batch_of, image_space, make, noise_images, randomise, seeded
+
+from sb3_cure.augmentations import Augmentation
+from sb3_cure.encoders import Encoder, PixelEncoder
+from sb3_cure.srl import CURL
+
+# ---------------------------------------------------------------- the contrastive loss
+
+
+@pytest.mark.parametrize("size", [None, 28], ids=["shift", "crop"])
+def test_infonce_against_straight_line_code(size: int | None) -> None:
+    """Cross-entropy of q^T W k over all keys of the batch with the own one on the diagonal, in plain loops."""
+    space = image_space(3)
+    encoder, head = make(CURL, space, size)
+    with th.no_grad():
+        head.W.normal_(generator=seeded(5))
+    batch = batch_of(noise_images(space, 6))
+    latents = encoder(head.preprocess(head.augment(batch.observations)))
+    th.manual_seed(4)
+    loss, error = head.loss(batch, latents)
+    th.manual_seed(4)
+    keys = head.target_encoder(head.augment(batch.observations).float() / 255).double().numpy()
+    q, w = latents.detach().double().numpy(), head.W.detach().double().numpy()
+    expected = []
+    for i in range(6):
+        scores = [sum(q[i, a] * w[a, b] * keys[j, b] for a in range(7) for b in range(7)) for j in range(6)]
+        expected.append(np.log(sum(np.exp(score - scores[i]) for score in scores)))
+    assert error.shape == (6,)
+    assert not error.requires_grad
+    np.testing.assert_allclose(error.numpy(), expected, rtol=1e-3, atol=1e-4)
+    assert float(loss.detach()) == pytest.approx(np.mean(expected), rel=1e-3)
+    assert th.equal(loss.detach(), error.mean())
+
+
+class Lookup(Encoder):
+    """An encoder that gives each image the row of a table that its first pixel names."""
+
+    def __init__(self, space: spaces.Box, table: th.Tensor):
+        super().__init__(space, table.shape[1], table.shape[1])
+        self.table = table
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.table[(observations[:, 0, 0, 0] * 255).round().long()]
+
+
+@pytest.mark.parametrize("batch_size", [2, 16, 128])
+def test_infonce_of_a_perfect_and_of_a_constant_encoder(batch_size: int) -> None:
+    """Keys that only their anchor resembles: 0; keys all alike: log B, what guessing scores."""
+    space = image_space(1, 8)
+    observations = th.arange(batch_size, dtype=th.uint8).view(-1, 1, 1, 1).expand(-1, 1, 8, 8)
+    for table, expected in [(th.eye(batch_size), 0.0), (th.ones(batch_size, 4), np.log(batch_size))]:
+        encoder = Lookup(space, table)
+        head = CURL(encoder, space)
+        head.bind(encoder, Augmentation(space))
+        previous = np.inf
+        for scale in (1.0, 5.0, 50.0):
+            with th.no_grad():
+                head.W.copy_(scale * th.eye(table.shape[1]))
+            latents = encoder(head.preprocess(observations))
+            loss = float(head.loss(batch_of(observations), latents).loss.detach())
+            assert expected <= loss + 1e-5 and loss <= previous + 1e-5
+            previous = loss
+        assert loss == pytest.approx(expected, abs=1e-4)
+
+
+def test_keys_come_from_the_momentum_encoder_without_gradient() -> None:
+    """The loss changes with the momentum encoder's weights; neither encoder gets a gradient through the keys."""
+    space = image_space()
+    encoder, head = make(CURL, space)
+    target = head.target_encoder.requires_grad_(True)
+    batch = batch_of(noise_images(space))
+    latents = encoder(head.preprocess(batch.observations)).detach().requires_grad_()
+    losses = []
+    for seed in (1, 2):
+        randomise(target, seed)
+        th.manual_seed(0)
+        loss = head.loss(batch, latents).loss
+        loss.backward()
+        losses.append(float(loss.detach()))
+    assert losses[0] != losses[1]
+    assert latents.grad is not None and head.W.grad is not None
+    assert all(parameter.grad is None for parameter in [*encoder.parameters(), *target.parameters()])
+
+
+def test_w_starts_uniform() -> None:
+    """CURL's W is drawn uniformly from [0, 1)."""
+    th.manual_seed(0)
+    space = image_space()
+    w = CURL(PixelEncoder(space, n_filters=2), space).W.detach()
+    assert w.shape == (50, 50)
+    assert 0 <= float(w.min()) < 0.01 and 0.99 < float(w.max()) < 1
+    assert float(w.mean()) == pytest.approx(0.5, abs=5 / np.sqrt(12 * 2500))
+
+
+# ---------------------------------------------------------------- the contrastive error
+
+
+def trained_curl(**kwargs: Any) -> tuple[Encoder, Any, spaces.Box]:
+    """A head that has seen two training batches."""
+    space = image_space()
+    th.manual_seed(0)
+    encoder, head = make(CURL, space, **kwargs)
+    for seed in (1, 2):
+        batch = batch_of(noise_images(space, 6, seed))
+        head.loss(batch, encoder(head.preprocess(head.augment(batch.observations))))
+    return encoder, head, space
+
+
+@pytest.mark.parametrize("size", [None, 28], ids=["shift", "crop"])
+def test_curl_error_of_one_observation(size: int | None) -> None:
+    """Positive for a batch of one, whose InfoNCE would be 0; independent of the rest of a batch; repeatable."""
+    encoder, head, space = trained_curl(size=size)
+    observations = noise_images(space, 5, seed=9)
+    latents = encoder(head.preprocess(head.augment.center(observations)))
+    before = th.get_rng_state()
+    errors = head.error(batch_of(observations), latents)
+    assert th.equal(th.get_rng_state(), before)
+    assert errors.shape == (5,)
+    assert not errors.requires_grad
+    assert float(errors.min()) > 0
+    assert len(errors.unique()) == 5
+    th.manual_seed(123)
+    assert th.equal(errors, head.error(batch_of(observations), latents))
+    for i in range(5):
+        single = head.error(batch_of(observations[i : i + 1]), latents[i : i + 1])
+        th.testing.assert_close(single, errors[i : i + 1], rtol=1e-5, atol=1e-6)
+    order = th.tensor([3, 1, 4, 0, 2])
+    th.testing.assert_close(head.error(batch_of(observations[order]), latents[order]), errors[order])
+    single = batch_of(observations[:1])
+    assert float(head.loss(single, latents[:1]).error) == 0
+
+
+def test_curl_error_against_straight_line_code() -> None:
+    """Cross-entropy of the own key against the bank's, where the views are known: images that a shift leaves alone."""
+    space = image_space(1, 36)
+    th.manual_seed(0)
+    encoder, head = make(CURL, space, bank_size=10)
+    flat = th.arange(0, 250, 25, dtype=th.uint8).view(-1, 1, 1, 1).expand(-1, 1, 36, 36)
+    batch = batch_of(flat)
+    latents = encoder(head.preprocess(flat)).detach()
+    # Fourteen are seen in training, but the bank holds ten.
+    head.loss(batch_of(flat[:7]), latents[:7])
+    head.loss(batch_of(flat[3:]), latents[3:])
+    bank = th.cat([flat[:7], flat[3:6]])
+    assert th.equal(head.bank, bank)
+    keys = head.target_encoder(bank.float() / 255)
+    own = head.target_encoder(flat.float() / 255)
+    q, w = latents, head.W.detach()
+    expected = []
+    for i in range(10):
+        positive = float(q[i] @ w @ own[i])
+        negatives = [float(q[i] @ w @ keys[j]) for j in range(10)]
+        expected.append(np.log(1 + sum(np.exp(negative - positive) for negative in negatives)))
+    np.testing.assert_allclose(head.error(batch, latents).numpy(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_bank_is_filled_once_from_the_first_batches() -> None:
+    """In order, as stored (uint8, not augmented), up to its size; later batches do not change it."""
+    space = image_space()
+    encoder, head = make(CURL, space, bank_size=8)
+    seen = [noise_images(space, 3, seed) for seed in range(4)]
+    assert int(head.bank_filled) == 0
+    for n, observations in enumerate(seen):
+        head.loss(batch_of(observations), encoder(head.preprocess(observations)))
+        assert int(head.bank_filled) == min(3 * (n + 1), 8)
+        filled = int(head.bank_filled)
+        assert th.equal(head.bank[:filled], th.cat(seen)[:filled])
+    # Measuring does not fill it.
+    fresh_encoder, fresh = make(CURL, space)
+    fresh.error(batch_of(seen[0]), fresh_encoder(fresh.preprocess(seen[0])))
+    assert int(fresh.bank_filled) == 0
+
+
+def test_set_bank_chooses_the_negatives() -> None:
+    """They replace those of training, none of the old ones counts any more; nonsense is one sentence."""
+    encoder, head, space = trained_curl(bank_size=16)
+    chosen = noise_images(space, 5, seed=11)
+    head.set_bank(chosen)
+    assert int(head.bank_filled) == 5 and th.equal(head.bank[:5], chosen)
+    _, fresh = make(CURL, space, bank_size=16)
+    fresh.load_state_dict({**head.state_dict(), "bank": th.cat([chosen, th.zeros_like(head.bank[5:])])})
+    observations = noise_images(space, 4, seed=9)
+    latents = encoder(head.preprocess(observations))
+    assert th.equal(fresh.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
+    for wrong in (noise_images(space, 17), chosen[:0], chosen[:, :1]):
+        with pytest.raises(ValueError, match=r"set_bank got observations of shape .* the bank holds 1 to 16"):
+            head.set_bank(wrong)
+
+
+@pytest.mark.parametrize("trained_before", [False, True])
+def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
+    """A restored head gives the same errors and goes on filling where the other stopped."""
+    encoder, head, space = trained_curl(bank_size=16)
+    assert int(head.bank_filled) == 12
+    _, other = make(CURL, space, bank_size=16)
+    if trained_before:
+        full = noise_images(space, 16, seed=5)
+        other.loss(batch_of(full), encoder(head.preprocess(full)))
+    other.load_state_dict(head.state_dict())
+    observations = noise_images(space, 4, seed=9)
+    latents = encoder(head.preprocess(observations))
+    assert th.equal(other.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
+    more = noise_images(space, 6, seed=7)
+    for each in (head, other):
+        each.loss(batch_of(more), encoder(head.preprocess(more)))
+    assert int(other.bank_filled) == 16
+    assert th.equal(other.bank, head.bank)
+    assert th.equal(other.bank[12:], more[:4])
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_logits_are_computed_in_fp32(precision: str) -> None:
+    """Also within autocast: of equal keys and anchors the error is that of fp32, to the last digits."""
+    space = image_space()
+    encoder, head = make(CURL, space)
+    with th.no_grad():
+        head.W.normal_(generator=seeded(5))
+    observations = noise_images(space, 16)
+    latents = encoder(head.preprocess(observations)).detach()
+    keys = encoder(head.preprocess(noise_images(space, 16, seed=1))).detach()
+    head._keys = lambda views: keys
+    with th.autocast("cpu", th.bfloat16, enabled=precision == "bf16"):
+        error = head.loss(batch_of(observations), latents).error
+    logits = latents.double() @ head.W.detach().double() @ keys.double().T
+    expected = logits.logsumexp(dim=1) - logits.diagonal()
+    assert error.dtype == th.float32
+    th.testing.assert_close(error.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+# ---------------------------------------------------------------- what the encoder sees
+
+
+def test_positive_is_another_view_of_the_observation() -> None:
+    """Drawn by ``self.augment`` from the stored observations, whatever the anchor saw."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", augmentation_kwargs={"pad": 3})
+    head: Any = model.policy.srl
+    assert head.augment is model.policy.augmentation
+    drawn: list[th.Tensor] = []
+    seen: list[th.Tensor] = []
+    keys = head._keys
+
+    def spy(views: th.Tensor) -> th.Tensor:
+        drawn.append(views)
+        return keys(views)
+
+    head._keys = spy
+    loss = head.loss
+
+    def look(batch: Any, latents: th.Tensor) -> Any:
+        seen.extend([batch.observations, batch.views])
+        return loss(batch, latents)
+
+    head.loss = look
+    model.learn(11)
+    ((positives,), (observations, views)) = drawn, seen
+    inner = observations[:, :, 3:-3, 3:-3]
+    size = inner.shape[-1]
+
+    def offsets(images: th.Tensor) -> list[tuple[int, int]]:
+        found = []
+        for image, centre in zip(images, inner, strict=True):
+            places = [
+                (y, x) for y in range(7) for x in range(7) if th.equal(image[:, y : y + size, x : x + size], centre)
+            ]
+            assert places
+            found.append(places[0])
+        return found
+
+    assert offsets(positives) != offsets(views)
+
+
+def test_curl_on_100_pixels_crops() -> None:
+    """CURL's setting: random crops of 84 in training, the central one to act, and latents without tanh."""
+    env = PixelBox(size=100)
+    policy = tiny_model("CnnPolicy", env, srl="curl", buffer_size=40).policy
+    assert policy.augmentation.view_space.shape == policy.encoder.view_space.shape == (6, 84, 84)
+    assert policy.observation_space.shape == (6, 100, 100)
+    assert policy.encoder.projection.tanh is False
+    assert policy.actor.features_extractor.tanh is False
+    observation = env.reset(seed=0)[0]
+    # Acting sees the centre alone: what is painted around it does not matter, what is painted within does.
+    around, within = observation.copy(), observation.copy()
+    around[:, :8] = around[:, 92:] = around[:, :, :8] = around[:, :, 92:] = 77
+    within[:, 8:20, 8:92] = 77
+    actions = [policy.predict(image, deterministic=True)[0] for image in (observation, around, within)]
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert not np.array_equal(actions[0], actions[2])
+
+
+@pytest.mark.parametrize(
+    "size, kwargs, seen, tanh",
+    [
+        (84, {}, 84, True),
+        (100, {"augmentation": "shift"}, 100, True),
+        (100, {"augmentation_kwargs": {"size": 64}}, 64, False),
+        (100, {"policy_kwargs": {"features_extractor_kwargs": {"tanh": True, "n_filters": 2}}}, 84, True),
+    ],
+    ids=str,
+)
+def test_augmentation_of_curl_can_be_chosen(size: int, kwargs: dict[str, Any], seen: int, tanh: bool) -> None:
+    """By default shifts up to 84 pixels, beyond that crops; arguments of the user win."""
+    policy = tiny_model("CnnPolicy", PixelBox(size=size), srl="curl", buffer_size=40, **kwargs).policy
+    assert policy.encoder.view_space.shape == (6, seen, seen)
+    assert policy.encoder.projection.tanh is tanh
+
+
+def test_curl_needs_two_views_of_an_image() -> None:
+    with pytest.raises(ValueError, match="srl='curl' compares two views of one image"):
+        tiny_model("MlpPolicy", VectorBox(), srl="curl")
+    with pytest.raises(ValueError, match="srl='curl' compares two random views, but augmentation is None"):
+        tiny_model("CnnPolicy", PixelBox(), srl="curl", augmentation=None)

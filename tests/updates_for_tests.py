@@ -1,0 +1,258 @@
+"""Models with a filled buffer, one update of them, and that update written out from the papers."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from torch import nn
+
+from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.buffers import Samples
+
+ALGORITHMS: dict[str, Any] = {"sac": CuReSAC, "tqc": CuReTQC}
+BATCH = 8
+
+
+def filled_model(algorithm: str = "sac", pixels: bool = False, **kwargs: Any) -> CuReSAC:
+    """A model with random transitions in its buffer that has not been trained.
+
+    Plain gradient descent, because Adam would move every parameter by the same distance; targets do not follow, so
+    that only a gradient could move them.
+    """
+    policy_kwargs = {"optimizer_class": th.optim.SGD, **kwargs.pop("policy_kwargs", {})}
+    if algorithm == "tqc":
+        policy_kwargs = {"n_quantiles": 5, **policy_kwargs}
+    defaults = dict(learning_starts=40, learning_rate=0.1, tau=0.0, encoder_tau=0.0, curiosity_prob=0.0)
+    policy, env = ("CnnPolicy", PixelBox()) if pixels else ("MlpPolicy", VectorBox())
+    arguments = {**defaults, **kwargs, "policy_kwargs": policy_kwargs}
+    return tiny_model(policy, env, ALGORITHMS[algorithm], **arguments).learn(40)
+
+
+def sampled(model: CuReSAC) -> Samples:
+    """The batch that ``train_once`` draws, with torch's generator where the update begins."""
+    np.random.seed(1)
+    batch = Samples(*model.replay_buffer.sample(BATCH))  # type: ignore[union-attr]
+    th.manual_seed(1)
+    return batch._replace(views=model.policy.augmentation(batch.observations))
+
+
+def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool = True) -> dict[str, float]:
+    """One update, on a batch and with noise that depend on nothing else.
+
+    :param model: With ``srl_schedule="simultaneous"``
+    :param srl: Whether it is one of the head
+    :param rl: Whether it is one of actors and critics
+    :param actors: Whether actors and temperatures follow their critics
+    :return: What was logged
+    """
+    model._phase = lambda: (srl, rl)  # type: ignore[method-assign]
+    model._n_rl_batches = 0 if actors else 1
+    np.random.seed(1)
+    th.manual_seed(1)
+    model.logger.name_to_value.clear()
+    model.train(1, BATCH)
+    return {key.removeprefix("train/"): float(value) for key, value in model.logger.name_to_value.items()}
+
+
+def groups(model: CuReSAC) -> dict[str, list[th.Tensor]]:
+    """Everything that is trained, by its role; copied."""
+    policy = model.policy
+    modules: dict[str, Any] = {
+        "trunk": policy.encoder.trunk,
+        "projection": policy.encoder.projection,
+        "encoder target": policy.encoder_target,
+        "head": policy.srl,
+        "reward": policy.intrinsic,
+    }
+    parameters = {name: list(module.parameters()) for name, module in modules.items() if module is not None}
+    for agent, prefix in ((policy.task, ""), (policy.curious, "curious ")):
+        if agent is not None:
+            own = list(agent.actor.features_extractor.parameters())
+            parameters[f"{prefix}actor projection"] = own
+            parameters[f"{prefix}actor"] = [p for p in agent.actor.parameters() if all(p is not q for q in own)]
+            parameters[f"{prefix}critic"] = list(agent.critic.parameters())
+            parameters[f"{prefix}critic target"] = list(agent.critic_target.parameters())
+            if agent.log_ent_coef is not None:
+                parameters[f"{prefix}temperature"] = [agent.log_ent_coef]
+    return {name: [p.detach().clone() for p in tensors] for name, tensors in parameters.items() if tensors}
+
+
+def equal(first: list[th.Tensor], second: list[th.Tensor]) -> bool:
+    return all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def moved(before: dict[str, list[th.Tensor]], after: dict[str, list[th.Tensor]]) -> set[str]:
+    """Names of the groups that moved; each moves as a whole or not at all."""
+    result = set()
+    for name in before:
+        changes = [not th.equal(a, b) for a, b in zip(before[name], after[name], strict=True)]
+        assert len(set(changes)) == 1, (name, changes)
+        if changes[0]:
+            result.add(name)
+    return result
+
+
+@th.no_grad()
+def prepare(model: CuReSAC) -> None:
+    """Let some transitions terminate, errors differ between observations, targets from what they follow."""
+    policy, buffer = model.policy, model.replay_buffer
+    if policy.srl is not None:
+        for parameter in policy.srl.parameters():
+            parameter.normal_(std=0.3, generator=th.Generator().manual_seed(parameter.numel()))
+    buffer.dones[::3] = 1  # type: ignore[union-attr]
+    buffer.timeouts[:] = 0  # type: ignore[union-attr]
+    for target in (policy.encoder_target, *(agent.critic_target for agent in policy.agents.values())):
+        for parameter in target.parameters():
+            parameter.mul_(1.1)
+
+
+class StraightLine:
+    """One update of the autoencoder and of both agents under plain gradient descent, written out from the papers.
+
+    :param model: Copied as it is; its head is RAE, its reward the standardised error
+    """
+
+    def __init__(self, model: CuReSAC):
+        policy = model.policy
+        self.model = model
+        # Together, as the head refers to the encoders
+        parts = [policy.encoder, policy.encoder_target, policy.srl, *policy.agents.values()]
+        self.encoder, self.encoder_target, self.head, *agents = copy.deepcopy(parts)
+        self.agents = dict(zip(policy.agents, agents, strict=True))
+        self.lr = model.learning_rate
+        self.quantiles = isinstance(model, CuReTQC)
+
+    def groups(self) -> list[th.Tensor]:
+        """All parameters and temperatures."""
+        modules = [self.encoder, self.encoder_target, self.head, *self.agents.values()]
+        found = [parameter.detach() for module in modules for parameter in module.parameters()]
+        return [*found, *(agent.log_ent_coef.detach() for agent in self.agents.values())]
+
+    def descend(self, loss: th.Tensor, module: nn.Module, rate: float) -> None:
+        parameters = list(module.parameters())
+        gradients = th.autograd.grad(loss, parameters, retain_graph=True)
+        with th.no_grad():
+            for parameter, gradient in zip(parameters, gradients, strict=True):
+                parameter.sub_(rate * gradient)
+
+    def scaled(self, observations: th.Tensor) -> th.Tensor:
+        return observations.float() / 255 if observations.dtype == th.uint8 else observations
+
+    def values(self, critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+        return [network(th.cat([latents, actions], dim=1)) for network in critic.q_networks]
+
+    def critic_loss(self, values: list[th.Tensor], target: th.Tensor) -> th.Tensor:
+        """
+        :param values: Of each critic, [B, 1] or [B, n_quantiles]
+        :param target: [B, 1] or [B, kept quantiles]
+        """
+        if not self.quantiles:
+            return 0.5 * sum(((value - target) ** 2).mean() for value in values)  # type: ignore[return-value]
+        n = values[0].shape[1]
+        total = []
+        for value in values:
+            for i in range(n):
+                for j in range(target.shape[1]):
+                    difference = target[:, j] - value[:, i]
+                    size = difference.abs()
+                    huber = th.where(size > 1, size - 0.5, 0.5 * difference**2)
+                    total.append(((i + 0.5) / n - (difference.detach() < 0).float()).abs() * huber)
+        return th.stack(total).mean()
+
+    def update(self, batch: Samples, sequential: bool) -> dict[str, float]:
+        """
+        :param batch: What is sampled, torch's generator where the update begins
+        :param sequential: Whether the encoder steps after each loss, or once on their normalised gradients
+        :return: Losses by their logged names
+        """
+        obs, next_obs = self.scaled(batch.observations), self.scaled(batch.next_observations)
+        with th.no_grad():
+            next_latents = self.encoder_target(next_obs)
+        shared = self.encoder(obs)
+        pulls: list[th.Tensor] = []
+
+        def learn(loss: th.Tensor, owner: nn.Module, latents: th.Tensor) -> None:
+            (gradient,) = th.autograd.grad(loss, latents, retain_graph=True)
+            along = th.autograd.grad(latents, list(self.encoder.parameters()), gradient, retain_graph=True)
+            self.descend(loss, owner, self.lr)
+            if sequential:
+                with th.no_grad():
+                    for parameter, step in zip(self.encoder.parameters(), along, strict=True):
+                        parameter.sub_(self.lr * step)
+            else:
+                pulls.append(gradient / gradient.norm())
+
+        latents = shared
+        if batch.observations.dtype == th.uint8:
+            drawn, goal = self.head.decoder(latents), self.head.target(batch.observations, dither=True)
+        else:
+            drawn, goal = self.head.decoder(latents), obs
+        errors = ((drawn - goal) ** 2).flatten(1).mean(dim=1)
+        loss = errors.mean() + 1e-6 * 0.5 * (latents**2).sum(dim=1).mean()
+        found = {"srl_loss": loss}
+        learn(loss, self.head, latents)
+        errors = errors.detach()
+        curious = ((errors - errors.mean()) / errors.std(unbiased=False)).clamp(-5, 5) * self.model.curiosity_beta
+        ends = batch.dones[:, 0]
+        curious_ends = ends if self.model.curiosity_episodic else th.zeros_like(ends)
+        self.learn_agent("task", batch, batch.rewards[:, 0], self.model.gamma * (1 - ends), next_latents, learn, found)
+        self.learn_agent(
+            "curious", batch, curious, self.model.curiosity_gamma * (1 - curious_ends), next_latents, learn, found
+        )
+        if not sequential:
+            direction = th.autograd.grad(shared, list(self.encoder.parameters()), sum(pulls))
+            with th.no_grad():
+                for parameter, step in zip(self.encoder.parameters(), direction, strict=True):
+                    parameter.sub_(self.lr * len(pulls) ** 0.5 * step)
+        with th.no_grad():
+            follow = [(self.encoder_target, self.encoder, self.model.encoder_tau)]
+            follow += [(agent.critic_target, agent.critic, self.model.tau) for agent in self.agents.values()]
+            for target, online, rate in follow:
+                for old, new in zip(target.parameters(), online.parameters(), strict=True):
+                    old.copy_((1 - rate) * old + rate * new)
+        return {name: float(value.detach()) for name, value in found.items()}
+
+    def learn_agent(
+        self,
+        name: str,
+        batch: Samples,
+        rewards: th.Tensor,
+        discounts: th.Tensor,
+        next_latents: th.Tensor,
+        learn: Any,
+        found: dict[str, th.Tensor],
+    ) -> None:
+        """Critic, actor and temperature, with the encoder as it is by now."""
+        agent, prefix = self.agents[name], "" if name == "task" else "curious_"
+        obs, next_obs = self.scaled(batch.observations), self.scaled(batch.next_observations)
+        alpha = agent.log_ent_coef.detach().exp()
+        with th.no_grad():
+            next_actions, next_log_prob = agent.actor.action_log_prob(self.encoder.trunk(next_obs))
+            next_values = self.values(agent.critic_target, next_latents, next_actions)
+            if self.quantiles:
+                kept = sum(v.shape[1] for v in next_values) - 2 * self.model.top_quantiles_to_drop_per_net
+                next_value = th.cat(next_values, dim=1).sort(dim=1).values[:, :kept]
+            else:
+                next_value = th.minimum(*next_values)
+            target = rewards[:, None] + discounts[:, None] * (next_value - alpha * next_log_prob)
+        latents = self.encoder(obs)
+        loss = found[f"{prefix}critic_loss"] = self.critic_loss(
+            self.values(agent.critic, latents, batch.actions), target
+        )
+        learn(loss, agent.critic, latents)
+        with th.no_grad():
+            features = self.encoder.trunk(obs)
+            latents = self.encoder.projection(features)
+        actions, log_prob = agent.actor.action_log_prob(features)
+        values = self.values(agent.critic, latents, actions)
+        value = th.cat(values, dim=1).mean(dim=1, keepdim=True) if self.quantiles else th.minimum(*values)
+        loss = found[f"{prefix}actor_loss"] = (alpha * log_prob - value).mean()
+        self.descend(loss, agent.actor, self.lr)
+        # Target entropy: minus the number of actions.
+        surplus = (log_prob.detach() - 2).mean()
+        found[f"{prefix}ent_coef_loss"] = -agent.log_ent_coef * surplus
+        with th.no_grad():  # the first step of any Adam is as long as its learning rate
+            agent.log_ent_coef.add_(self.lr * self.model.ent_coef_lr_factor * surplus.sign())
+        found[f"{prefix}ent_coef"] = alpha
