@@ -5,11 +5,11 @@ Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), whic
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import FlattenImage, Projection, conv_sizes, init_weights
+from sb3_cure.layers import FlattenImage, FullPrecision, Projection, conv_sizes, init_weights
 from sb3_cure.values import is_integer
 
 
@@ -104,7 +104,7 @@ class VectorEncoder(Encoder):
             )
         super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
         inputs = get_flattened_obs_dim(observation_space)
-        self.trunk = nn.Sequential(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
+        self.trunk = FullPrecision(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
         self.projection = Projection(hidden_dim, features_dim, tanh)
         init_weights(self)
 
@@ -117,7 +117,7 @@ class ExtractorEncoder(Encoder):
 
     def __init__(self, extractor: BaseFeaturesExtractor):
         super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
-        self.trunk = extractor
+        self.trunk = extractor if is_image_space(extractor._observation_space) else FullPrecision(extractor)
         self.projection = nn.Identity()
 
 

@@ -1,5 +1,7 @@
 """Building blocks of the encoder, the decoder, the actors and the critics."""
 
+import contextlib
+from collections.abc import Sequence
 from typing import TypeVar
 
 import torch as th
@@ -79,6 +81,33 @@ def full_precision(tensor: th.Tensor) -> th.autocast:
     return th.autocast(tensor.device.type, enabled=False)
 
 
+class FullPrecision(nn.Sequential):
+    """Modules that compute in fp32 within autocast, too: they read vectors, of which bf16 keeps three digits."""
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: What the first module reads
+        :return: What the last module returns
+        """
+        with full_precision(inputs):
+            return super().forward(inputs)
+
+
+def dense(layers: Sequence[nn.Module], inputs: th.Tensor) -> th.Tensor:
+    """Layers of an actor or a critic, the first of them in fp32: actions .500 and .501 are one number in bf16.
+
+    The first layer is small; the products of the wide hidden layers are what bf16 is for.
+
+    :param layers: Linear maps and activations
+    :param inputs: Latents, with or without actions, fp32, [B, n]
+    :return: Output of the last layer
+    """
+    for i, layer in enumerate(layers):
+        with full_precision(inputs) if i == 0 else contextlib.nullcontext():
+            inputs = layer(inputs)
+    return inputs
+
+
 class ConvTranspose2d(nn.ConvTranspose2d):
     """torch's transposed convolution, its bias added afterwards: inside, oneDNN's bias gradient costs as much as
     that of the weights. Square strides, no padding but ``output_padding``."""
@@ -122,7 +151,9 @@ class Projection(nn.Module):
         self.tanh = tanh
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        projected = self.linear(features)
+        # Convolutions in autocast pass bf16 on; features of vectors are fp32, and stay so.
+        with full_precision(features) if features.dtype == th.float32 else contextlib.nullcontext():
+            projected = self.linear(features)
         with full_precision(projected):
             latents = self.norm(projected.float())
             return th.tanh(latents) if self.tanh else latents

@@ -20,7 +20,7 @@ from torch import nn
 from sb3_cure.curiosity import CuriousReward
 from sb3_cure.encoder_optimizer import EncoderOptimizer
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.layers import Projection, full_precision, init_weights, preprocess
+from sb3_cure.layers import Projection, dense, full_precision, init_weights, preprocess
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
 from sb3_cure.values import check_optimizer_kwargs
@@ -45,7 +45,7 @@ class TrunkActor(Actor):
                 f"the actor got {obs.ndim} dimensions, but it reads the shared encoder's features: call the policy, or "  # type: ignore[union-attr]
                 "sb3_cure.deployment.DeterministicActor(model) for actions of observations."
             )
-        latent = self.latent_pi(self.features_extractor(obs))
+        latent = dense(list(self.latent_pi), self.features_extractor(obs).float())  # type: ignore[arg-type]
         with full_precision(latent):
             latent = latent.float()
             # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
@@ -77,14 +77,13 @@ class LatentCritic(ContinuousCritic):
         :param actions: [B, action_dim], in [-1, 1]
         :return: Q values of each critic, [B, 1]
         """
-        inputs = th.cat([obs, actions], dim=1)
+        inputs = th.cat([obs.float(), actions], dim=1)
         return tuple(self._q_value(q_net, inputs) for q_net in self.q_networks)
 
     @staticmethod
     def _q_value(q_net: nn.Module, inputs: th.Tensor) -> th.Tensor:
         *hidden, output = q_net.children()
-        for layer in hidden:
-            inputs = layer(inputs)
+        inputs = dense(hidden, inputs)
         with full_precision(inputs):
             return output(inputs.float())
 

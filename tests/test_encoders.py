@@ -269,16 +269,17 @@ def test_log_probability_is_that_of_the_squashed_gaussian() -> None:
 
 
 def test_bf16_stays_within_the_hidden_layers() -> None:
-    """Under autocast hidden layers compute in bf16; latents, Q, log-probabilities, targets and losses are fp32."""
-    model = tiny_model("CnnPolicy", PixelBox(), precision="bf16")
+    """Under autocast convolutions and hidden layers compute in bf16, but for the first layer of actors and critics;
+    latents, Q, log-probabilities, targets and losses are fp32."""
+    model = tiny_model("CnnPolicy", PixelBox(), precision="bf16", policy_kwargs={"net_arch": [16, 16]})
     policy = model.policy
     observations = th.randint(256, (4, 6, 36, 36), dtype=th.uint8, generator=th.Generator().manual_seed(0))
     batch = ReplayBufferSamples(observations, th.zeros(4, 2), observations, th.zeros(4, 1), th.zeros(4, 1))
     hidden: list[th.dtype] = []
-    for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[0]):
+    for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[2]):
         layer.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     for q_net in policy.critic.q_networks:
-        q_net[0].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
+        q_net[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     policy.srl.decoder.linear.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
 
     def compute() -> dict[str, th.Tensor]:

@@ -23,7 +23,7 @@ def test_targets_follow_at_their_own_rates(update: str) -> None:
                 parameter.copy_(followed + 1)
     one_update(model)
     left = {
-        name: [float((p - q).mean()) for p, q in zip(target.parameters(), source.parameters(), strict=True)]
+        name: [float((p - q).detach().mean()) for p, q in zip(target.parameters(), source.parameters(), strict=True)]
         for name, (source, target) in pairs.items()
     }
     assert left["encoder"] == pytest.approx([0.4] * len(left["encoder"]), abs=1e-5)
