@@ -223,7 +223,7 @@ def _check_numbers(model: "CuReSAC") -> None:
         _check_range(name, getattr(model, name), 0.0, 1.0)
     for name in ("curiosity_beta", "ent_coef_lr_factor", "learning_starts"):
         _check_range(name, getattr(model, name), 0.0, np.inf)
-    flags = ("task", "overlap", "normalize_curiosity", "curiosity_encoder_grad")
+    flags = ("task", "overlap", "normalize_curiosity", "curiosity_encoder_grad", "curiosity_episodic")
     for name in (*flags, "optimize_memory_usage", "use_sde", "use_sde_at_warmup"):
         if not isinstance(getattr(model, name), bool):
             raise ValueError(f"{name} is {getattr(model, name)!r}, but it must be True or False: change {name}.")

@@ -154,7 +154,10 @@ class CuReSAC(SAC):
         [0, 1], or a schedule
     :param curiosity_beta: beta, factor of the curious reward
     :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"``
-    :param normalize_curiosity: Standardise the error by running statistics, clipped to +-5; False: the paper's letter
+    :param curiosity_episodic: Whether the curious return ends where an episode terminates. A standardised reward has
+        mean zero: wherever errors are low, ending pays. False: a terminal state is one like any other
+    :param normalize_curiosity: Divide the error by its running size and clip at 5, less the batch's mean unless it is a
+        bonus; False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free), or
         ``"next_observation"``, for which the head gets the batch with the next observations as its observations
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
@@ -208,6 +211,7 @@ class CuReSAC(SAC):
         curiosity_prob: float | Schedule = 0.2,
         curiosity_beta: float = 1.0,
         curiosity_gamma: float = 0.99,
+        curiosity_episodic: bool = False,
         normalize_curiosity: bool = True,
         curiosity_target: str = "observation",
         curiosity_encoder_grad: bool = True,
@@ -253,6 +257,7 @@ class CuReSAC(SAC):
         self.curiosity_prob = curiosity_prob
         self.curiosity_beta = curiosity_beta
         self.curiosity_gamma = curiosity_gamma
+        self.curiosity_episodic = curiosity_episodic
         self.normalize_curiosity = normalize_curiosity
         self.curiosity_target = curiosity_target
         self.curiosity_encoder_grad = curiosity_encoder_grad
@@ -341,7 +346,12 @@ class CuReSAC(SAC):
             srl_class=None if self.srl is None else get_srl_class(self.srl),
             srl_kwargs=self.srl_kwargs,
             curious=self._has_curious_agent,
-            curiosity_kwargs=dict(beta=self.curiosity_beta, normalize=self.normalize_curiosity),
+            curiosity_kwargs=dict(
+                beta=self.curiosity_beta,
+                normalize=self.normalize_curiosity,
+                # A bonus comes on top of a task's reward, where less than nothing would make ending attractive.
+                center=self.curiosity != "bonus",
+            ),
             encoder_sources=tuple(name for name, trains in sources.items() if trains),
             update=self.update,
             acting="actor" if self.task else "curious_actor",
@@ -811,7 +821,8 @@ class CuReSAC(SAC):
             next_actions, next_log_prob = agent.actor.action_log_prob(encoded.next_features())
             next_q = th.cat(agent.critic_target(next_latents, next_actions), dim=1).amin(dim=1, keepdim=True)
         next_value = next_q - agent.temperature() * next_log_prob.unsqueeze(1)
-        target = rewards + (1 - batch.dones) * discounts * next_value
+        ends = agent is self._task_agent or self.curiosity_episodic
+        target = rewards + (1 - batch.dones * ends) * discounts * next_value
 
         latents = encoded.latents.detach().requires_grad_(agent.trains_encoder)
         with self._autocast():

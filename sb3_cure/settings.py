@@ -364,8 +364,8 @@ SCHEMA: dict[str, tuple[str, Callable[[Any], bool]]] = {
             "a finite number or a string",
             lambda value: type(value) is str or is_number(value),
         ),
-        "use_sde use_sde_at_warmup optimize_memory_usage normalize_curiosity curiosity_encoder_grad task overlap "
-        "_warmed_up _custom_logger": ("True or False", _is_a(bool)),
+        "use_sde use_sde_at_warmup optimize_memory_usage normalize_curiosity curiosity_encoder_grad curiosity_episodic "
+        "task overlap _warmed_up _custom_logger": ("True or False", _is_a(bool)),
         "compile": ("True, False or a string", _is_a(bool, str)),
         "srl_schedule curiosity_target update precision on_bad_transition": ("a string", _is_a(str)),
         "curiosity _collector": ("a string or None", _or_none(_is_a(str))),

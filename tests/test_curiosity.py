@@ -1,4 +1,4 @@
-"""The curious reward: beta times the SRL error, standardised by debiased running statistics."""
+"""The curious reward: beta times the SRL error, centred by its batch and scaled by a debiased running size."""
 
 from collections.abc import Sequence
 
@@ -24,26 +24,25 @@ def error_batches(n: int, size: int = 16, seed: int = 0) -> list[np.ndarray]:
     return [((1e-3 + 1e-1 * 0.95**i) * rng.gamma(2.0, size=size)).astype(np.float32) for i in range(n)]
 
 
-def statistics(batches: Sequence[np.ndarray], decay: float) -> tuple[float, float]:
-    """Mean and standard deviation under exponentially falling weights that add up to 1, in float64."""
-    weights = decay ** np.arange(len(batches) - 1, -1, -1.0)
-    weights /= weights.sum()
-    mean = sum(w * np.mean(b, dtype=np.float64) for w, b in zip(weights, batches, strict=True))
-    mean_square = sum(w * np.mean(np.square(b, dtype=np.float64)) for w, b in zip(weights, batches, strict=True))
-    return mean, np.sqrt(mean_square - mean**2)
+def running_mean(values: Sequence[float], decay: float) -> float:
+    """Mean under exponentially falling weights that add up to 1, in float64."""
+    weights = decay ** np.arange(len(values) - 1, -1, -1.0)
+    return float(np.average(values, weights=weights))
 
 
 @pytest.mark.parametrize("n_batches", [1, 2, 30, 400])
 @pytest.mark.parametrize("beta, clip, decay", [(1.0, 5.0, 0.99), (0.3, 0.5, 0.9)])
-def test_standardised_reward_against_float64(n_batches: int, beta: float, clip: float, decay: float) -> None:
+@pytest.mark.parametrize("center", [True, False])
+def test_scaled_reward_against_float64(n_batches: int, beta: float, clip: float, decay: float, center: bool) -> None:
     """From the very first batch on, i.e. without the bias of averages that start at zero."""
-    reward = CuriousReward(beta, clip=clip, decay=decay)
+    reward = CuriousReward(beta, center=center, clip=clip, decay=decay)
     batches = error_batches(n_batches)
     for batch in batches:
         reward.update(th.as_tensor(batch))
-    mean, deviation = statistics(batches, decay)
     errors = np.concatenate([batches[-1], batches[0]])
-    expected = beta * np.clip((errors - mean) / deviation, -clip, clip)
+    exact = [batch.astype(np.float64) for batch in batches]
+    size = running_mean([batch.var() if center else np.mean(batch**2) for batch in exact], decay) ** 0.5
+    expected = beta * np.clip((errors - errors.mean() * center) / size, -clip, clip)
     actual = reward(th.as_tensor(errors))
     assert actual.shape == (len(errors), 1)
     np.testing.assert_allclose(actual[:, 0].numpy(), expected, rtol=1e-3, atol=1e-4)
@@ -66,6 +65,10 @@ def test_outliers_are_clipped_at_five_deviations(beta: float) -> None:
     reward.update(th.as_tensor(error_batches(1)[0]) + 1)
     low, high = reward(th.tensor([0.0, 1e6]))[:, 0].tolist()
     assert (low, high) == (-5 * beta, 5 * beta)
+    bonus = CuriousReward(beta, center=False)
+    bonus.update(th.as_tensor(error_batches(1)[0]))
+    low, high = bonus(th.tensor([0.0, 1e6]))[:, 0].tolist()
+    assert (low, high) == (0, 5 * beta)
 
 
 @pytest.mark.parametrize("beta", [0.0, 1.0, 0.37])
@@ -137,7 +140,7 @@ def test_statistics_belong_to_the_policy() -> None:
     model.learn(15)
     state = model.policy.state_dict()
     assert float(state["curiosity.weight"]) == pytest.approx(1 - 0.99**model._n_updates, rel=1e-4)
-    assert float(state["curiosity.mean"]) > 0
+    assert float(state["curiosity.mean_square"]) > 0
     fresh = tiny_model("MlpPolicy", VectorBox())
     fresh.policy.load_state_dict(state)
     errors = th.linspace(0, 1, 9)

@@ -227,7 +227,8 @@ def straight_line(
             next_actions, next_log_prob = actor.action_log_prob(next_features)
             next_q = th.minimum(*[q[:, 0] for q in critic_target(next_latents, next_actions)])
             value = next_q - alpha * next_log_prob
-            target = rewards[agent] + gammas[agent] * (1 - batch.dones[:, 0]) * value
+            ends = batch.dones[:, 0] if agent == "" else 0  # a curious return goes on after terminations
+            target = rewards[agent] + gammas[agent] * (1 - ends) * value
         first, second = (q[:, 0] for q in critic(latents, batch.actions))
         result[f"{agent}critic_loss"] = 0.5 * (((first - target) ** 2).mean() + ((second - target) ** 2).mean())
         with th.no_grad():
@@ -257,6 +258,8 @@ def prepare(model: CuReSAC) -> None:
     for target in (model.policy.encoder_target, model.policy.critic_target, model.policy.curious_critic_target):
         for parameter in target.parameters():
             parameter.mul_(1.1)
+    if model.curious_log_ent_coef is not None:
+        model.curious_log_ent_coef += 0.7  # so that no agent's temperature stands for the other's
 
 
 @UPDATES
