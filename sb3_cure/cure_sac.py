@@ -145,9 +145,9 @@ class CuReSAC(SAC):
     :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), a subclass of
         ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
-    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: ``srl_period`` updates of
-        SRL, then as many of RL, in turn
-    :param srl_period: Updates per phase when alternating
+    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: ``srl_period`` agent steps
+        with two updates of SRL each, then as many with two of RL each, in turn
+    :param srl_period: Agent steps (where each has its update) per phase when alternating
     :param curiosity: ``"separate"``: a second actor-critic is rewarded with the SRL error; ``"bonus"``: the error is
         added to the task reward; ``"random"``: the second actor draws uniform actions (control); None: off
     :param curiosity_prob: p_c, probability with which the second actor acts, per environment and step; a number in
@@ -280,6 +280,8 @@ class CuReSAC(SAC):
         # Whether `learn` comes right after `pretrain`, and begins as without it
         self._is_pretrained = False
         self._warmed_up = False
+        # Which of the updates that ``_n_updates`` counts as one is being made: 0, or 1 when alternating
+        self._part = 0
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
         self._run = Run()
@@ -690,10 +692,12 @@ class CuReSAC(SAC):
             self.policy.set_training_mode(True)
             self._update_learning_rates()
             for _ in range(gradient_steps):
-                random_state = np.random.get_state(legacy=False)
-                batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                with self._guard.update(self, batch, random_state):
-                    self._gradient_step(batch)
+                # Two in either phase, so that SRL and RL are as many as when they are simultaneous.
+                for self._part in range(self._updates_per_step):
+                    random_state = np.random.get_state(legacy=False)
+                    batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+                    with self._guard.update(self, batch, random_state):
+                        self._gradient_step(batch)
                 self._n_updates += 1
             self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self._overlapped is not None:
@@ -723,8 +727,7 @@ class CuReSAC(SAC):
             if self._curious_agent is not None and self._collector != "random":
                 self._update_actor_critic(self._curious_agent, encode(), next_latents, batch, curious_reward)
         self.policy.encoder_optimizer.step()
-        if self._n_updates % self.target_update_interval == 0:
-            self._update_targets()
+        self._update_targets()
         self._record_metrics(batch)
 
     def _encode(self, observations: th.Tensor, next_observations: th.Tensor) -> EncoderPass:
@@ -867,12 +870,20 @@ class CuReSAC(SAC):
             self._log({f"{prefix}ent_coef_loss": ent_coef_loss})
 
     def _update_targets(self) -> None:
-        """Polyak step of the target encoder and the target critics."""
+        """Polyak steps, where they are due: of the target encoder, and of the target critics where critics move."""
         policy = self.policy
-        _polyak(policy.encoder, policy.encoder_target, self._guard.rate(self.encoder_tau))
-        for agent in (self._task_agent, self._curious_agent):
-            if agent is not None:
-                _polyak(agent.critic, agent.critic_target, self._guard.rate(self.tau))
+        n_updates = self._n_updates * self._updates_per_step + self._part
+        if n_updates % self.target_update_interval == 0:
+            _polyak(policy.encoder, policy.encoder_target, self._guard.rate(self.encoder_tau))
+        if self._in_rl_phase and self._n_rl_updates % self.target_update_interval == 0:
+            for agent in (self._task_agent, self._curious_agent):
+                if agent is not None:
+                    _polyak(agent.critic, agent.critic_target, self._guard.rate(self.tau))
+
+    @property
+    def _updates_per_step(self) -> int:
+        """Updates that ``_n_updates`` counts as one: phases alternate, but where there is nothing but SRL."""
+        return 1 if self.srl_schedule == "simultaneous" or self._collector == "random" else 2
 
     @property
     def _in_srl_phase(self) -> bool:
@@ -890,7 +901,7 @@ class CuReSAC(SAC):
         if self.srl_schedule == "simultaneous":
             return self._n_updates
         periods, position = divmod(self._n_updates, 2 * self.srl_period)
-        return periods * self.srl_period + position - self.srl_period
+        return 2 * (periods * self.srl_period + position - self.srl_period) + self._part
 
     @property
     def _progress_remaining(self) -> float:

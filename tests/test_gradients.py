@@ -14,7 +14,7 @@ from sb3_cure.srl import CURL, RAE, SRLOutput
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
 HEADS = pytest.mark.parametrize("srl", ["rae", "curl"])
-#: Number of the update: actors follow in every second one; alternating phases are of 100 updates
+#: Number of the update: actors follow in every second one; alternating phases are of 100 steps
 WITH_ACTORS, WITHOUT_ACTORS = 0, 1
 RL_WITH_ACTORS, RL_WITHOUT_ACTORS = 100, 101
 
@@ -44,7 +44,11 @@ def train_once(model: CuReSAC, n_updates: int) -> dict[str, float]:
     np.random.seed(1)
     th.manual_seed(1)
     model.logger.name_to_value.clear()
-    model.train(1, batch_size=8)
+    if model.srl_schedule == "simultaneous":
+        model.train(1, batch_size=8)
+    else:  # one of the two updates of a step
+        model._n_updates, model._part = 100 * (n_updates // 100), n_updates % 100
+        model._gradient_step(model.replay_buffer.sample(8))
     return {key: float(value) for key, value in model.logger.name_to_value.items()}
 
 
@@ -401,7 +405,7 @@ def test_actors_follow_every_few_updates_of_their_critics(
             update(agent, *args)
 
         monkeypatch.setattr(model, name, note)
-    model.train(2 * max(8 * interval, 2 * period), batch_size=4)
+    model.train(max(4 * interval, 2 * period), batch_size=4)
     for agent in ("task", "curious"):
         own = [name for name in done if name.endswith(agent)]
         critics = own.count("_update_actor_critic" + agent)

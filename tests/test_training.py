@@ -185,19 +185,16 @@ def test_zero_learning_rate_freezes_everything(srl: str, update: str) -> None:
 
 @both_updates
 def test_alternating_schedule(update: str) -> None:
-    """``srl_period`` updates of the head, then as many of the agents, in turn; the encoder learns from both."""
+    """``srl_period`` steps of the head, then as many of the agents, in turn; the encoder learns from both."""
     model = tiny_model(
         "CnnPolicy", PixelBox(), update=update, srl_schedule="alternating", srl_period=3, actor_update_interval=1,
-        target_update_interval=100,
     ).learn(10)  # fmt: skip
-    model.train(1, batch_size=8)  # the one that updates the targets
-    for n_updates in range(1, 13):
+    for n_updates in range(12):
         names = moved(model, lambda: model.train(1, batch_size=8))
         if n_updates // 3 % 2 == 0:
-            assert names == {"encoder", "srl", *STATISTICS}
+            assert names == {"encoder", "encoder_target", "srl", *STATISTICS}
         else:
-            agents = (TASK | CURIOUS) - {"critic_target", "curious_critic_target"}
-            assert names == {"encoder", *agents, *STATISTICS}
+            assert names == {"encoder", "encoder_target", *TASK, *CURIOUS, *STATISTICS}
 
 
 def test_periods_may_be_numbers_of_numpy() -> None:
@@ -839,7 +836,7 @@ def test_a_heads_error_may_have_any_number_format(head: type[SRLHead], precision
     """All that is made of it is in full precision, in training and when policies are compared."""
     arguments: dict[str, Any] = dict(srl=head, precision=precision, curiosity_target=target)
     model = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(25)
-    assert model.policy.curiosity.mean.dtype is th.float32 and float(model.policy.curiosity.mean) > 0
+    assert model.policy.curiosity.mean_square.dtype is th.float32 and float(model.policy.curiosity.mean_square) > 0
     (episode,) = run_episodes(model, PixelBox(), 1, seed=0)
     assert episode.srl_errors.dtype == np.float32 and (episode.srl_errors > 0).all()
 
