@@ -162,8 +162,8 @@ class CuReSAC(SAC):
         ``"next_observation"``, for which the head gets the batch with the next observations as its observations
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
-    :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000), or 0
-        where there is no warm-up
+    :param warmup_updates: Updates in one burst after ``learning_starts``, each of which updates actors, temperatures
+        and targets, too (SAC-AE); None: what the head wants (RAE: 1000), or 0 where there is no warm-up
     :param actor_update_interval: Updates between two updates of actors and temperatures; when alternating, those of RL
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
@@ -282,6 +282,8 @@ class CuReSAC(SAC):
         self._warmed_up = False
         # Which of the updates that ``_n_updates`` counts as one is being made: 0, or 1 when alternating
         self._part = 0
+        # Whether `train` is called for the burst after the warm-up, and whether the running updates are that burst's
+        self._asks_for_burst = self._is_burst = False
         # While `learn` runs with overlap=True: the environments, which do updates as they step
         self._overlapped: OverlappedVecEnv | None = None
         self._run = Run()
@@ -668,7 +670,12 @@ class CuReSAC(SAC):
             if updates > 0 and self.gradient_steps != 0:
                 if self.verbose >= 1:
                     print(f"{updates} updates on the {self.num_timesteps} agent steps of the random warm-up")
-                self.train(gradient_steps=updates, batch_size=self.batch_size)
+                # SAC-AE's step counter stands still meanwhile: actors and targets are due in each of these updates.
+                self._asks_for_burst = True
+                try:
+                    self.train(gradient_steps=updates, batch_size=self.batch_size)
+                finally:
+                    self._asks_for_burst = False
         return rollout
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -678,11 +685,12 @@ class CuReSAC(SAC):
         :param batch_size: Transitions per update
         """
         if self._overlapped is not None and self.num_timesteps < self._total_timesteps:
-            self._overlapped.defer(partial(self._train, gradient_steps, batch_size))
+            self._overlapped.defer(partial(self._train, gradient_steps, batch_size, self._asks_for_burst))
         else:
-            self._train(gradient_steps, batch_size)
+            self._train(gradient_steps, batch_size, self._asks_for_burst)
 
-    def _train(self, gradient_steps: int, batch_size: int) -> None:
+    def _train(self, gradient_steps: int, batch_size: int, is_burst: bool) -> None:
+        self._is_burst = is_burst
         if self.is_plain_sac:
             # SB3's update knows no guard: its optimisers look before they step.
             optimizers = {"actor": self.actor.optimizer, "critic": self.critic.optimizer}
@@ -693,7 +701,8 @@ class CuReSAC(SAC):
             self._update_learning_rates()
             for _ in range(gradient_steps):
                 # Two in either phase, so that SRL and RL are as many as when they are simultaneous.
-                for self._part in range(self._updates_per_step):
+                for part in range(self._updates_per_step):
+                    self._part = part
                     random_state = np.random.get_state(legacy=False)
                     batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
                     with self._guard.update(self, batch, random_state):
@@ -839,7 +848,7 @@ class CuReSAC(SAC):
         self._guard.step(agent.critic.optimizer)
         prefix = self._prefix(agent)
         self._log({f"{prefix}critic_loss": critic_loss, f"{prefix}q_value": q_values[0].mean()})  # type: ignore[dict-item]
-        if self._n_rl_updates % self.actor_update_interval == 0:
+        if self._is_burst or self._n_rl_updates % self.actor_update_interval == 0:
             self._update_actor(agent, *encoded.for_actor())
 
     def _update_actor(self, agent: Agent, features: th.Tensor, latents: th.Tensor) -> None:
@@ -873,9 +882,9 @@ class CuReSAC(SAC):
         """Polyak steps, where they are due: of the target encoder, and of the target critics where critics move."""
         policy = self.policy
         n_updates = self._n_updates * self._updates_per_step + self._part
-        if n_updates % self.target_update_interval == 0:
+        if self._is_burst or n_updates % self.target_update_interval == 0:
             _polyak(policy.encoder, policy.encoder_target, self._guard.rate(self.encoder_tau))
-        if self._in_rl_phase and self._n_rl_updates % self.target_update_interval == 0:
+        if self._in_rl_phase and (self._is_burst or self._n_rl_updates % self.target_update_interval == 0):
             for agent in (self._task_agent, self._curious_agent):
                 if agent is not None:
                     _polyak(agent.critic, agent.critic_target, self._guard.rate(self.tau))

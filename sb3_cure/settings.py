@@ -48,7 +48,8 @@ MAX_STACKED_FRAMES = 2**20
 #: What belongs to a running model alone, and is never a setting: made anew by set-up or ``learn``
 NEVER_SAVED = frozenset(
     "policy device env replay_buffer rollout_buffer _vec_normalize_env _logger actor critic critic_target _metrics "
-    "_guard _transition_guard _task_agent _curious_agent _overlapped _run _is_pretrained _part".split()
+    "_guard _transition_guard _task_agent _curious_agent _overlapped _run _is_pretrained _part "
+    "_asks_for_burst _is_burst".split()
 )
 #: What set-up derives from other settings
 DERIVED = frozenset(
