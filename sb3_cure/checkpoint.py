@@ -167,8 +167,8 @@ def training_state(model: "CuReSAC", environments_may_be_gone: bool = False) -> 
         "metrics": {
             "sums": dict(model._metrics._sums),
             "counts": dict(model._metrics._counts),
-            # Measured now and then, logged every time (sequential updates)
-            "shares": {} if model.is_plain_sac else dict(model.policy.encoder_optimizer.shares),
+            # Measured now and then, logged every time
+            "parameter_norms": {} if model.is_plain_sac else dict(model.policy.encoder_optimizer.parameter_norms),
         },
         "logger": _logger_state(model),
         "callbacks": [_changed(watched) for watched in model._run.watched],
@@ -535,8 +535,8 @@ class Resumption:
             model._metrics._sums = {key: value.to(model.device) for key, value in metrics["sums"].items()}
             model._metrics._counts = dict(metrics["counts"])
             if not model.is_plain_sac:
-                shares = {key: value.to(model.device) for key, value in metrics["shares"].items()}
-                model.policy.encoder_optimizer.shares = shares
+                norms = {key: value.to(model.device) for key, value in metrics["parameter_norms"].items()}
+                model.policy.encoder_optimizer.parameter_norms = norms
 
     def enter(self, model: "CuReSAC") -> None:
         """Environments and random streams, last of all, so that nothing can disturb them.

@@ -1084,6 +1084,7 @@ class CuReSAC(SAC):
     def _record_metrics(self, batch: ReplayBufferSamples) -> None:
         optimizer = self.policy.encoder_optimizer
         self._log({f"train/latent_grad_norm_{name}": norm for name, norm in optimizer.gradient_norms.items()})
+        self._log({f"train/encoder_grad_norm_{name}": norm for name, norm in optimizer.parameter_norms.items()})
         self._log({f"train/encoder_share_{name}": share for name, share in optimizer.shares.items()})
         if self._n_updates % RECONSTRUCTION_INTERVAL == 0:
             self._log_reconstructions(batch)

@@ -4,6 +4,7 @@ The SRL loss and the critics' losses all pull at the encoder, with gradients tha
 A plain sum under one Adam would let the critics drown the autoencoder: Adam divides by the running size of the sum.
 """
 
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch import nn
 
 from sb3_cure.guards import Guard
 
-#: Every how many updates the sequential mode measures how far each source moved the encoder (it costs a copy)
+#: Every how many updates each source's gradient is measured at the encoder's parameters (joint: a pass for each)
 SHARE_INTERVAL = 50
 
 
@@ -60,12 +61,22 @@ class EncoderOptimizer:
         self.learning_rate = lr
         self._pulls: dict[str, th.Tensor] = {}
         self._norms: dict[str, th.Tensor] = {}
+        self._measured: dict[str, th.Tensor] = {}
         self._latents: th.Tensor | None = None
         self._n_steps = 0
         #: Norm of each source's gradient at the latents, of the last update (detached scalars)
         self.gradient_norms: dict[str, th.Tensor] = {}
-        #: Share of each source in the last measured step of the encoder; they add up to 1 (detached scalars)
-        self.shares: dict[str, th.Tensor] = {}
+        #: Norm of each source's gradient at the encoder's parameters, before anything is scaled, of the last update
+        #: that was measured (detached scalars)
+        self.parameter_norms: dict[str, th.Tensor] = {}
+
+    @property
+    def shares(self) -> dict[str, th.Tensor]:
+        """Share of each source in the sum of ``parameter_norms``: what a plain sum of the losses would be made of."""
+        if not self.parameter_norms:
+            return {}
+        total = th.stack(list(self.parameter_norms.values())).sum().clamp(min=1e-30)
+        return {source: norm / total for source, norm in self.parameter_norms.items()}
 
     def add_source(self, source: str) -> None:
         """
@@ -83,7 +94,7 @@ class EncoderOptimizer:
         """
         self.optimizers.pop(source, None)
         del self.mean_squares[source], self.weights[source]
-        self.gradient_norms, self.shares = {}, {}
+        self.gradient_norms, self.parameter_norms = {}, {}
 
     def pull(self, source: str, latents: th.Tensor, gradient: th.Tensor) -> None:
         """Take one source's gradient: step at once (sequential), or keep it for ``step`` (joint).
@@ -100,15 +111,14 @@ class EncoderOptimizer:
             optimizer.zero_grad()
             latents.backward(gradient)
             self.guard.check(f"{source} loss at the encoder", None, optimizer)
-            if self._n_steps % SHARE_INTERVAL == 0:
-                before = [parameter.detach().clone() for parameter in self.parameters]
-                self.guard.step(optimizer)
-                moved = [now.detach() - then for now, then in zip(self.parameters, before, strict=True)]
-                self._pulls[source] = th.linalg.vector_norm(th.stack(th._foreach_norm(moved)))
-            else:
-                self.guard.step(optimizer)
+            if self._is_measured:
+                self._measured[source] = _norm([parameter.grad for parameter in self.parameters])
+            self.guard.step(optimizer)
         else:
             self.guard.check(f"{source} loss at the latents", None, gradients=[gradient])
+            if self._is_measured:
+                own = th.autograd.grad(latents, self.parameters, gradient, retain_graph=True, allow_unused=True)
+                self._measured[source] = _norm(own)
             # The policy may have moved to another device since this average was made.
             mean_square = self.mean_squares[source].to(norm.device)
             # A bad gradient counts as one of the usual size.
@@ -120,9 +130,15 @@ class EncoderOptimizer:
             self._pulls[source] = gradient / size
             self._latents = latents
 
+    @property
+    def _is_measured(self) -> bool:
+        return self._n_steps % SHARE_INTERVAL == 0
+
     def step(self) -> None:
         """End one update: in joint mode, one backward pass with the scaled gradients and one step."""
         self._n_steps += 1
+        if self._measured:
+            self.parameter_norms, self._measured = self._measured, {}
         self.gradient_norms, self._norms = self._norms, {}
         if self.mode == "joint" and self._latents is not None:
             optimizer = self.optimizers["joint"]
@@ -131,16 +147,11 @@ class EncoderOptimizer:
             self._latents.backward(th.stack(list(self._pulls.values())).sum(dim=0))
             self.guard.check("joint loss at the encoder", None, optimizer)
             self.guard.step(optimizer)
-            self._latents = None
-        if self._pulls:
-            sizes = {source: pull.norm() for source, pull in self._pulls.items()}
-            total = th.stack(list(sizes.values())).sum().clamp(min=1e-30)
-            self.shares = {source: size / total for source, size in sizes.items()}
-            self._pulls = {}
+            self._pulls, self._latents = {}, None
 
     def discard(self) -> None:
         """Forget the pulls of an update that is not brought to its end."""
-        self._pulls, self._norms, self._latents = {}, {}, None
+        self._pulls, self._norms, self._measured, self._latents = {}, {}, {}, None
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """
@@ -192,3 +203,8 @@ class EncoderOptimizer:
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
         self.weights = dict(state["weights"])
         self._n_steps = state["n_steps"]
+
+
+def _norm(gradients: Iterable[th.Tensor | None]) -> th.Tensor:
+    """Norm of all gradients together; None: that parameter was not used."""
+    return th.linalg.vector_norm(th.stack(th._foreach_norm([grad for grad in gradients if grad is not None])))
