@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from sb3_cure.augmentations import center_crop, random_crop, random_shift
 from sb3_cure.encoders import Encoder
+from sb3_cure.layers import full_precision
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.values import is_integer, is_one_of
 
@@ -137,8 +138,9 @@ class CURL(SRLHead):
         self._fill_bank(batch.observations)
         keys = self._keys(self._augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
-        # Row maxima are subtracted inside cross_entropy.
-        error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
+        # In fp32, where autocast would round the products; row maxima are subtracted inside cross_entropy.
+        with full_precision(latents):
+            error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
         return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()
@@ -156,11 +158,13 @@ class CURL(SRLHead):
         # The same offset for all, drawn for them as one image of many channels: neither batch size nor order matters.
         views = self._augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
-        weighted = latents.float() @ self.W
-        logits = (weighted * own).sum(dim=1, keepdim=True)
+        with full_precision(latents):
+            weighted = latents.float() @ self.W
+            logits = (weighted * own).sum(dim=1, keepdim=True)
         if len(negatives) > 0:
             bank = self._keys(self._augment(negatives, th.Generator().manual_seed(1)))
-            logits = th.cat([logits, weighted @ bank.T], dim=1)
+            with full_precision(latents):
+                logits = th.cat([logits, weighted @ bank.T], dim=1)
         first = th.zeros(len(logits), dtype=th.long, device=logits.device)
         # Rounding can leave less than 0, or a -0.0.
         return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
