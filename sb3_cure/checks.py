@@ -637,6 +637,11 @@ def check_srl_output(head: nn.Module, output: Any, trains: bool) -> None:
             f"{name}.loss returned a loss {kind}, but it must be one number that depends on the latents or on the "
             "head's parameters: average over the batch, and detach the error only."
         )
+    if output[1].dtype in (th.bfloat16, th.float16):
+        raise ValueError(
+            f"{name}.loss returned an error in {output[1].dtype}, too few digits for the curious reward to "
+            "be made of: compute it within sb3_cure.layers.full_precision(latents), or set mixed_precision = False."
+        )
 
 
 def check_srl_error(error: th.Tensor, batch_size: int, look: bool) -> None:

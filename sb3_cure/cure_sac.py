@@ -769,7 +769,7 @@ class CuReSAC(SAC):
         trains = self._in_srl_phase
         # The loss stops at a copy of the latents; the encoder's optimiser takes the gradient from there.
         latents = encoded.latents.detach().requires_grad_(trains)
-        with th.set_grad_enabled(trains), self._autocast():
+        with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
             output = srl.loss(batch, latents)
         check_srl_output(srl, output, trains)
         # In full precision, whatever the head computes in.
@@ -788,6 +788,7 @@ class CuReSAC(SAC):
         if self.curiosity_target == "next_observation" and self._uses_curious_reward:
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features()).float()
+            with th.no_grad(), self._autocast(srl.mixed_precision):
                 _, error = srl.loss(batch._replace(observations=batch.next_observations), next_latents)  # type: ignore[arg-type]
             error = error.float()
         return error
@@ -917,8 +918,8 @@ class CuReSAC(SAC):
         """What schedules get: SB3's own goes below zero where the last rollout goes beyond ``total_timesteps``."""
         return max(self._current_progress_remaining, 0.0)
 
-    def _autocast(self) -> th.autocast:
-        return autocast_context(self._computed_precision, self.device)
+    def _autocast(self, wanted: bool = True) -> th.autocast:
+        return autocast_context(self._computed_precision if wanted else "fp32", self.device)
 
     def _update_learning_rates(self) -> None:
         """One schedule for everything; the temperatures follow it at a fixed ratio, so that a zero freezes all."""

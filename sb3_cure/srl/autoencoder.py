@@ -111,6 +111,7 @@ class RAE(SRLHead):
     """
 
     warmup_updates = 1000
+    mixed_precision = True
 
     def __init__(
         self,

@@ -35,6 +35,9 @@ class SRLHead(nn.Module):
 
     #: Gradient steps in one burst after the random warm-up, unless ``warmup_updates`` says otherwise
     warmup_updates: ClassVar[int] = 0
+    #: Whether ``loss`` is run under autocast where networks compute in bf16 (fast for convolutions). The head then has
+    #: to see to it that its error is made in fp32 (``layers.full_precision``); otherwise all of it is
+    mixed_precision: ClassVar[bool] = False
     #: Optimiser of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
     #: Extra arguments (but the learning rate) of the optimiser of the head's own parameters, e.g. weight decay

@@ -34,6 +34,8 @@ class CURL(SRLHead):
     :raises ValueError: if observations are no images or too small to crop
     """
 
+    mixed_precision = True
+
     def __init__(
         self,
         encoder: Encoder,
