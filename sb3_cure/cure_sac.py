@@ -159,7 +159,8 @@ class CuReSAC(SAC):
     :param normalize_curiosity: Divide the error by its running size and clip at 5, less the batch's mean unless it is a
         bonus; False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free), or
-        ``"next_observation"``, for which the head gets the batch with the next observations as its observations
+        ``"next_observation"``, for which the head gets these as the observations of a batch without actions. Heads of
+        transitions (``needs_next_latents``) always see true ones, whose error rewards them either way
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param warmup_updates: Updates in one burst after ``learning_starts``, each of which updates actors, temperatures
@@ -785,11 +786,15 @@ class CuReSAC(SAC):
                 self._guard.step(srl.optimizer)
         check_srl_error(error, len(batch.observations), look=self._n_updates == 0)
         self._log({"train/srl_loss": loss, "train/srl_error": error.mean()})
-        if self.curiosity_target == "next_observation" and self._uses_curious_reward:
+        # The error of a transition model is about the next observation as it is.
+        about_next = self.curiosity_target == "next_observation" and not srl.needs_next_latents
+        if about_next and self._uses_curious_reward:
+            # With nothing else, so that no model of transitions takes (s', a, s') for one.
+            next_batch = ReplayBufferSamples(batch.next_observations, None, None, None, None)  # type: ignore[arg-type]
             with th.no_grad(), self._autocast():
                 next_latents = self.policy.encoder.projection(encoded.next_features()).float()
             with th.no_grad(), self._autocast(srl.mixed_precision):
-                _, error = srl.loss(batch._replace(observations=batch.next_observations), next_latents)  # type: ignore[arg-type]
+                _, error = srl.loss(next_batch, next_latents)
             error = error.float()
         return error
 

@@ -38,6 +38,10 @@ class SRLHead(nn.Module):
     #: Whether ``loss`` is run under autocast where networks compute in bf16 (fast for convolutions). The head then has
     #: to see to it that its error is made in fp32 (``layers.full_precision``); otherwise all of it is
     mixed_precision: ClassVar[bool] = False
+    #: Whether the head is about transitions (s, a, s') rather than single observations: its error then rewards the
+    #: transition whatever ``curiosity_target`` says. Other heads are asked for the next observations' errors with a
+    #: batch of these alone, all of whose other fields are None
+    needs_next_latents: ClassVar[bool] = False
     #: Optimiser of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
     #: Extra arguments (but the learning rate) of the optimiser of the head's own parameters, e.g. weight decay
