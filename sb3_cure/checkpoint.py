@@ -506,13 +506,10 @@ class Resumption:
     def __init__(self, generation: Generation, state: dict[str, Any], model: "CuReSAC"):
         self.generation = generation
         self.state = state
-        kept = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_num_timesteps_at_start", "action_noise")
+        kept = ("_last_obs", "_last_episode_starts", "_last_original_obs", "action_noise")
         self._kept = {name: copy.deepcopy(getattr(model, name)) for name in kept}
-
-    @property
-    def started_at(self) -> int:
-        """Agent steps at which the interrupted call began."""
-        return self._kept["_num_timesteps_at_start"]
+        #: Agent steps at which the call that is gone on with began
+        self.started_at: int = model._num_timesteps_at_start
 
     def set_up(self, model: "CuReSAC") -> None:
         """Counters of callbacks, files of the logger and what was not yet logged.
@@ -572,12 +569,13 @@ class Run:
         #: Of these, calls that were over when the checkpoint was taken, and that the script will make again
         self.done: list[str] = []
 
-    def skips(self, call: str) -> bool:
+    def skips(self, call: str, counts_anew: bool = True) -> bool:
         """
         :param call: ``"learn"`` or ``"pretrain"``, which is being called
+        :param counts_anew: Its ``reset_num_timesteps``: without, it asks for more steps and is none of those before
         :return: Whether the checkpoint that was resumed from was taken after it
         """
-        if self.resumed is not None and self.done[:1] == [call]:
+        if self.resumed is not None and counts_anew and self.done[:1] == [call]:
             self.done.pop(0)
             print(f"{call} number {len(self.calls) - len(self.done)} of this training was over: skipped")
             return True

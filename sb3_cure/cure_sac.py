@@ -471,9 +471,13 @@ class CuReSAC(SAC):
     ) -> tuple[int, BaseCallback]:
         resumed = self._run.resumed
         if resumed is not None:
-            # The interrupted call is gone on with, whose total is meant.
+            if reset_num_timesteps:
+                # The interrupted call is gone on with, whose total is meant.
+                total_timesteps += resumed.started_at - self.num_timesteps
+            else:
+                # So many steps more, as everywhere in SB3: a call of its own.
+                resumed.started_at = self.num_timesteps
             reset_num_timesteps = False
-            total_timesteps += resumed.started_at - self.num_timesteps
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -959,7 +963,7 @@ class CuReSAC(SAC):
         :return: self
         """
         check_learning(self, total_timesteps, callback, log_interval)
-        if self._run.skips("learn"):
+        if self._run.skips("learn", reset_num_timesteps):
             return self
         # A checkpoint taken while pretraining may have been loaded.
         self._end_pretraining()
@@ -1026,7 +1030,7 @@ class CuReSAC(SAC):
         if collector == "curious":
             check_curious_agent(self)
         check_learning(self, total_timesteps, callback, log_interval)
-        if self._run.skips("pretrain"):
+        if self._run.skips("pretrain", reset_num_timesteps):
             return self
         if self._run.resumed is not None and self._collector != collector:
             raise ValueError(
@@ -1276,6 +1280,8 @@ class CuReSAC(SAC):
         The same calls of ``learn`` and ``pretrain`` as before, with the same numbers of timesteps and the same
         callbacks, then do what was left: those that were over are skipped, so that a script can be started again as it
         is. Log files are gone on with where ``set_logger`` is called as before.
+
+        A call with ``reset_num_timesteps=False`` is a new one: it does as many steps more as it says, as in SB3.
 
         :param path: Folder of the checkpoints
         :param env: Environments as those before: as many, of the same settings
