@@ -1262,6 +1262,7 @@ class CuReSAC(SAC):
                 f"{name} is no replay buffer that this package saved without pickle, and unpickling runs any code that "
                 "is in a file: if you know where it comes from, load it with trusted=True."
             )
+        self.replay_buffer.device = self.device  # type: ignore[union-attr]
         rows = self.replay_buffer.buffer_size  # type: ignore[union-attr]
         if rows != max(self.buffer_size // self.n_envs, 1):
             self.buffer_size = rows * self.n_envs  # with which checkpoints and archives are loaded again

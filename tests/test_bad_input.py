@@ -541,13 +541,6 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "through policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=...)).",
     ),
     # --- actions
-    "discrete actions": (
-        "CnnPolicy",
-        actions(spaces.Discrete(3)),
-        {},
-        "the action space is Discrete(3), but SAC needs continuous actions (a Box): use "
-        "another algorithm (DQN, PPO), or an environment with continuous actions.",
-    ),
     "unbounded actions": (
         "CnnPolicy",
         actions(spaces.Box(-np.inf, np.inf, (2,), np.float32)),
