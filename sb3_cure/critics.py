@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.layers import full_precision
+from sb3_cure.layers import first_in_fp32, full_precision
 
 
 class LatentCritic(nn.Module):
@@ -52,18 +52,12 @@ class LatentCritic(nn.Module):
         :return: Values in fp32, [B, n_critics, n_values]
         """
         inputs = th.cat([latents, actions], dim=1)
-        return th.stack([_first_and_last_in_fp32(network, inputs) for network in self.q_networks], dim=1)
-
-
-def _first_and_last_in_fp32(network: Any, inputs: th.Tensor) -> th.Tensor:
-    """Of bf16's eight bits, actions of .500 and .501 are the same; and values need more than eight."""
-    first, *hidden, last = network if len(network) > 1 else (nn.Identity(), *network)
-    with full_precision(inputs):
-        values = first(inputs.float())
-    for layer in hidden:
-        values = layer(values)
-    with full_precision(values):
-        return last(values.float())
+        values = []
+        for *hidden, last in self.q_networks:  # type: ignore[misc]
+            values.append(first_in_fp32(hidden, inputs))
+            with full_precision(inputs):
+                values[-1] = last(values[-1].float())
+        return th.stack(values, dim=1)
 
 
 class TwinQ:

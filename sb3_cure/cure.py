@@ -423,8 +423,10 @@ class CuRe(OffPolicyAlgorithm):
                 updates = 0 if self.srl is None or learning_starts == 0 else get_srl_class(self.srl).warmup_updates
             if updates > 0 and self.gradient_steps != 0:
                 self._in_burst = True
-                self.train(gradient_steps=updates, batch_size=self.batch_size)
-                self._in_burst = False
+                try:
+                    CuRe.train(self, gradient_steps=updates, batch_size=self.batch_size)  # now, also with overlap=True
+                finally:
+                    self._in_burst = False
         return rollout
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -499,10 +501,10 @@ class CuRe(OffPolicyAlgorithm):
         read = [_read(run.latents, trains) for run in runs]
         with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
             loss, error = srl.loss(batch, *(latents for _, latents in read))
-        if error.shape != (len(batch.views),) or error.requires_grad:
+        if error.shape != (len(batch.views),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
             raise ValueError(
-                f"{type(srl).__name__}.loss returned an error of shape {tuple(error.shape)} (requires_grad="
-                f"{error.requires_grad}), but it is one number per sample, detached: return SRLOutput(loss, error[B])."
+                f"{type(srl).__name__}.loss returned an error of shape {tuple(error.shape)} in {error.dtype} "
+                f"(requires_grad={error.requires_grad}), but it is one number per sample, detached, in fp32."
             )
         if trains:
             self._learn_from("srl", loss.float(), srl.optimizer, "srl", read)
@@ -514,7 +516,8 @@ class CuRe(OffPolicyAlgorithm):
             with th.no_grad(), self._autocast(srl.mixed_precision):
                 views = self.policy.augmentation(batch.next_observations)
                 latents = self.policy.encoder(self.policy.preprocess(views)).float()
-                shown = batch._replace(observations=batch.next_observations, views=views)
+                # With nothing else, so that no head takes (s', a, s') for a transition.
+                shown = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
                 error = srl.loss(shown, latents).error
         return error.float()
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_cure.encoders import Encoder
 
-#: Every how many updates the shares of the sources are measured, which costs a backward pass for each
+#: Every how many updates gradients are measured at the parameters, which costs a backward pass for each source
 SHARE_INTERVAL = 100
 
 #: Takes a loss's name, the loss and an optimiser, and makes a step
@@ -74,8 +74,8 @@ class EncoderUpdate:
             self.add_source(source)
         #: Within what the encoder runs; the algorithm puts its own here
         self.autocast: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
-        #: Share of each source in what moved the encoder's parameters when that was measured last
-        self.shares: dict[str, th.Tensor] = {}
+        #: Norm of each source's gradient at the encoder's parameters, when that was measured last
+        self.parameter_norms: dict[str, th.Tensor] = {}
         self._n_updates = 0
         self.begin(th.empty(0), th.empty(0))
 
@@ -93,7 +93,7 @@ class EncoderUpdate:
         """
         self.optimizers.pop(source, None)
         del self.mean_squares[source], self.weights[source]
-        self.shares = {}
+        self.parameter_norms = {}
 
     def begin(self, views: th.Tensor, next_views: th.Tensor) -> None:
         """Begin an update, and forget one that was not brought to its end.
@@ -105,7 +105,7 @@ class EncoderUpdate:
         self._runs: dict[str, Encoded] = {}
         self._pulls: dict[str, list[tuple[th.Tensor, th.Tensor]]] = {}
         self.gradient_norms: dict[str, th.Tensor] = {}
-        self._sizes: dict[str, th.Tensor] = {}
+        self._measured: dict[str, th.Tensor] = {}
 
     def run(self) -> Encoded:
         """
@@ -137,6 +137,11 @@ class EncoderUpdate:
         """
         norm = th.stack(th._foreach_norm([gradient for _, gradient in gradients])).norm()
         self.gradient_norms[source] = norm
+        if self._n_updates % SHARE_INTERVAL == 0:
+            parameters = [parameter for parameter in self.encoder.parameters() if parameter.requires_grad]
+            outputs, at_outputs = zip(*gradients, strict=True)
+            own = th.autograd.grad(outputs, parameters, at_outputs, retain_graph=True, allow_unused=True)
+            self._measured[source] = th.stack(th._foreach_norm([each for each in own if each is not None])).norm()
         if self.mode == "joint":
             # The policy may have moved to another device since this average was made.
             mean_square = self.mean_squares[source].to(norm.device)
@@ -147,7 +152,7 @@ class EncoderUpdate:
             self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
             size = (self.mean_squares[source] / self.weights[source]).sqrt().clamp(min=1e-30)
             gradients = [(latents, gradient / size) for latents, gradient in gradients]
-        self._pulls[source] = list(gradients)
+        self._pulls[source] = gradients
 
     def step(self, optimize: Optimize) -> None:
         """Move the encoder along the gradients that were given since the last step; without any, do nothing.
@@ -157,36 +162,30 @@ class EncoderUpdate:
         if not self._pulls:
             return
         losses: dict[str, th.Tensor] = {}
-        trained = [parameter for parameter in self.encoder.parameters() if parameter.requires_grad]
-        measures = self._n_updates % SHARE_INTERVAL == 0 and bool(trained)
         for source, pulls in self._pulls.items():
             for latents, gradient in pulls:  # the gradient of (latents * g).sum() at the latents is g
                 losses[source] = losses.get(source, 0) + (latents * gradient).sum()
-            if measures and self.mode == "joint":
-                moved = th.autograd.grad(losses[source], trained, retain_graph=True, materialize_grads=True)
-                self._sizes[source] = th.stack(th._foreach_norm(moved)).norm()
         optimizer = self.optimizers["joint" if self.mode == "joint" else source]
         factor = len(losses) ** 0.5 if self.mode == "joint" else 1.0
         update_learning_rate(optimizer, self.learning_rate * factor)
-        before = [p.detach().clone() for p in trained] if measures and self.mode == "sequential" else []
         optimize("encoder", th.stack(list(losses.values())).sum(), optimizer)
-        if before:  # each source has an Adam, whose step is not as long as the gradient
-            with th.no_grad():
-                self._sizes[source] = th.stack(th._foreach_norm(th._foreach_sub(trained, before))).norm()
         self._pulls, self._runs = {}, {}
 
     def end(self) -> dict[str, th.Tensor]:
         """End an update.
 
-        :return: Norm of each source's gradient at the latents, and the share of each source in what moved the encoder's
-            parameters when that was measured last, by their logged names (detached scalars; the shares add up to 1)
+        :return: Norms of each source's gradient, before anything is scaled: at the latents, and, when that was measured
+            last, at the encoder's parameters, with the share of each source there: what a plain sum of the losses would
+            be made of. By their logged names, detached scalars
         """
         self._n_updates += 1
-        if self._sizes:
-            total = th.stack(list(self._sizes.values())).sum().clamp(min=1e-30)
-            self.shares = {source: size / total for source, size in self._sizes.items()}
+        if self._measured:
+            self.parameter_norms = self._measured
         metrics = {f"latent_grad_norm_{source}": norm for source, norm in self.gradient_norms.items()}
-        metrics |= {f"encoder_share_{source}": share for source, share in self.shares.items()}
+        if self.parameter_norms:
+            total = th.stack(list(self.parameter_norms.values())).sum().clamp(min=1e-30)
+            for source, norm in self.parameter_norms.items():
+                metrics[f"encoder_grad_norm_{source}"], metrics[f"encoder_share_{source}"] = norm, norm / total
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
@@ -198,7 +197,7 @@ class EncoderUpdate:
             "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
             "weights": dict(self.weights),
             "n_updates": self._n_updates,
-            "shares": dict(self.shares),
+            "parameter_norms": dict(self.parameter_norms),
         }
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
@@ -220,4 +219,4 @@ class EncoderUpdate:
             optimizer.load_state_dict(state["optimizers"][name])
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
         self.weights = dict(state["weights"])
-        self._n_updates, self.shares = state["n_updates"], dict(state["shares"])
+        self._n_updates, self.parameter_norms = state["n_updates"], dict(state["parameter_norms"])

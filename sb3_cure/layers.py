@@ -1,6 +1,7 @@
 """Building blocks of the encoder, the decoder, the actors and the critics."""
 
-from typing import TypeVar
+import contextlib
+from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -90,6 +91,21 @@ class FullPrecisionLinear(nn.Linear):
             return super().forward(inputs.float())
 
 
+def first_in_fp32(layers: Any, inputs: th.Tensor) -> th.Tensor:
+    """Run layers of an actor or a critic, the first of them in fp32: of bf16's digits, actions .500 and .501 are one.
+
+    The first layer is small; the products of the wide hidden layers are what bf16 is for.
+
+    :param layers: Linear maps and activations
+    :param inputs: Latents, with or without actions, [B, n]
+    :return: Output of the last layer
+    """
+    for i, layer in enumerate(layers):
+        with full_precision(inputs) if i == 0 else contextlib.nullcontext():
+            inputs = layer(inputs.float() if i == 0 else inputs)
+    return inputs
+
+
 class ConvTranspose2d(nn.ConvTranspose2d):
     """torch's transposed convolution, its bias added afterwards: inside, oneDNN's bias gradient costs as much as
     that of the weights. Square strides, no padding but ``output_padding``."""
@@ -129,7 +145,9 @@ class Projection(nn.Module):
         self.tanh = tanh
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        projected = self.linear(features)
+        # Convolutions within autocast pass bf16 on; features of vectors are fp32, and stay so.
+        with full_precision(features) if features.dtype == th.float32 else contextlib.nullcontext():
+            projected = self.linear(features)
         with full_precision(projected):
             latents = self.norm(projected.float())
             return th.tanh(latents) if self.tanh else latents

@@ -22,7 +22,7 @@ from sb3_cure.critics import LatentCritic, TwinQ
 from sb3_cure.encoder_update import EncoderUpdate
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.intrinsic import IntrinsicReward, RewardScale
-from sb3_cure.layers import Projection, full_precision, init_weights, preprocess
+from sb3_cure.layers import Projection, first_in_fp32, full_precision, init_weights, preprocess
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
 
@@ -40,7 +40,7 @@ class TrunkActor(Actor):
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation before squashing, [B, action_dim] each
         """
-        latent = self.latent_pi(self.features_extractor(obs))
+        latent = first_in_fp32(self.latent_pi, self.features_extractor(obs))
         with full_precision(latent):
             latent = latent.float()
             # Rescaled, not clamped: a clamped log std has no gradient with which to come back.

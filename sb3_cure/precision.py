@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
+from torch._functorch import config as functorch_config
 
 #: Why ``compile="auto"`` is eager
 NOT_COMPILED = {
@@ -92,6 +93,8 @@ def compile_while_training(module: nn.Module, owner: nn.Module) -> None:
     def call(*args: Any, **kwargs: Any) -> Any:
         return module._call_impl(*args, **kwargs)
 
+    # Graphs are gone through once for each source to measure its share of the encoder's gradient (EncoderOptimizer).
+    functorch_config.donated_buffer = False
     # A function of ours, as torch.compile passes over frames of torch.nn itself, such as that of nn.Sequential; with a
     # code object of its own, by which compiled graphs are kept and counted.
     call.__code__ = call.__code__.replace()

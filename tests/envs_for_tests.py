@@ -68,6 +68,32 @@ class VectorBox(gym.Env):
         self.np_random.bit_generator.state = state["generator"]
 
 
+class Cliff(gym.Env):
+    """A point on [-1, 1], moved by 0.3 x action, that falls off the left end: the only one here that terminates.
+
+    Observations are (position, 1 at a reset, 1 after the fall): an observation after a fall is like no other, and no
+    transition starts from it. Staying pays 1 per step. Episodes are truncated after 20 steps.
+    """
+
+    def __init__(self) -> None:
+        self.action_space = spaces.Box(-1, 1, (1,), np.float32)
+        self.observation_space = spaces.Box(-2, 2, (3,), np.float32)
+        self.position = 0.0
+        self.n_steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.position = float(self.np_random.uniform(-0.9, 0.9))
+        self.n_steps = 0
+        return np.array([self.position, 1, 0], np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.position = min(self.position + 0.3 * float(action[0]), 1.0)
+        self.n_steps += 1
+        fell = self.position < -1
+        return np.array([self.position, 0, fell], np.float32), 1.0, fell, self.n_steps >= 20, {}
+
+
 class PixelBox(VectorBox):
     """``VectorBox`` seen as the newest ``frame_stack`` frames: uint8 (3 * frame_stack, size, size), oldest first.
 

@@ -29,9 +29,9 @@ from sb3_cure.callbacks import (
     ReconstructionCallback,
 )
 from sb3_cure.envs import make_pixel_env
-from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 from sb3_cure.evaluation import most_uncomfortable, run_episodes
 from sb3_cure.srl import RAE, SRLOutput
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 IMAGE = spaces.Box(0, 255, (3, 36, 36), np.uint8)
 VECTOR = spaces.Box(-1, 1, (3,), np.float32)
@@ -542,13 +542,6 @@ CONSTRUCTOR: dict[str, tuple[Any, gym.Env | Callable[[], Any], dict[str, Any], s
         "through policy_kwargs=dict(features_extractor_kwargs=dict(n_layers=...)).",
     ),
     # --- actions
-    "discrete actions": (
-        "CnnPolicy",
-        actions(spaces.Discrete(3)),
-        {},
-        "the action space is Discrete(3), but SAC needs continuous actions (a Box): use "
-        "another algorithm (DQN, PPO), or an environment with continuous actions.",
-    ),
     "unbounded actions": (
         "CnnPolicy",
         actions(spaces.Box(-np.inf, np.inf, (2,), np.float32)),

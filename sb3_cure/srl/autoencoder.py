@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
-from sb3_cure.layers import ConvTranspose2d, conv_sizes, full_precision, init_weights
+from sb3_cure.layers import ConvTranspose2d, FullPrecision, conv_sizes, full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -84,8 +84,8 @@ class _SquaredError(th.autograd.Function):
         return difference * (gradient * (2 / difference[0].numel())).view(-1, 1, 1, 1), None
 
 
-class VectorDecoder(nn.Sequential):
-    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]."""
+class VectorDecoder(FullPrecision):
+    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]; in fp32, as its target is."""
 
     def __init__(self, latent_dim: int, out_dim: int, hidden_dim: int = 256):
         super().__init__(nn.Linear(latent_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, out_dim))

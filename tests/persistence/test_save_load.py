@@ -129,7 +129,7 @@ def test_loaded_model_acts_and_learns_alike(
     model.learn(21)
     assert model._n_updates == 11
     if curiosity in ("separate", "bonus"):
-        assert model.policy.curiosity.weight > 0 and model.policy.curiosity.mean > 0
+        assert model.policy.curiosity.weight > 0 and model.policy.curiosity.mean_square > 0
     if srl == "curl":
         assert model.policy.srl.bank_filled == 64 and model.policy.srl.bank.any()
     check_save_load(model, PixelBox, tmp_path)

@@ -1,0 +1,123 @@
+"""What the curious agent makes of the ends of episodes, and of an error that falls."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from agents_for_tests import one_update, q_values
+from envs_for_tests import Cliff, VectorBox, tiny_model
+
+from sb3_cure import CuReSAC
+from sb3_cure.srl import SRLHead, SRLOutput
+
+
+class ResetsAreNovel(SRLHead):
+    """No parameters; the error is high at resets, which no action leads to, and else a little higher to the right."""
+
+    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
+        position, reset, _ = batch.observations.unbind(dim=1)
+        return SRLOutput(0 * latents.square().mean(), reset + 0.05 * (position + 2))
+
+
+class HalfIsNovel(SRLHead):
+    """No parameters; the error is 1 in the right half of the square, else 0."""
+
+    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
+        return SRLOutput(0 * latents.square().mean(), (batch.observations[:, 0] > 0).float())
+
+
+class FallingError(SRLHead):
+    """No parameters; the error depends on the place and falls by 1 % with every batch."""
+
+    n_batches = 0
+
+    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
+        self.n_batches += 1
+        return SRLOutput(0 * latents.square().mean(), 0.99**self.n_batches * (2 + batch.observations[:, 0]))
+
+
+def curious_on_the_cliff(curiosity_gamma: float, ent_coef: float, updates: int, **kwargs: Any) -> CuReSAC:
+    """A curious agent, trained on random transitions of the cliff."""
+    arguments: dict[str, Any] = dict(srl=ResetsAreNovel, task=False, learning_starts=500, learning_rate=1e-3)
+    arguments |= dict(buffer_size=1000, target_update_interval=1, tau=0.02, encoder_tau=0.05, batch_size=32)
+    arguments |= dict(curiosity_gamma=curiosity_gamma, ent_coef=ent_coef, policy_kwargs={"net_arch": [16, 16]})
+    model = tiny_model("MlpPolicy", Cliff(), **{**arguments, **kwargs}).learn(500)
+    assert 10 < model.replay_buffer.dones[:500].sum() < 200
+    model.train(updates, batch_size=model.batch_size)
+    return model
+
+
+def deaths(model: CuReSAC) -> float:
+    """Of episodes of the curious policy that start in the left half, the share that end in a fall within 10 steps."""
+    env = Cliff()
+    falls = []
+    for position in np.linspace(-0.95, 0, 20):
+        observation, _ = env.reset(seed=0)
+        env.position = observation[0] = position
+        for _ in range(10):
+            action, _ = model.predict_curious(observation, deterministic=True)
+            observation, _, fell, _, _ = env.step(action)
+            if fell:
+                break
+        falls.append(fell)
+    return float(np.mean(falls))
+
+
+@pytest.mark.parametrize("arguments, dies", [({}, False), ({"curiosity_episodic": True}, True)])
+def test_dying_is_not_preferred_by_default(arguments: dict[str, Any], dies: bool) -> None:
+    """Nearly all rewards are below the mean: ending them pays if the return ends with the episode, and only then."""
+    share = deaths(curious_on_the_cliff(0.9, 0.02, 1000, learning_rate=3e-3, **arguments))
+    assert share > 0.6 if dies else share < 0.2
+
+
+def test_curious_values_of_terminal_states_stay_bounded() -> None:
+    """No sample starts from them, so that no update corrects what is bootstrapped from: over 20 000 updates they stay
+    beside the values of the states that are learned, far from the limit of 500 that rewards of 5 would allow."""
+    model = curious_on_the_cliff(0.99, 0.02, 0, learning_rate=3e-3, batch_size=16)
+    ended = model.replay_buffer.dones[:500, 0] == 1
+    ends = th.as_tensor(model.replay_buffer.next_observations[:500, 0][ended])
+    starts = th.as_tensor(model.replay_buffer.observations[:500, 0])
+    actions = th.linspace(-1, 1, 500)[:, None]
+    for _ in range(4):
+        model.train(5_000, batch_size=16)
+        with th.no_grad():
+            at_ends = q_values(model, "curious", model.policy.encode(ends), actions[: len(ends)])
+            at_starts = q_values(model, "curious", model.policy.encode(starts), actions)
+        assert float(at_starts.abs().max()) < 60
+        assert float(at_starts.min()) - 5 < float(at_ends.min()) <= float(at_ends.max()) < float(at_starts.max()) + 5
+
+
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_terminations_count_for_the_task_alone(update: str) -> None:
+    """By default; with ``curiosity_episodic=True`` for both agents."""
+    losses: dict[tuple[bool, int], dict[str, float]] = {}
+    for episodic in (True, False):
+        model = tiny_model("MlpPolicy", VectorBox(), learning_starts=40, learning_rate=0.0, update=update).learn(40)
+        model.replay_buffer.timeouts[:] = 0
+        for done in (0, 1):
+            model.replay_buffer.dones[:] = done
+            model._n_updates = 0  # the noise of the same draws
+            losses[episodic, done] = one_update(model)
+    for episodic in (True, False):
+        assert losses[episodic, 0]["critic_loss"] != losses[episodic, 1]["critic_loss"]
+        going_on, ending = (losses[episodic, done]["curious_critic_loss"] for done in (0, 1))
+        assert (ending == pytest.approx(going_on, rel=1e-4)) is not episodic
+
+
+def test_a_bonus_is_scaled_but_not_centred() -> None:
+    """Errors of 0 earn nothing, errors of 1 more than that: no state is worse than without curiosity."""
+    model = tiny_model("MlpPolicy", VectorBox(), srl=HalfIsNovel, curiosity="bonus", learning_starts=200).learn(200)
+    logged = one_update(model, batch_size=100)
+    share = logged["curious_reward_raw_mean"]
+    assert 0.1 < share < 0.9
+    assert logged["curious_reward_max"] == pytest.approx(share**-0.5, rel=1e-3)
+    assert logged["curious_reward_mean"] == pytest.approx(share**0.5, rel=1e-3)
+
+
+def test_curious_reward_stays_centred_while_errors_fall() -> None:
+    """What is subtracted does not lag behind the error: else nearly all rewards turn negative, without a reason."""
+    model = tiny_model("MlpPolicy", VectorBox(), srl=FallingError, learning_starts=200).learn(200)
+    model.train(600, batch_size=16)
+    means = [one_update(model, batch_size=16, seed=seed)["curious_reward_mean"] for seed in range(5)]
+    assert np.abs(means).max() < 0.05
