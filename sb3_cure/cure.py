@@ -666,7 +666,7 @@ class CuRe(OffPolicyAlgorithm):
 
 
 def _read(latents: th.Tensor, gradient: bool) -> Read:
-    return latents, latents.detach().requires_grad_(gradient)
+    return latents, latents.detach().requires_grad_(gradient and latents.requires_grad)
 
 
 @th.no_grad()

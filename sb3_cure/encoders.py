@@ -9,7 +9,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import FlattenImage, FullPrecisionLinear, Projection, conv_sizes, init_weights
+from sb3_cure.layers import FlattenImage, FullPrecision, Projection, conv_sizes, init_weights
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -97,7 +97,7 @@ class VectorEncoder(Encoder):
     ):
         super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
         inputs = get_flattened_obs_dim(observation_space)
-        self.trunk = nn.Sequential(nn.Flatten(), FullPrecisionLinear(inputs, hidden_dim), nn.ReLU())
+        self.trunk = FullPrecision(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
         self.projection = Projection(hidden_dim, features_dim, tanh)
         init_weights(self)
 

@@ -79,16 +79,16 @@ def full_precision(tensor: th.Tensor) -> th.autocast:
     return th.autocast(tensor.device.type, enabled=False)
 
 
-class FullPrecisionLinear(nn.Linear):
-    """A linear map outside of autocast: in bf16, 1.000 and 1.003 of a vector would be the same number."""
+class FullPrecision(nn.Sequential):
+    """Modules that compute in fp32 within autocast, too: they read vectors, of which bf16 keeps three digits."""
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
-        :param inputs: [B, in_features]
-        :return: fp32, [B, out_features]
+        :param inputs: What the first module reads
+        :return: What the last module returns
         """
         with full_precision(inputs):
-            return super().forward(inputs.float())
+            return super().forward(inputs)
 
 
 def first_in_fp32(layers: Any, inputs: th.Tensor) -> th.Tensor:

@@ -93,7 +93,7 @@ def compile_while_training(module: nn.Module, owner: nn.Module) -> None:
     def call(*args: Any, **kwargs: Any) -> Any:
         return module._call_impl(*args, **kwargs)
 
-    # Graphs are gone through once for each source to measure its share of the encoder's gradient (EncoderOptimizer).
+    # Graphs are gone through once for each source to measure its share of the encoder's gradient (EncoderUpdate).
     functorch_config.donated_buffer = False
     # A function of ours, as torch.compile passes over frames of torch.nn itself, such as that of nn.Sequential; with a
     # code object of its own, by which compiled graphs are kept and counted.
