@@ -77,14 +77,17 @@ def is_marked(info: Mapping[str, Any]) -> bool:
     return any(info.get(mark) is not None for mark in MARKS)
 
 
-def unmarked(buffer: ReplayBuffer, rows: ndarray, env_inds: ndarray) -> ndarray:
+def unmarked(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
     """
     :param buffer: A replay buffer
-    :param rows: Row positions, [n]
-    :param env_inds: Environment of each, [n]
-    :return: Which of these transitions may be sampled, bool [n]
+    :return: Rows, environments and ages (in rows) of all transitions that may be sampled, newest first, [n] each
     """
-    return ~buffer.marked[rows, env_inds] if isinstance(buffer, SkipsMarked) else np.ones(len(rows), dtype=bool)
+    # SB3's memory-saving variant has overwritten the observation of its oldest row
+    n_rows = buffer.size() - int(buffer.optimize_memory_usage and buffer.full)
+    ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
+    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+    good = ~buffer.marked[rows, env_inds] if isinstance(buffer, SkipsMarked) else np.ones(len(rows), dtype=bool)
+    return rows[good], env_inds[good], ages[good]
 
 
 def refuse_marked(buffer: ReplayBuffer, infos: Infos) -> None:
@@ -177,7 +180,6 @@ class SkipsMarked(ReplayBuffer):
             if len(good_rows) == 0:
                 raise ValueError("All transitions in the replay buffer are marked as faulty: mend the environments.")
             drawn = np.random.randint(0, len(good_rows), size=int(bad.sum()))
-            rows = rows.copy()
             rows[bad], env_inds[bad] = stored[good_rows[drawn]], good_envs[drawn]
         self.last_sampled = rows, env_inds
         return transitions(self, rows, env_inds, env)

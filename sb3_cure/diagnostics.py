@@ -68,59 +68,61 @@ class Temperature(NamedTuple):
 def look(
     model: Any, n_samples: int, min_updates: int, autoencoder_updates: int, temperature_bounds: Sequence[float]
 ) -> Iterator[Finding]:
-    """Look at a model in training.
+    """
+    Look at a model in training, from cause to effect, and no further than the first problem.
 
     What a fault may explain is not looked for while it lasts: behind a constant image all latents are alike, beside a
     huge temperature no reward counts.
 
-    :param model: An off-policy algorithm of SB3, or ``CuReSAC``
+    :param model: An off-policy algorithm of SB3, or of this package
     :param n_samples: Observations to look at
     :param min_updates: Updates before networks and temperatures are judged
     :param autoencoder_updates: Updates before the autoencoder is judged; its number is given from the start
     :param temperature_bounds: Least and greatest temperature
     :return: What was found
     """
-    constant = constant_image(model, n_samples)
-    if constant is not None:
-        yield constant
+    image = constant_image(model, n_samples)
+    if image is not None:
+        yield image
     if model._n_updates < max(min_updates, 1):
         return
     model.policy.set_training_mode(False)
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    found = [constant, temperature_at_bound(temperatures, model, temperature_bounds)]
-    if found[-1] is not None:
-        yield found[-1]
-    if any(finding.problem for finding in found if finding is not None):
+    found = temperature_at_bound(temperatures, model, temperature_bounds)
+    if found is not None:
+        yield found
+    if any(finding is not None and finding.problem for finding in (image, found)):
         return
-    for finding in _representation(model, batch, autoencoder_updates):
-        yield finding
-        if finding.problem:
+    for each in _networks(model, batch, temperatures, autoencoder_updates):
+        yield each
+        if each.problem:
             return
+
+
+def _networks(
+    model: Any, batch: ReplayBufferSamples, temperatures: Sequence[Temperature], autoencoder_updates: int
+) -> Iterator[Finding]:
+    encoded = _encode(model, batch)
+    if encoded is not None:
+        latents, silent = encoded
+        if silent:
+            yield dead_units(silent)
+        yield collapsed_latents(latents)
+        explained = explained_share(model, batch, latents)
+        if explained is not None:
+            yield autoencoder(explained, model._n_updates, autoencoder_updates)
     curious = curious_reward(model, temperatures)
     if curious is not None:
         yield curious
-
-
-def _representation(model: Any, batch: ReplayBufferSamples, autoencoder_updates: int) -> Iterator[Finding]:
-    """From cause to effect."""
-    encoded = _encode(model, batch)
-    if encoded is None:
-        return
-    latents, silent = encoded
-    if silent:
-        yield dead_units(silent)
-    yield collapsed_latents(latents)
-    explained = explained_share(model, batch, latents)
-    if explained is not None:
-        yield autoencoder(explained, model._n_updates, autoencoder_updates)
 
 
 # ------------------------------------------------------------------------ checks
 
 
 def constant_image(model: Any, n_samples: int) -> Finding | None:
-    """Environments whose latest observations are equal in every bit, while nothing moves or the camera sees nothing.
+    """
+    Environments whose latest observations are equal in every bit, while nothing moves or the camera sees nothing.
 
     Value: number of such environments. Expected: 0.
 
@@ -133,41 +135,38 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
     if not is_image_space(model.observation_space) or rows < MIN_ALIKE:
         return None
     chosen = np.linspace(0, rows - 1, min(rows, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
+    positions = (buffer.pos - 1 - chosen) % buffer.buffer_size
     constant = []
     for env in range(buffer.n_envs):
-        positions = (buffer.pos - 1 - chosen) % buffer.buffer_size
         seen = transitions(buffer, positions, np.full(len(chosen), env)).observations
         if bool((seen == seen[:1]).all()):
             constant.append(env)
-    problem = None
-    if constant:
-        problem = (
-            f"the last {rows} observations of environment {', '.join(map(str, constant))} are one and the same image, "
-            "but an agent that acts should see something move: look at what env.render() shows, and at camera_id."
-        )
-    return Finding("constant_image", len(constant), problem)
+    problem = (
+        f"the last {rows} observations of environment {', '.join(map(str, constant))} are one and the same image: look "
+        "at what env.render() shows, and at camera_id."
+    )
+    return Finding("constant_image", len(constant), problem if constant else None)
 
 
 def dead_units(silent: dict[str, float]) -> Finding:
-    """ReLUs of the encoder (channels of convolutions) that are 0 for all observations, hence get no gradient.
+    """
+    ReLUs of the encoder (channels of convolutions) that are 0 for all observations, hence get no gradient.
 
     Value: the largest share of such units in a layer. Expected: below ``DEAD_SHARE``.
 
     :param silent: By layer, the share of its units that are 0 for all observations
     """
     layer = max(silent, key=lambda name: silent[name])
-    problem = None
-    if silent[layer] >= DEAD_SHARE:
-        problem = (
-            f"{silent[layer]:.0%} of the units of the encoder's layer {layer!r} are 0 for every observation, but less "
-            f"than {DEAD_SHARE:.0%} should be, as these no longer learn: start anew with a smaller learning_rate, or "
-            "clip or scale the rewards."
-        )
-    return Finding("dead_units", silent[layer], problem)
+    problem = (
+        f"{silent[layer]:.0%} of the units of the encoder's layer {layer!r} are 0 for every observation and no longer "
+        "learn: start anew with a smaller learning_rate, or clip or scale the rewards."
+    )
+    return Finding("dead_units", silent[layer], problem if silent[layer] >= DEAD_SHARE else None)
 
 
 def collapsed_latents(latents: th.Tensor) -> Finding:
-    """Latents that are the same whatever is observed.
+    """
+    Latents that are the same whatever is observed.
 
     Value: standard deviation between observations over root mean square. Expected: at least ``LATENT_SPREAD``.
 
@@ -175,18 +174,16 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
     """
     deviation, size = latents.var(dim=0, correction=0).mean().sqrt(), latents.square().mean().sqrt()
     spread = float(deviation / size.clamp(min=1e-12))
-    problem = None
-    if spread < LATENT_SPREAD:
-        problem = (
-            f"the encoder's latents differ by {spread:.1e} of their size between observations, but should by "
-            f"{LATENT_SPREAD} at least, as the agent cannot tell what it sees: try a smaller learning_rate, or "
-            "another srl head or srl_kwargs."
-        )
-    return Finding("collapsed_latents", spread, problem)
+    problem = (
+        f"the encoder's latents differ by {spread:.1e} of their size between observations, but should by "
+        f"{LATENT_SPREAD} at least: try a smaller learning_rate, or another srl head or srl_kwargs."
+    )
+    return Finding("collapsed_latents", spread, problem if spread < LATENT_SPREAD else None)
 
 
 def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
-    """An autoencoder no better than the mean image, which is the best of all constant drawings.
+    """
+    An autoencoder no better than the mean image, which is the best of all constant drawings.
 
     Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` once there
     was time to learn; early on it is below 0.
@@ -195,18 +192,17 @@ def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
     :param updates: Updates that were made
     :param min_updates: Updates after which it is judged
     """
-    problem = None
-    if updates >= min_updates and explained < EXPLAINED_SHARE:
-        problem = (
-            f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, but should "
-            f"explain {EXPLAINED_SHARE} at least, as the mean image explains 0: try another learning_rate, more "
-            "filters (features_extractor_kwargs), or srl='curl'."
-        )
-    return Finding("autoencoder", explained, problem)
+    problem = (
+        f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, but should "
+        f"explain {EXPLAINED_SHARE} at least: try another learning_rate, more filters, or srl='curl'."
+    )
+    is_bad = updates >= min_updates and explained < EXPLAINED_SHARE
+    return Finding("autoencoder", explained, problem if is_bad else None)
 
 
 def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds: Sequence[float]) -> Finding | None:
-    """Temperatures that no longer weigh entropy against reward.
+    """
+    Temperatures that no longer weigh entropy against reward.
 
     SAC bounds its temperature nowhere but at 0, to which it falls where the policy stays more random than the target
     entropy asks whatever the temperature (no reward to be found, say); it rises without limit where the policy cannot
@@ -222,31 +218,29 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
     :param bounds: Least and greatest temperature
     :return: None for algorithms without temperature
     """
-    if not temperatures:
-        return None
     problems = []
     for agent, value, learned, log_prob in temperatures:
         entropy, target = -float(log_prob.mean()), float(model.target_entropy)
         gap = (entropy - target) / np.prod(model.action_space.shape)
         too_low, too_high = value < bounds[0], value > bounds[1]
+        expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected"
         if learned and ((too_low and gap > ENTROPY_GAP) or (too_high and gap < -ENTROPY_GAP)):
             advice = "see whether it finds any reward" if too_low else "set a smaller target_entropy"
             problems.append(
-                f"the temperature of the {agent} agent has run to {value:.1e}, but {bounds[0]:g} to {bounds[1]:g} "
-                f"was expected, and its policy's entropy is still {entropy:.1f} where {target:.1f} is the target: "
-                f"{advice}, or fix ent_coef."
+                f"the temperature of the {agent} agent has run to {expected}, and its policy's entropy is still "
+                f"{entropy:.1f} where {target:.1f} is the target: {advice}, or fix ent_coef."
             )
         elif not learned and value != 0 and (too_low or too_high):
             problems.append(
-                f"the temperature of the {agent} agent is fixed at {value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was "
-                "expected, beyond which either reward or entropy does not count: use ent_coef='auto', or scale the "
-                "rewards."
+                f"the temperature of the {agent} agent is fixed at {expected}, so either reward or entropy does not "
+                "count: use ent_coef='auto', or scale the rewards."
             )
-    return Finding("temperature", len(problems), problems[0] if problems else None)
+    return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
 
 
 def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding | None:
-    """A curious reward so small beside the entropy term that its agent acts at random.
+    """
+    A curious reward so small beside the entropy term that its agent acts at random.
 
     Value: standard deviation of the curious reward in the latest update over the mean of |temperature *
     log-probability| (what all observations earn alike steers nothing). Expected: at least ``CURIOUS_SHARE``.
@@ -255,25 +249,22 @@ def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding |
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
     :return: None without curiosity, without entropy term, or before the first update
     """
-    if not getattr(model, "_uses_curious_reward", False):
+    latest = model._metrics.latest if getattr(model, "_uses_curious_reward", False) else {}
+    deviation = float(latest.get("train/curious_reward_std", np.nan))
+    if np.isnan(deviation) or not temperatures or temperatures[-1].value == 0:
         return None
-    deviation = model._metrics.latest.get("train/curious_reward_std")
-    if deviation is None or not temperatures or temperatures[-1].value == 0:
-        return None
-    deviation, entropy = float(deviation), float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())
+    entropy = float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())
     ratio = deviation / max(entropy, 1e-12)
-    problem = None
-    if ratio < CURIOUS_SHARE:
-        problem = (
-            f"the curious reward varies by {deviation:.1e} while the entropy term is {entropy:.1e}, but "
-            f"{CURIOUS_SHARE} of it was expected at least, as the curious policy is close to random: use "
-            "normalize_curiosity=True, a larger curiosity_beta, or a smaller ent_coef."
-        )
-    return Finding("curious_reward", ratio, problem)
+    problem = (
+        f"the curious reward varies by {deviation:.1e} while the entropy term is {entropy:.1e}, so the curious "
+        "policy is close to random: use normalize_curiosity=True, or a larger curiosity_beta."
+    )
+    return Finding("curious_reward", ratio, problem if ratio < CURIOUS_SHARE else None)
 
 
 def software_rendering(env: VecEnv) -> Finding | None:
-    """Frames that the CPU draws on a machine with a GPU.
+    """
+    Frames that the CPU draws on a machine with a GPU.
 
     Value: 1 if so, else 0. OpenGL is asked in a process of its own, which takes a few seconds, on machines with a GPU
     only.
@@ -299,22 +290,21 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
     if found is None:
         return None
     encoder, encode = found
-    silent: dict[str, float] = {}
-    handles = []
-    for name, module in encoder.named_modules():
-        if isinstance(module, nn.ReLU):
+    peaks: dict[str, th.Tensor] = {}
 
-            def note(_: nn.Module, __: Any, output: th.Tensor, name: str = name) -> None:
-                peaks = output.transpose(0, 1).flatten(1).amax(dim=1)
-                silent[name] = float((peaks <= 0).float().mean())
+    def note(module: nn.Module, _: Any, output: th.Tensor) -> None:
+        peaks[names[module]] = output.transpose(0, 1).flatten(1).amax(dim=1)
 
-            handles.append(module.register_forward_hook(note))
+    names: dict[nn.Module, str] = {
+        module: name for name, module in encoder.named_modules() if isinstance(module, nn.ReLU)
+    }
+    handles = [module.register_forward_hook(note) for module in names]
     try:
         latents = encode(batch.observations)
     finally:
         for handle in handles:
             handle.remove()
-    return latents, silent
+    return latents, {name: float((peak <= 0).float().mean()) for name, peak in peaks.items()}
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
@@ -322,8 +312,7 @@ def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) 
     head = getattr(model.policy, "srl", None)
     if not isinstance(head, RAE):
         return None
-    targets = head.target(batch.observations, dither=False)
-    variance = float(targets.var(dim=0, correction=0).mean())
+    variance = float(head.target(batch.observations, dither=False).var(dim=0, correction=0).mean())
     return None if variance == 0 else 1 - float(head.error(batch, latents).mean()) / variance
 
 
@@ -332,12 +321,9 @@ def _temperatures(model: Any, batch: ReplayBufferSamples) -> Iterator[Temperatur
     if isinstance(model.policy, CuRePolicy):
         features = model.policy.encoder.trunk(model.policy.center(batch.observations))
         task = model._task_agent if model.task and model._collector is None else None
-        for agent in (task, model._curious_agent):
-            if agent is not None:
-                learned = agent.log_ent_coef is not None
-                yield Temperature(
-                    agent.name, float(agent.temperature()), learned, agent.actor.action_log_prob(features)[1]
-                )
+        for agent in filter(None, (task, model._curious_agent)):
+            log_prob = agent.actor.action_log_prob(features)[1]
+            yield Temperature(agent.name, float(agent.temperature()), agent.log_ent_coef is not None, log_prob)
     elif hasattr(model, "log_ent_coef"):
         learned = model.log_ent_coef is not None
         value = model.log_ent_coef.exp() if learned else model.ent_coef_tensor

@@ -1,7 +1,6 @@
 """Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
 
 import contextlib
-import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -9,27 +8,25 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from sb3_cure.buffers import transitions, unmarked
-from sb3_cure.checks import check_srl_error
-from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
 from sb3_cure.srl import CURL
-from sb3_cure.values import is_integer
 
 ACTORS = ("task", "curious", "random")
 
 
 @dataclass
 class Episode:
-    """What one episode showed.
+    """
+    What one episode of T agent steps showed.
 
-    :param rewards: Reward of each agent step, [T]
+    :param rewards: Reward of each step, [T]
     :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
-    :param observations: The observations before each step, [T, *shape]; of images the channels come first, as for the
-        model
+    :param observations: The observations before each step, [T, *shape]; images channels first, as the model has them
     :param frames: ``env.render()`` after each step, if asked for
     :param states: The true state of the environment before each step, [T, d], if asked for; else empty
     """
@@ -46,39 +43,37 @@ class Episode:
         return float(self.rewards.sum())
 
 
-def srl_errors(model: CuReSAC, batch: ReplayBufferSamples, chunk: int = 128) -> np.ndarray:
-    """SRL error of transitions without training noise, as the acting agent sees them (no augmentation).
+def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk: int = 128) -> np.ndarray:
+    """
+    SRL error of transitions without training noise, as the acting agent sees them (no augmentation).
 
     :param model: A model with an SRL head
     :param batch: Transitions, observations as stored (images in 0-255)
     :param chunk: How many at a time
     :return: Error per sample, [n]
-    :raises ValueError: if the head's error is not one number per sample
     """
-    policy = model.policy
+    policy: Any = model.policy
     policy.set_training_mode(False)
     errors = []
     with th.no_grad():
         for start in range(0, len(batch.observations), chunk):
-            part = ReplayBufferSamples(*[field[start : start + chunk] for field in batch if field is not None])
-            error = policy.srl.error(part, policy.encode(part.observations))  # type: ignore[union-attr]
-            check_srl_error(error, len(part.observations), look=False)
-            errors.append(error.float().cpu().numpy())
+            part = Samples(*[None if column is None else column[start : start + chunk] for column in batch])  # type: ignore[arg-type]
+            errors.append(policy.srl.error(part, policy.encode(part.observations)).float().cpu().numpy())
     return np.concatenate(errors)
 
 
-def trained_actors(model: CuReSAC) -> list[str]:
+def trained_actors(model: BaseAlgorithm) -> list[str]:
     """
-    :param model: A model, also of SB3's own SAC
+    :param model: A model, also of SB3's own algorithms
     :return: Which of ``"task"`` and ``"curious"`` it trains
     """
     has_curious = getattr(model.policy, "curious_actor", None) is not None
-    there = {"task": getattr(model, "task", True), "curious": has_curious}
-    return [actor for actor, trained in there.items() if trained]
+    return ["task"] * getattr(model, "task", True) + ["curious"] * has_curious
 
 
-def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> None:
-    """Before policies are compared by CURL's error: take its negatives evenly from what they see.
+def even_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> None:
+    """
+    Before policies are compared by CURL's error: take its negatives evenly from what they see.
 
     Rolls out an episode of each policy that the model has. Without this the negatives are those of the random
     warm-up, to which the random policy's observations are the most alike. Heads without negatives are left alone.
@@ -87,25 +82,26 @@ def even_negatives(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Non
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    head = getattr(model.policy, "srl", None)
+    head: Any = getattr(model.policy, "srl", None)
     if not isinstance(head, CURL):
         return
     actors = [*trained_actors(model), "random"]
     share = max(len(head.bank) // len(actors), 1)  # type: ignore[arg-type]
     seen = [_as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
-    frames = [each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen]
-    head.set_bank(th.as_tensor(np.concatenate(frames)[: len(head.bank)]))  # type: ignore[arg-type]
+    frames = np.concatenate([each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen])
+    head.set_bank(th.as_tensor(frames[: len(head.bank)]))  # type: ignore[arg-type]
 
 
 @contextlib.contextmanager
-def evenly_measured(model: CuReSAC, env: gym.Env, seed: int | None = None) -> Iterator[None]:
-    """Measure with ``even_negatives`` for a while, and leave the head as it was.
+def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> Iterator[None]:
+    """
+    Measure with ``even_negatives`` for a while, and leave the head as it was.
 
     :param model: A model, also of SB3's own algorithms
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    head = getattr(model.policy, "srl", None)
+    head: Any = getattr(model.policy, "srl", None)
     if not isinstance(head, CURL) or int(head.bank_filled) == 0:  # type: ignore[arg-type]
         yield
         return
@@ -117,28 +113,14 @@ def evenly_measured(model: CuReSAC, env: gym.Env, seed: int | None = None) -> It
         head.set_bank(usual)
 
 
-def _actor(
-    model: CuReSAC, env: gym.Env, actor: str, deterministic: bool
-) -> Callable[[np.ndarray, Any, bool], tuple[np.ndarray, Any]]:
-    """Action and memory (of recurrent policies) from an observation, the memory before, and whether it is the first."""
-    if actor not in ACTORS:
-        raise ValueError(f"actor is {actor!r}, but it must be one of {', '.join(map(repr, ACTORS))}: choose one.")
-    if actor == "random":
-        return lambda observation, memory, first: (env.action_space.sample(), None)
-    predict = model.predict_curious if actor == "curious" else model.predict
-    return lambda observation, memory, first: predict(
-        _as_trained(model, observation), memory, np.array([first]), deterministic
-    )
-
-
-def _as_trained(model: CuReSAC, observations: np.ndarray) -> np.ndarray:
+def _as_trained(model: BaseAlgorithm, observations: np.ndarray) -> np.ndarray:
     """Observations normalised as in training, if a ``VecNormalize`` did so."""
     normalizer = model.get_vec_normalize_env()
     return observations if normalizer is None else normalizer.normalize_obs(observations)  # type: ignore[return-value]
 
 
 def run_episodes(
-    model: CuReSAC,
+    model: BaseAlgorithm,
     env: gym.Env,
     n_episodes: int,
     actor: str = "task",
@@ -148,7 +130,8 @@ def run_episodes(
     render: bool = False,
     states: bool | Callable[[gym.Env], np.ndarray] = False,
 ) -> Iterator[Episode]:
-    """Roll out one policy alone, episode by episode (one is in memory at a time).
+    """
+    Roll out one policy alone, episode by episode (one is in memory at a time).
 
     :param model: A trained model
     :param env: One (not vectorised) environment
@@ -161,68 +144,54 @@ def run_episodes(
     :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
         (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]
     :return: The episodes
-    :raises ValueError: if the actor is unknown, the model has no curious policy, or the environment no known state
+    :raises ValueError: if the actor is unknown, or the environment no known state
     """
-    if not is_integer(n_episodes, 1):
-        raise ValueError(
-            f"n_episodes is {n_episodes!r}, but it must be a whole number of at least 1: change n_episodes."
-        )
-    if not isinstance(env, gym.Env):
-        raise ValueError(
-            f"env is {env!r}, but one environment is rolled out at a time: give a gymnasium.Env with the observations "
-            "of training."
-        )
-    seed = None if seed is None else operator.index(seed)  # Gymnasium takes no numbers of NumPy
+    if actor not in ACTORS:
+        raise ValueError(f"actor is {actor!r}, but must be one of {', '.join(map(repr, ACTORS))}.")
+    agent: Any = model
+    predict = agent.predict_curious if actor == "curious" else agent.predict
     state_of = physics_state if states is True else states
-    choose = _actor(model, env, actor, deterministic)
     if seed is not None:
         env.action_space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
-        observations, rewards, dones, frames = [observation], [], [], []
-        actions: list[np.ndarray] = []
-        true_states: list[np.ndarray] = []
-        done, memory = False, None
+        observations, frames, true_states, steps = [observation], [], [], list[tuple[Any, ...]]()
+        done, memory = False, None  # memory: of recurrent policies
         while not done:
-            action, memory = choose(observation, memory, not actions)
+            if actor == "random":
+                action = env.action_space.sample()
+            else:
+                action, memory = predict(_as_trained(model, observation), memory, np.array([not steps]), deterministic)
             if state_of:
                 true_states.append(np.array(state_of(env)))  # a copy
             observation, reward, terminated, truncated, _ = env.step(action)
             done = terminated or truncated
             observations.append(observation)
-            actions.append(action)
-            rewards.append(float(reward))
-            dones.append(terminated)
+            steps.append((action, float(reward), terminated))
             if render:
                 frames.append(env.render())
-        seen = maybe_transpose(np.stack(observations), model.observation_space)
+        seen: Any = maybe_transpose(np.stack(observations), model.observation_space)
+        actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "srl", None) is not None:
             errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))
-        episode = Episode(np.array(rewards), errors, seen[:-1], frames)  # type: ignore[arg-type]
-        if true_states:
-            episode.states = np.stack(true_states)
-        yield episode
+        kept = {"states": np.stack(true_states)} if states else {}
+        yield Episode(rewards, errors, seen[:-1], frames, **kept)  # type: ignore[arg-type]
 
 
 def _as_batch(
-    model: CuReSAC, observations: np.ndarray, actions: list[np.ndarray], rewards: list[float], dones: list[bool]
-) -> ReplayBufferSamples:
+    model: BaseAlgorithm, observations: np.ndarray, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray
+) -> Samples:
     """An episode in the form in which heads read the replay buffer (actions scaled to [-1, 1])."""
-    device = model.device
-    stacked = th.as_tensor(observations, device=device)
-    column = {"dtype": th.float32, "device": device}
-    return ReplayBufferSamples(
-        observations=stacked[:-1],
-        actions=th.as_tensor(model.policy.scale_action(np.stack(actions)), **column),  # type: ignore[arg-type]
-        next_observations=stacked[1:],
-        dones=th.as_tensor(dones, **column).unsqueeze(1),  # type: ignore[arg-type]
-        rewards=th.as_tensor(rewards, **column).unsqueeze(1),  # type: ignore[arg-type]
-    )
+    seen = th.as_tensor(observations, device=model.device)
+    columns = (model.policy.scale_action(actions), dones[:, None], rewards[:, None])  # type: ignore[operator]
+    scaled, done, reward = (th.as_tensor(each, dtype=th.float32, device=model.device) for each in columns)
+    return Samples(seen[:-1], scaled, seen[1:], done, reward)
 
 
 class Uncomfortable(NamedTuple):
-    """Where the agent's representation errs the most.
+    """
+    Where the agent's representation errs the most.
 
     :param observations: The observations, the worst first, [k, *shape]
     :param errors: Their SRL errors, [k]
@@ -236,8 +205,9 @@ class Uncomfortable(NamedTuple):
     mean_error: float
 
 
-def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int = 128) -> Uncomfortable:
-    """The observations of the replay buffer with the highest noise-free SRL error.
+def most_uncomfortable(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: int = 128) -> Uncomfortable:
+    """
+    The observations of the replay buffer with the highest noise-free SRL error.
 
     Reads the whole buffer, a chunk at a time. Two observations of one environment are at least ``gap`` steps apart:
     else the answer would be one moment k times.
@@ -247,31 +217,19 @@ def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int
     :param gap: Least distance in time, in steps of one environment; 1 allows neighbours
     :param chunk: How many observations are in memory at a time
     :return: The observations, worst first, with their errors
-    :raises ValueError: if an argument is below 1, or the model has no SRL head or nothing in its replay buffer
+    :raises ValueError: if there is nothing to measure in the replay buffer
     """
-    if not all(is_integer(value, 1) for value in (k, gap, chunk)):
-        raise ValueError(
-            f"k is {k!r}, gap {gap!r} and chunk {chunk!r}, but each must be at least 1: give numbers >= 1."
-        )
-    if getattr(model.policy, "srl", None) is None:
-        raise ValueError("the model has no SRL head, so no SRL error: train it with srl='rae' or 'curl', for example.")
-    buffer = getattr(model, "replay_buffer", None)
-    if buffer is None or buffer.size() == 0:
-        raise ValueError("the model has nothing in its replay buffer: train it, or call load_replay_buffer first.")
-    # Newest first: transition i is `ages[i]` rows older than the newest one.
-    # SB3's memory-saving variant has overwritten the observation of its oldest row.
-    n_rows = buffer.size() - int(buffer.optimize_memory_usage and buffer.full)
-    ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
-    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
-    ages, env_inds, rows = (each[unmarked(buffer, rows, env_inds)] for each in (ages, env_inds, rows))
+    buffer: Any = model.replay_buffer  # type: ignore[attr-defined]
+    rows, env_inds, ages = unmarked(buffer)
     if len(rows) == 0:
-        raise ValueError("all transitions in the replay buffer are marked as faulty: mend the environments.")
+        raise ValueError("the replay buffer is empty, or all its transitions are marked as faulty.")
 
     errors = np.zeros(len(rows), np.float32)
     for start in range(0, len(rows), chunk):
         part = slice(start, start + chunk)
-        batch = transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env())
-        errors[part] = srl_errors(model, batch)
+        errors[part] = srl_errors(
+            model, transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env()), chunk
+        )
     chosen: list[int] = []
     for candidate in np.argsort(-errors, kind="stable"):
         same = [other for other in chosen if env_inds[other] == env_inds[candidate]]
@@ -279,24 +237,24 @@ def most_uncomfortable(model: CuReSAC, k: int = 16, *, gap: int = 25, chunk: int
             chosen.append(int(candidate))
         if len(chosen) == k:
             break
-    index = np.array(chosen)
-    observations = transitions(buffer, rows[index], env_inds[index]).observations.cpu().numpy()
-    return Uncomfortable(observations, errors[index], ages[index] * buffer.n_envs, float(errors.mean()))
+    observations = transitions(buffer, rows[chosen], env_inds[chosen]).observations.cpu().numpy()
+    return Uncomfortable(observations, errors[chosen], ages[chosen] * buffer.n_envs, float(errors.mean()))
 
 
 def binned_errors(
     states: np.ndarray, errors: np.ndarray, edges: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Visits and mean SRL error on a grid over two coordinates of the state.
+    """
+    Visits and mean SRL error on a grid over two coordinates of the state.
 
     :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
     :param errors: SRL error of each visited state, [n], or empty
     :param edges: Edges of the bins of both coordinates, increasing, [a + 1] and [b + 1]
     :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN where there is none
     """
-    inside = [np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1)]
-    visits = np.histogram2d(*inside, bins=edges)[0]  # type: ignore[call-overload]
+    x, y = (np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1))
+    visits = np.histogram2d(x, y, bins=edges)[0]  # type: ignore[call-overload]
     if len(errors) == 0:
         return visits, np.full_like(visits, np.nan)
-    sums = np.histogram2d(*inside, bins=edges, weights=errors)[0]  # type: ignore[call-overload]
+    sums = np.histogram2d(x, y, bins=edges, weights=errors)[0]  # type: ignore[call-overload]
     return visits, np.divide(sums, visits, out=np.full_like(sums, np.nan), where=visits > 0)
