@@ -493,7 +493,12 @@ class DiagnosticsCallback(PeriodicCallback):
 
     def on_period(self) -> None:
         """Look, log and warn."""
-        findings = [*self._rendering, *diagnostics.look(self.model, *self._arguments)]
+        findings = list(self._rendering)
+        for finding in diagnostics.look(self.model, *self._arguments):
+            if finding is not None:
+                findings.append(finding)
+                if finding.problem:
+                    break
         self._report(findings)
         if self.verbose >= 1:
             print(", ".join(f"{finding.name} {finding.value:.3g}" for finding in findings))

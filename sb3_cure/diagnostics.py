@@ -67,54 +67,33 @@ class Temperature(NamedTuple):
 @th.no_grad()
 def look(
     model: Any, n_samples: int, min_updates: int, autoencoder_updates: int, temperature_bounds: Sequence[float]
-) -> Iterator[Finding]:
+) -> Iterator[Finding | None]:
     """
-    Look at a model in training, from cause to effect, and no further than the first problem.
-
-    What a fault may explain is not looked for while it lasts: behind a constant image all latents are alike, beside a
-    huge temperature no reward counts.
+    Look at a model in training, from cause to effect. Stop at the first problem, which may explain what follows: behind
+    a constant image all latents are alike, beside a huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or of this package
     :param n_samples: Observations to look at
     :param min_updates: Updates before networks and temperatures are judged
     :param autoencoder_updates: Updates before the autoencoder is judged; its number is given from the start
     :param temperature_bounds: Least and greatest temperature
-    :return: What was found
+    :return: What was found; None where a check does not apply
     """
-    image = constant_image(model, n_samples)
-    if image is not None:
-        yield image
+    yield constant_image(model, n_samples)
     if model._n_updates < max(min_updates, 1):
         return
     model.policy.set_training_mode(False)
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    found = temperature_at_bound(temperatures, model, temperature_bounds)
-    if found is not None:
-        yield found
-    if any(finding is not None and finding.problem for finding in (image, found)):
-        return
-    for each in _networks(model, batch, temperatures, autoencoder_updates):
-        yield each
-        if each.problem:
-            return
-
-
-def _networks(
-    model: Any, batch: ReplayBufferSamples, temperatures: Sequence[Temperature], autoencoder_updates: int
-) -> Iterator[Finding]:
+    yield temperature_at_bound(temperatures, model, temperature_bounds)
     encoded = _encode(model, batch)
     if encoded is not None:
         latents, silent = encoded
-        if silent:
-            yield dead_units(silent)
+        yield dead_units(silent) if silent else None
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
-        if explained is not None:
-            yield autoencoder(explained, model._n_updates, autoencoder_updates)
-    curious = curious_reward(model, temperatures)
-    if curious is not None:
-        yield curious
+        yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
+    yield curious_reward(model, temperatures)
 
 
 # ------------------------------------------------------------------------ checks
