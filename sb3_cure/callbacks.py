@@ -109,11 +109,8 @@ class RolloutCallback(PeriodicCallback):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        self.eval_env = eval_env
-        self.n_episodes = n_episodes
-        self.deterministic = deterministic
-        self.seed = seed
-        self.actors = actors
+        self.eval_env, self.n_episodes, self.actors = eval_env, n_episodes, actors
+        self.deterministic, self.seed = deterministic, seed
 
     def _init_callback(self) -> None:
         """Refuse now what would end the training when the callback is due."""

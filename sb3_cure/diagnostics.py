@@ -202,18 +202,14 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
         entropy, target = -float(log_prob.mean()), float(model.target_entropy)
         gap = (entropy - target) / np.prod(model.action_space.shape)
         too_low, too_high = value < bounds[0], value > bounds[1]
-        expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected"
-        if learned and ((too_low and gap > ENTROPY_GAP) or (too_high and gap < -ENTROPY_GAP)):
+        how, advice = "is fixed at", "use ent_coef='auto', or scale the rewards"
+        if learned:
+            too_low, too_high = too_low and gap > ENTROPY_GAP, too_high and gap < -ENTROPY_GAP
+            how = f"lets the entropy be {entropy:.1f} where {target:.1f} is the target, and has run to"
             advice = "see whether it finds any reward" if too_low else "set a smaller target_entropy"
-            problems.append(
-                f"the temperature of the {agent} agent has run to {expected}, and its policy's entropy is still "
-                f"{entropy:.1f} where {target:.1f} is the target: {advice}, or fix ent_coef."
-            )
-        elif not learned and value != 0 and (too_low or too_high):
-            problems.append(
-                f"the temperature of the {agent} agent is fixed at {expected}, so either reward or entropy does not "
-                "count: use ent_coef='auto', or scale the rewards."
-            )
+        if (too_low or too_high) and (learned or value != 0):
+            expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected: {advice}"
+            problems.append(f"the temperature of the {agent} agent {how} {expected}.")
     return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
 
 

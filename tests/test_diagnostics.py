@@ -214,12 +214,12 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
     "hot": (
         lambda: box(PixelBox(), target_entropy=5.0, ent_coef_lr_factor=300.0),
         "temperature",
-        r"has run to \d.*e\+\d+, .* still 1\.\d where 5\.0 is the target: set a smaller target_entropy",
+        r"entropy be 1\.\d where 5\.0 is the target, and has run to \d.*e\+\d+, .*: set a smaller target_entropy",
     ),
     "cold": (
         lambda: box(PixelBox(), target_entropy=-50.0, ent_coef_lr_factor=100.0),
         "temperature",
-        r"has run to \d.*e-\d+, .* where -50\.0 is the target: see whether it finds any reward",
+        r"where -50\.0 is the target, and has run to \d.*e-\d+, .*: see whether it finds any reward",
     ),
     "fixed hot": (lambda: box(PixelBox(), ent_coef=1e6), "temperature", r"task agent is fixed at 1\.0e\+06"),
     "fixed cold": (lambda: box(PixelBox(), ent_coef=1e-8), "temperature", r"task agent is fixed at 1\.0e-08"),

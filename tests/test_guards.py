@@ -798,10 +798,10 @@ def test_a_reward_that_worker_processes_do_not_give(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (dict(curiosity=None, n_steps=3), "which a NStepReplayBuffer cannot do: train with SB3's ReplayBuffer"),
+        (dict(curiosity=None, n_steps=3), "which a NStepReplayBuffer cannot do: use SkippingReplayBuffer"),
         (
             dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
-            "which it cannot do with optimize_memory_usage=True",
+            "which a ReplayBuffer cannot do: use SkippingReplayBuffer",
         ),
     ],
 )
