@@ -66,14 +66,17 @@ def is_marked(info: Mapping[str, Any]) -> bool:
     return any(info.get(mark) is not None for mark in MARKS)
 
 
-def unmarked(buffer: ReplayBuffer, rows: ndarray, env_inds: ndarray) -> ndarray:
+def unmarked(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
     """
     :param buffer: A replay buffer
-    :param rows: Row positions, [n]
-    :param env_inds: Environment of each, [n]
-    :return: Which of these transitions may be sampled, bool [n]
+    :return: Rows, environments and ages (in rows) of all transitions that may be sampled, newest first, [n] each
     """
-    return ~buffer.marked[rows, env_inds] if isinstance(buffer, SkipsMarked) else np.ones(len(rows), dtype=bool)
+    # SB3's memory-saving variant has overwritten the observation of its oldest row
+    n_rows = buffer.size() - int(buffer.optimize_memory_usage and buffer.full)
+    ages, env_inds = np.divmod(np.arange(n_rows * buffer.n_envs), buffer.n_envs)
+    rows = (buffer.pos - 1 - ages) % buffer.buffer_size
+    good = ~buffer.marked[rows, env_inds] if isinstance(buffer, SkipsMarked) else np.ones(len(rows), dtype=bool)
+    return rows[good], env_inds[good], ages[good]
 
 
 def transitions(
@@ -91,7 +94,9 @@ def transitions(
     """
     inds = rows, env_inds
     if isinstance(buffer, FrameStackReplayBuffer):
-        obs, next_obs = buffer.stacks(rows, env_inds)
+        slots = buffer.slots(rows, env_inds)
+        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of NumPy
+        obs, next_obs = th.from_numpy(buffer.frames).index_select(0, slots).view(2, -1, *buffer.obs_shape).numpy()
     elif buffer.optimize_memory_usage:
         obs, next_obs = buffer.observations[inds], buffer.observations[(rows + 1) % buffer.buffer_size, env_inds]
     else:
@@ -151,7 +156,6 @@ class SkipsMarked(ReplayBuffer):
             if len(good_rows) == 0:
                 raise ValueError("All transitions in the replay buffer are marked as faulty: mend the environments.")
             drawn = np.random.randint(0, len(good_rows), size=int(bad.sum()))
-            rows = rows.copy()
             rows[bad], env_inds[bad] = stored[good_rows[drawn]], good_envs[drawn]
         self.last_sampled = rows, env_inds
         return transitions(self, rows, env_inds, env)
@@ -258,8 +262,7 @@ class FrameStackReplayBuffer(SkipsMarked):
         self.optimize_memory_usage = False
         self.handle_timeout_termination = handle_timeout_termination
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
-        channels, height, width = self.obs_shape
-        self.frame_shape = (channels // frame_stack, height, width)
+        self.frame_shape = (self.obs_shape[0] // frame_stack, *self.obs_shape[1:])  # c, height, width
         # What one `add` may write: two whole stacks per environment. Before it does, rows are given up for that many
         # frames; so the ring has room for as many more, and for the row that it writes and the stack before it.
         self._max_frames_per_add = 2 * frame_stack * n_envs
@@ -372,18 +375,16 @@ class FrameStackReplayBuffer(SkipsMarked):
             rows = (rows + self.pos - self._n_valid) % self.buffer_size
         return self._get_samples(rows, env=env)
 
-    def stacks(self, rows: ndarray, env_inds: ndarray) -> tuple[ndarray, ndarray]:
+    def slots(self, rows: ndarray, env_inds: ndarray) -> th.Tensor:
         """
         :param rows: Row positions, [n]
         :param env_inds: Environment of each, [n]
-        :return: Observations and their successors, uint8 [n, frame_stack * c, height, width] each
+        :return: Positions in ``frames``: of all observations, then of their successors, [2 * n * frame_stack]
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
         if np.any((self.pos - 1 - rows) % self.buffer_size >= self._n_valid):
             raise IndexError(f"Only the {self._n_valid} rows before pos={self.pos} hold transitions: use sample().")
-        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of NumPy
-        slots = th.from_numpy(self.frame_slots[rows, env_inds].swapaxes(0, 1).ravel())
-        return tuple(th.from_numpy(self.frames).index_select(0, slots).view(2, -1, *self.obs_shape).numpy())
+        return th.from_numpy(self.frame_slots[rows, env_inds].swapaxes(0, 1).ravel())
 
     def reserve_frames(self) -> None:
         """Make the unnamed file for the frames, which ends with the array, if there is to be one and there is none."""

@@ -14,8 +14,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_cure import doctor
-from sb3_cure.buffers import transitions
+from sb3_cure.buffers import Samples, transitions
+from sb3_cure.envs import render_check
 from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import RAE
 
@@ -67,54 +67,33 @@ class Temperature(NamedTuple):
 @th.no_grad()
 def look(
     model: Any, n_samples: int, min_updates: int, autoencoder_updates: int, temperature_bounds: Sequence[float]
-) -> Iterator[Finding]:
+) -> Iterator[Finding | None]:
     """
-    Look at a model in training, from cause to effect, and no further than the first problem.
-
-    What a fault may explain is not looked for while it lasts: behind a constant image all latents are alike, beside a
-    huge temperature no reward counts.
+    Look at a model in training, from cause to effect. Stop at the first problem, which may explain what follows: behind
+    a constant image all latents are alike, beside a huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or of this package
     :param n_samples: Observations to look at
     :param min_updates: Updates before networks and temperatures are judged
     :param autoencoder_updates: Updates before the autoencoder is judged; its number is given from the start
     :param temperature_bounds: Least and greatest temperature
-    :return: What was found
+    :return: What was found; None where a check does not apply
     """
-    image = constant_image(model, n_samples)
-    if image is not None:
-        yield image
+    yield constant_image(model, n_samples)
     if model._n_updates < max(min_updates, 1):
         return
     model.policy.set_training_mode(False)
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    found = temperature_at_bound(temperatures, model, temperature_bounds)
-    if found is not None:
-        yield found
-    if any(finding is not None and finding.problem for finding in (image, found)):
-        return
-    for each in _networks(model, batch, temperatures, autoencoder_updates):
-        yield each
-        if each.problem:
-            return
-
-
-def _networks(
-    model: Any, batch: ReplayBufferSamples, temperatures: Sequence[Temperature], autoencoder_updates: int
-) -> Iterator[Finding]:
+    yield temperature_at_bound(temperatures, model, temperature_bounds)
     encoded = _encode(model, batch)
     if encoded is not None:
         latents, silent = encoded
-        if silent:
-            yield dead_units(silent)
+        yield dead_units(silent) if silent else None
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
-        if explained is not None:
-            yield autoencoder(explained, model._n_updates, autoencoder_updates)
-    curious = curious_reward(model, temperatures)
-    if curious is not None:
-        yield curious
+        yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
+    yield curious_reward(model, temperatures)
 
 
 # ------------------------------------------------------------------------ checks
@@ -223,18 +202,14 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
         entropy, target = -float(log_prob.mean()), float(model.target_entropy)
         gap = (entropy - target) / np.prod(model.action_space.shape)
         too_low, too_high = value < bounds[0], value > bounds[1]
-        expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected"
-        if learned and ((too_low and gap > ENTROPY_GAP) or (too_high and gap < -ENTROPY_GAP)):
+        how, advice = "is fixed at", "use ent_coef='auto', or scale the rewards"
+        if learned:
+            too_low, too_high = too_low and gap > ENTROPY_GAP, too_high and gap < -ENTROPY_GAP
+            how = f"lets the entropy be {entropy:.1f} where {target:.1f} is the target, and has run to"
             advice = "see whether it finds any reward" if too_low else "set a smaller target_entropy"
-            problems.append(
-                f"the temperature of the {agent} agent has run to {expected}, and its policy's entropy is still "
-                f"{entropy:.1f} where {target:.1f} is the target: {advice}, or fix ent_coef."
-            )
-        elif not learned and value != 0 and (too_low or too_high):
-            problems.append(
-                f"the temperature of the {agent} agent is fixed at {expected}, so either reward or entropy does not "
-                "count: use ent_coef='auto', or scale the rewards."
-            )
+        if (too_low or too_high) and (learned or value != 0):
+            expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected: {advice}"
+            problems.append(f"the temperature of the {agent} agent {how} {expected}.")
     return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
 
 
@@ -272,12 +247,12 @@ def software_rendering(env: VecEnv) -> Finding | None:
     :param env: Training environments
     :return: None without a GPU, without images, or where the environments do not render MuJoCo by OpenGL
     """
-    gpus = doctor.find_gpus()
+    gpus = render_check.find_gpus()
     renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
     if not gpus or not renders or not is_image_space(env.observation_space):
         return None
-    renderer = doctor.try_rendering().get("renderer")
-    problem = None if renderer is None else doctor.judge_renderer(renderer, gpus)
+    renderer = render_check.try_rendering().get("renderer")
+    problem = None if renderer is None else render_check.judge_renderer(renderer, gpus)
     return Finding("software_rendering", problem is not None, problem)
 
 
@@ -312,18 +287,20 @@ def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) 
     head = getattr(model.policy, "srl", None)
     if not isinstance(head, RAE):
         return None
-    variance = float(head.target(batch.observations, dither=False).var(dim=0, correction=0).mean())
-    return None if variance == 0 else 1 - float(head.error(batch, latents).mean()) / variance
+    views = model.policy.augmentation.center(batch.observations)
+    variance = float(head.target(views, dither=False).var(dim=0, correction=0).mean())
+    error = head.error(Samples(**{**batch._asdict(), "views": views}), latents)
+    return None if variance == 0 else 1 - float(error.mean()) / variance
 
 
 def _temperatures(model: Any, batch: ReplayBufferSamples) -> Iterator[Temperature]:
     """Of the agents that are trained, the curious one last."""
     if isinstance(model.policy, CuRePolicy):
         features = model.policy.encoder.trunk(model.policy.center(batch.observations))
-        task = model._task_agent if model.task and model._collector is None else None
-        for agent in filter(None, (task, model._curious_agent)):
-            log_prob = agent.actor.action_log_prob(features)[1]
-            yield Temperature(agent.name, float(agent.temperature()), agent.log_ent_coef is not None, log_prob)
+        for name, agent in model.policy.agents.items():
+            if name == "curious" or model.task:
+                log_prob = agent.actor.action_log_prob(features)[1]
+                yield Temperature(name, float(agent.temperature()), agent.log_ent_coef is not None, log_prob)
     elif hasattr(model, "log_ent_coef"):
         learned = model.log_ent_coef is not None
         value = model.log_ent_coef.exp() if learned else model.ent_coef_tensor

@@ -54,10 +54,11 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
     """
     policy: Any = model.policy
     policy.set_training_mode(False)
-    errors = []
+    errors, fields = [], batch._asdict()
     with th.no_grad():
         for start in range(0, len(batch.observations), chunk):
-            part = Samples(*[None if column is None else column[start : start + chunk] for column in batch])  # type: ignore[arg-type]
+            columns = {name: None if column is None else column[start : start + chunk] for name, column in fields.items()}
+            part = Samples(**{**columns, "views": policy.augmentation.center(columns["observations"])})
             errors.append(policy.srl.error(part, policy.encode(part.observations)).float().cpu().numpy())
     return np.concatenate(errors)
 
