@@ -1,7 +1,6 @@
 """A training run as a user sees it: who acts, what is stored, what is updated when, and what is logged."""
 
 import csv
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -879,29 +878,3 @@ def test_stacks_of_vec_frame_stack_are_stored_once(own: int, around: int, last: 
     # Of an episode of 20 steps all frames are new, but for the stack that it begins with.
     assert buffer.frames.shape[-3:] == (3 * own, 36, 36) and buffer.size() >= 85
     assert buffer.sample(64).observations.shape[1] == 3 * own * around
-
-
-@pytest.mark.parametrize("stacks", [False, True])
-@pytest.mark.parametrize(("scale", "warns"), [(255, True), (1, False)])
-def test_images_of_zeros_and_ones_are_warned_of(scale: int, warns: bool, stacks: bool) -> None:
-    """What SB3 makes of floats in [0, 1] in a space of uint8; no training ends for it, as there are dark rooms."""
-
-    class Floats(PixelBox):
-        def observe(self, first: bool = False) -> np.ndarray:
-            return super().observe(first) / scale
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        tiny_model("CnnPolicy", Floats(tells_frame_stack=stacks)).learn(25)
-    said = [str(warning.message) for warning in caught if "sees black" in str(warning.message)]
-    assert len(said) == warns and all(
-        "no pixel of the images so far is brighter than 1 of 255" in each for each in said
-    )
-
-
-def test_images_that_begin_with_vec_frame_stacks_zeros_are_not_dark() -> None:
-    """The first frame that is stored is of no camera."""
-    env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=1, tells_frame_stack=False)]), 3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        tiny_model("CnnPolicy", env, learning_starts=0).learn(3)
