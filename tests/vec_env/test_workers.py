@@ -321,7 +321,7 @@ def test_dead_worker_answers_whatever_is_asked(name: str) -> None:
 def test_failing_call_costs_no_episode() -> None:
     env = made([breakable_box, breakable_box])
     env.reset()
-    with pytest.raises(AttributeError, match=r"Environment 0 raised AttributeError.*'nothing'.* in get_attr"):
+    with pytest.raises(EnvFaultError, match=r"Environment 0 raised AttributeError.*'nothing'.* in get_attr"):
         env.get_attr("nothing")
     with pytest.raises(EnvFaultError, match=r"Environment 0 raised TypeError.* in env_method") as caught:
         env.env_method("break_down")
