@@ -29,8 +29,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.harness import describe_machine
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.envs import make_pixel_env
-from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 from sb3_cure.files import replacing
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 FAULTS = ("raise", "die", "hang", "black", "frozen")
 #: The bar: megabytes by which resident memory may grow per 10 000 agent steps once the replay buffer is full

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -39,9 +40,9 @@ from sb3_cure import CuReSAC, checkpoint, files, generations, make_dmc_env
 from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
 from sb3_cure.checkpoint import CheckpointError
-from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 from sb3_cure.generations import Draft, Generations
 from sb3_cure.serialization import read_state, write_state
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 
 @pytest.fixture(autouse=True)
@@ -518,6 +519,10 @@ def test_one_folder_under_two_names(tmp_path: Path) -> None:
 
 class NoState(gym.Wrapper):
     """Keeps to itself what it is like."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.lock = threading.Lock()
 
 
 def test_environments_that_keep_their_state_to_themselves_begin_a_new_episode(tmp_path: Path) -> None:
