@@ -57,7 +57,8 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
     errors, fields = [], batch._asdict()
     with th.no_grad():
         for start in range(0, len(batch.observations), chunk):
-            columns = {name: None if column is None else column[start : start + chunk] for name, column in fields.items()}
+            rows = slice(start, start + chunk)
+            columns = {name: None if column is None else column[rows] for name, column in fields.items()}
             part = Samples(**{**columns, "views": policy.augmentation.center(columns["observations"])})
             errors.append(policy.srl.error(part, policy.encode(part.observations)).float().cpu().numpy())
     return np.concatenate(errors)

@@ -222,22 +222,10 @@ def make_pixel_env(
     :param action_repeat: Environment steps per agent step; their rewards are summed
     :param grayscale: One channel of luminance per frame instead of three of RGB
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack`` and ``action_repeat``
-    :raises ValueError: If an argument is out of range or ``env`` cannot render RGB frames
+    :raises ValueError: If an argument is out of range or, when first reset, ``env`` does not render RGB frames
     """
     if isinstance(env, str):
-        try:
-            env = gym.make(env, render_mode="rgb_array")
-        except gym.error.Error as error:
-            raise ValueError(
-                f"{env!r} cannot be made ({' '.join(str(error).split())}); give the id of an environment that renders "
-                "'rgb_array'."
-            ) from error
-    if not isinstance(env, gym.Env):
-        raise ValueError(f"{env!r} is no Gymnasium environment; give one that is not vectorised, or an id.")
-    if env.render_mode is None:
-        raise ValueError(
-            f"{env} was made with render_mode=None; make it with render_mode='rgb_array' to see its pixels."
-        )
+        env = gym.make(env, render_mode="rgb_array")
     if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):
         env = NormalizeActions(env)
     env = PixelObservation(ActionRepeat(env, action_repeat), image_size, grayscale)

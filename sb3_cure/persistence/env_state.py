@@ -297,9 +297,9 @@ def _decoded(saved: Any, current: Any, memo: dict[int, np.random.Generator]) -> 
     if kind == "number":
         return value[()]
     if kind == "dict":
-        there = current if isinstance(current, dict) else {}
+        entries = current if isinstance(current, dict) else {}
         pairs = [(_decoded(key, None, memo), part) for key, part in value]
-        return {key: _decoded(part, there.get(key), memo) for key, part in pairs}
+        return {key: _decoded(part, entries.get(key), memo) for key, part in pairs}
     if kind == "deque":
         return deque(_decoded(value[1], None, memo), value[0])
     if kind in _COLLECTIONS:

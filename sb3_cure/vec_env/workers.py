@@ -20,12 +20,9 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import (
     CloudpickleWrapper,
-    VecEnvIndices,
     VecEnvObs,
-    VecEnvStepReturn,
 )
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
-from stable_baselines3.common.vec_env.subproc_vec_env import _stack_obs
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as sb3_worker
 
 from sb3_cure.vec_env.frame_watch import FrameFaultError, FrameWatch
@@ -63,7 +60,6 @@ class _Failure(NamedTuple):
 
     what: str
     details: str
-    is_attribute_error: bool
 
 
 def _leave_with_parent() -> None:
@@ -111,7 +107,7 @@ def _work(
             what = str(error) if is_frame_fault else f"raised {error!r}"
             details = "" if is_frame_fault else traceback.format_exc()
             try:
-                remote.send(_Failure(what, details, isinstance(error, AttributeError)))
+                remote.send(_Failure(what, details))
             except OSError:
                 return
             if not made:
@@ -132,6 +128,16 @@ class _Worker:
 
     def __init__(self, owner: "FaultTolerantSubprocVecEnv", index: int, env_fn: Callable[[], gym.Env]) -> None:
         self.owner, self.index, self.env_fn = owner, index, env_fn
+        # What a new process gets: attributes that were set, options of the last reset, the last seed that was given
+        self.attributes: dict[str, Any] = {}
+        self.seed: int | None = None
+        self.options: dict[str, Any] = {}
+        self.restarts = self.faults_in_a_row = 0
+        self.last_obs: Any = None
+        # How many of the latest steps showed frozen pixels, perhaps: a fault spoils these too
+        self.n_frozen = 0
+        # A fault that the next step has to report, with what the reset after it returned
+        self.unreported: list[Any] | None = None
         self.start(again=False)
 
     def start(self, again: bool) -> None:
@@ -149,9 +155,8 @@ class _Worker:
         # At the parent's exit multiprocessing sends SIGTERM to daemons, which they ignore, and waits for them
         self._kill_at_exit = Finalize(self, self.process.kill, exitpriority=0)
         self.fault: EnvFaultError | None = None
-        self._starting = True
-        # Answers that are not read yet
-        self._n_owed = 0
+        self._is_starting = True
+        self._n_unread = 0
 
     def stop(self, fault: EnvFaultError, patience: float = 0.0) -> None:
         """
@@ -174,66 +179,92 @@ class _Worker:
 
     def send(self, request: tuple[str, Any]) -> None:
         """
-        :param request: Command and data
+        :param request: Command and data, as SB3's worker takes them
         """
-        name = "start_timeout" if self._starting else "timeout"
-        self._patience = name, getattr(self.owner, name)
-        self._deadline = time.monotonic() + self._patience[1]
-        while self._n_owed > 0 and self.fault is None:
-            self._outcome()  # of a request that was given up (by Ctrl-C, say)
-        self._request = request
-        if self.fault is None:
-            with contextlib.suppress(OSError):  # it is dead, as `_outcome` will find
-                self.connection.send(request)
-            self._n_owed += 1
+        while self._n_unread > 0 and self.fault is None:
+            self._answer()  # to a request that was given up (by Ctrl-C, say)
+        command, data = self._request = request
+        self._time_out = "start_timeout" if self._is_starting else "timeout"
+        self._deadline = time.monotonic() + getattr(self.owner, self._time_out)
+        if self.fault is not None or self._is_over():
+            return
+        if command == "set_attr":
+            request = ("env_method", ("set_env_attr", data, {}))  # beneath the frame watch
+        with contextlib.suppress(OSError):  # it is dead, as `_answer` will find
+            self.connection.send(request)
+        self._n_unread += 1
 
     def recv(self) -> Any:
         """
         :return: The answer to the last request; if the worker is lost, of a new one
         :raises EnvFaultError: If the worker is lost and not to be replaced, or the call failed in it
         """
-        outcome = self.outcome()
-        if not isinstance(outcome, EnvFaultError):
-            return outcome
-        request = self._request
-        self.owner._restart(self, outcome)
-        self.send(request)
-        return self.answer()
+        command, data = self._request
+        if command == "reset":
+            self.seed, self.options = self.seed if data[0] is None else data[0], data[1]
+        answer: Any = None if self._is_over() else self._answer()
+        if isinstance(answer, EnvFaultError):
+            if self.fault is None:
+                raise answer
+            begun = self._restart(answer)
+            if command not in ("step", "reset"):
+                return self._ask((command, data))
+            answer = begun if command == "reset" else None
+        if command == "set_attr":
+            self.attributes[data[0]] = data[1]
+        elif command == "reset":
+            # Nothing came before the first observation that could be told of
+            self.last_obs, self.n_frozen, self.unreported = answer[0], 0, None
+        elif command == "step" and answer is None:
+            answer = self._report()
+        elif command == "step":
+            self.last_obs, self.n_frozen = answer[0], answer[3].get("frozen_frames", 0)
+            self.faults_in_a_row = 0
+        return answer
 
-    def answer(self) -> Any:
+    def expect(self) -> Any:
         """
         :return: The answer to the last request
         :raises EnvFaultError: If there is none
         """
-        outcome = self.outcome()
-        if isinstance(outcome, EnvFaultError):
-            raise outcome
-        return outcome
+        answer = self._answer()
+        if isinstance(answer, EnvFaultError):
+            raise answer
+        return answer
 
-    def outcome(self) -> Any:
-        """
-        :return: The answer to the last request; or, if the worker is lost and has been stopped, the fault, which is not
-            raised because a process that is forked while an exception is handled repeats it in its own tracebacks
-        :raises EnvFaultError: If a call failed in a worker that can go on
-        :raises AttributeError: If the environment lacks the attribute that was asked for
-        """
-        outcome = self._outcome()
-        if isinstance(outcome, _Failure):
-            what = f"{outcome.what} in {self._request[0]}"
-            sentence = EnvFaultError(self.index, what, "ask for what the environment has and takes.", outcome.details)
-            if outcome.is_attribute_error:
-                raise AttributeError(str(sentence)) from sentence
-            raise sentence
-        return outcome
+    def _ask(self, request: tuple[str, Any]) -> Any:
+        self.send(request)
+        return self.expect()
 
-    def _outcome(self) -> Any:
+    def _is_over(self) -> bool:
+        """Whether the episode in which a step is to be made was lost."""
+        return self._request[0] == "step" and self.unreported is not None
+
+    def _report(self) -> tuple[Any, float, bool, dict[str, Any], dict[str, Any]]:
+        """What the step returns in which an environment was lost."""
+        sentence, (observation, reset_info) = self.unreported  # type: ignore[misc]
+        info = {
+            "env_fault": sentence,
+            "env_fault_steps": 1 + self.n_frozen,
+            "TimeLimit.truncated": True,
+            "terminal_observation": self.last_obs,
+        }
+        self.last_obs, self.n_frozen, self.unreported = observation, 0, None
+        return observation, 0.0, True, info, reset_info
+
+    def _answer(self) -> Any:
+        """
+        :return: The answer to the last request; or what went wrong in it, after which the worker has been stopped if it
+            is lost. Not raised, because a process that is forked while an exception is handled repeats it in its own
+            tracebacks
+        """
         if self.fault is not None:
             return self.fault
         command = self._request[0]
-        name, seconds = self._patience
         try:
             # Not its sentinel, which with forkserver tells of the server's end too
             if not self.connection.poll(max(0.0, self._deadline - time.monotonic())):
+                name, seconds = self._time_out, getattr(self.owner, self._time_out)
                 return self._lost(
                     f"did not answer {command} within {name}={seconds:g} s (rendering or the environment hangs; raise "
                     f"{name} if it is only slow)"
@@ -244,12 +275,15 @@ class _Worker:
             code = self.process.exitcode
             how = f"was killed by {signal.Signals(-code).name}" if code and code < 0 else f"ended with status {code}"
             return self._lost(f"is lost, as its process {how} during {command}")
-        self._n_owed -= 1
-        if isinstance(answer, _Failure) and command in _EPISODE_COMMANDS:
+        self._n_unread -= 1
+        if isinstance(answer, _Failure):
             when = " when it was made" if command == "get_spaces" else f" in {command}"
-            return self._lost(answer.what + (when if answer.details else ""), answer.details)
+            what = answer.what + (when if answer.details else "")
+            if command in _EPISODE_COMMANDS:
+                return self._lost(what, answer.details)
+            return EnvFaultError(self.index, what, "ask for what the environment has and takes.", answer.details)
         # Restored environments begin with a step
-        self._starting &= command not in ("reset", "step")
+        self._is_starting &= command not in ("reset", "step")
         return answer
 
     def _lost(self, what: str, details: str = "") -> EnvFaultError:
@@ -260,6 +294,44 @@ class _Worker:
         fault = EnvFaultError(self.index, what, fix, details)
         self.stop(fault)
         return fault
+
+    def _restart(self, fault: EnvFaultError) -> list[Any]:
+        """
+        Start a new process and its first episode; the next step reports it.
+
+        :return: First observation and its info
+        :raises EnvFaultError: If workers are not to be replaced (any more), or this environment fails again and again
+        """
+        if self.owner.on_env_fault == "raise" or self.owner.closed:
+            raise fault
+        latest = fault
+        begun: list[Any] = []
+        while not begun:
+            self.stop(latest)
+            self.faults_in_a_row += 1
+            if self.faults_in_a_row > self.owner.max_faults:
+                what = f"failed {self.faults_in_a_row} times without a good step in between, and at last {latest.what}"
+                raise EnvFaultError(self.index, what, "mend the cause, or raise max_faults.", latest.details) from fault
+            self.restarts += 1
+            details = f"\n{latest.details}" if latest.details else ""
+            warnings.warn(f"{latest} This is restart {self.restarts}.{details}", RuntimeWarning, stacklevel=2)
+            try:
+                begun = self._begin_again()
+            except EnvFaultError as another:
+                latest = another
+        self.unreported = [str(fault), begun]
+        return begun
+
+    def _begin_again(self) -> list[Any]:
+        seed = self.seed
+        if seed is not None:
+            # Not the same again: it would repeat the episode, and whatever made it fail.
+            seed = int(np.random.SeedSequence([seed, self.restarts]).generate_state(1)[0])
+        self.start(again=True)
+        self._ask(("get_spaces", None))
+        for attribute in self.attributes.items():
+            self._ask(("set_attr", attribute))
+        return list(self._ask(("reset", (seed, self.options))))
 
 
 class FaultTolerantSubprocVecEnv(SubprocVecEnv):
@@ -319,25 +391,13 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         self.timeout, self.start_timeout, self.on_env_fault = timeout, start_timeout, on_env_fault
         self.max_faults, self.watch = max_faults, watch
         self.waiting = self.closed = False
-        #: Workers replaced so far, by environment
-        self.restarts = [0] * len(env_fns)
-        self._faults_in_a_row = [0] * len(env_fns)
-        # What a new worker gets: attributes that were set, and seed and options of the last reset that had any
-        self._attributes: list[dict[str, Any]] = [{} for _ in env_fns]
-        self._last_seeds: list[int | None] = [None] * len(env_fns)
-        self._last_options: list[dict[str, Any]] = [{} for _ in env_fns]
-        self._last_obs: list[Any] = [None] * len(env_fns)
-        # How many of the latest steps of each showed frozen pixels, perhaps: a fault spoils these too
-        self._n_frozen = [0] * len(env_fns)
-        # The sentences of faults that the next step has to report, with the first observations of the new episodes
-        self._unreported: list[list[Any] | None] = [None] * len(env_fns)
         self.remotes = []
         try:
             for index, env_fn in enumerate(env_fns):
                 self.remotes.append(_Worker(self, index, env_fn))
             for worker in self.remotes:
                 worker.send(("get_spaces", None))
-            env_spaces = [worker.answer() for worker in self.remotes]
+            env_spaces = [worker.expect() for worker in self.remotes]
             VecEnv.__init__(self, len(env_fns), *env_spaces[0])
         except BaseException:
             self.close()
@@ -348,138 +408,37 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         """The present worker processes."""
         return [worker.process for worker in self.remotes]
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """
-        :param actions: One per environment
-        """
-        for worker, action in zip(self.remotes, actions, strict=True):
-            if self._unreported[worker.index] is None:
-                worker.send(("step", action))
-        self.waiting = True
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """
-        :return: Observations, rewards, dones and infos
-        :raises EnvFaultError: If an environment failed and is not to be replaced, or failed again and again
-        """
-        results = [self._step_result(worker) for worker in self.remotes]
-        self.waiting = False
-        observations, rewards, dones, infos, self.reset_infos = zip(*results, strict=True)  # type: ignore[assignment]
-        return _stack_obs(observations, self.observation_space), np.stack(rewards), np.stack(dones), infos  # type: ignore[return-value]
-
-    def _step_result(self, worker: _Worker) -> tuple[Any, Any, Any, dict[str, Any], dict[str, Any]]:
-        index = worker.index
-        if self._unreported[index] is None:
-            result = worker.outcome()
-            if not isinstance(result, EnvFaultError):
-                self._last_obs[index], self._n_frozen[index] = result[0], result[3].get("frozen_frames", 0)
-                self._faults_in_a_row[index] = 0
-                return result
-            self._restart(worker, result)
-        sentence, observation = self._unreported[index]  # type: ignore[misc]
-        self._unreported[index] = None
-        info = {
-            "env_fault": sentence,
-            "env_fault_steps": 1 + self._n_frozen[index],
-            "TimeLimit.truncated": True,
-            "terminal_observation": self._last_obs[index],
-        }
-        self._last_obs[index], self._n_frozen[index] = observation, 0
-        return observation, 0.0, True, info, self.reset_infos[index]
+    @property
+    def restarts(self) -> list[int]:
+        """Workers replaced so far, by environment."""
+        return [worker.restarts for worker in self.remotes]
 
     def reset(self) -> VecEnvObs:
         """
         :return: First observations
-        :raises EnvFaultError: As ``step_wait``
+        :raises EnvFaultError: If an environment failed and is not to be replaced, or failed again and again
         """
-        for worker, seed, options in zip(self.remotes, self._seeds, self._options, strict=True):
-            if seed is not None:
-                self._last_seeds[worker.index] = seed
-            self._last_options[worker.index] = options
-            worker.send(("reset", (seed, options)))
         self.waiting = False
-        self.reset_infos = list(self.reset_infos)
-        for worker in self.remotes:
-            outcome = worker.outcome()
-            if isinstance(outcome, EnvFaultError):
-                self._restart(worker, outcome)
-                _, self._last_obs[worker.index] = self._unreported[worker.index]  # type: ignore[misc]
-            else:
-                self._last_obs[worker.index], self.reset_infos[worker.index] = outcome
-        # Nothing came before the first observation that could be told of
-        self._unreported = [None] * self.num_envs
-        self._reset_seeds()
-        self._reset_options()
-        return _stack_obs(self._last_obs, self.observation_space)
-
-    def _restart(self, worker: _Worker, fault: EnvFaultError) -> None:
-        """
-        Replace a worker that has been stopped; the next step reports it.
-
-        :raises EnvFaultError: If workers are not to be replaced (any more), or this environment fails again and again
-        """
-        index = worker.index
-        if self.on_env_fault == "raise" or self.closed:
-            raise fault
-        latest, observation = fault, None
-        while observation is None:
-            worker.stop(latest)
-            self._faults_in_a_row[index] += 1
-            if (n_faults := self._faults_in_a_row[index]) > self.max_faults:
-                what = f"failed {n_faults} times without a good step in between, and at last {latest.what}"
-                raise EnvFaultError(index, what, "mend the cause, or raise max_faults.", latest.details) from fault
-            self.restarts[index] += 1
-            details = f"\n{latest.details}" if latest.details else ""
-            warnings.warn(f"{latest} This is restart {self.restarts[index]}.{details}", RuntimeWarning, stacklevel=2)
-            try:
-                observation = self._begin_again(worker)
-            except EnvFaultError as another:
-                latest = another
-        self._unreported[index] = [str(fault), observation]
-
-    def _begin_again(self, worker: _Worker) -> Any:
-        """Start a new worker and its first episode; returns the first observation."""
-        index = worker.index
-        seed = self._last_seeds[index]
-        if seed is not None:
-            # Not the same again: it would repeat the episode, and whatever made it fail.
-            seed = int(np.random.SeedSequence([seed, self.restarts[index]]).generate_state(1)[0])
-        attributes = [("env_method", ("set_env_attr", pair, {})) for pair in self._attributes[index].items()]
-        worker.start(again=True)
-        for request in (("get_spaces", None), *attributes, ("reset", (seed, self._last_options[index]))):
-            worker.send(request)
-            answer = worker.answer()
-        observation, reset_info = answer
-        self.reset_infos = [*self.reset_infos[:index], reset_info, *self.reset_infos[index + 1 :]]
-        return observation
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """
-        :param attr_name: Name
-        :param value: Value, which a worker that replaces another one gets too
-        :param indices: Which environments; None: all
-        """
-        indices = list(self._get_indices(indices))
-        self.env_method("set_env_attr", attr_name, value, indices=indices)
-        for index in indices:
-            self._attributes[index][attr_name] = value
+        return super().reset()
 
     def state_dict(self) -> dict[str, Any]:
         """For exact resume.
 
         :return: What is remembered of workers, beside what their environments tell of themselves
         """
-        return {name: getattr(self, name) for name in _STATE}
+        workers = [{name: getattr(worker, name) for name in _STATE} for worker in self.remotes]
+        return {"seeds": self._seeds, "options": self._options, "workers": workers}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: Result of ``state_dict``
         """
-        for index, attributes in enumerate(state["_attributes"]):
-            for name, value in attributes.items():
-                self.set_attr(name, value, index)
-        for name in _STATE:
-            setattr(self, name, state[name])
+        self._seeds, self._options = state["seeds"], state["options"]
+        for worker, own in zip(self.remotes, state["workers"], strict=True):
+            for attribute in own["attributes"].items():
+                worker.send(("set_attr", attribute))
+                worker.recv()
+            vars(worker).update(own)
 
     def close(self) -> None:
         """End all workers, within ten seconds or ``timeout``, whichever is less."""
@@ -496,8 +455,5 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
             worker.stop(fault, max(0.0, deadline - time.monotonic()))
 
 
-# Attributes of the environments that a resumed training needs.
-_STATE = (
-    *("_seeds", "_options", "restarts", "_faults_in_a_row", "_attributes", "_last_seeds", "_last_options"),
-    *("_last_obs", "_n_frozen", "_unreported"),
-)
+# Attributes of a worker that a resumed training needs
+_STATE = ("attributes", "seed", "options", "restarts", "faults_in_a_row", "last_obs", "n_frozen", "unreported")

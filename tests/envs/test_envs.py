@@ -36,7 +36,8 @@ from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
 
 load_gl()  # before any test imports dm_control
 
-ALL_IDS = [f"dmc_pixels/{domain}-{task}-v0" for domain, tasks in DMC_TASKS.items() for task in tasks]
+# Tasks of one domain differ in rewards and starts; cartpole-three_poles and lqr_6_2 build their models otherwise.
+IDS = [f"dmc_pixels/{domain}-{tasks[-1]}-v0" for domain, tasks in DMC_TASKS.items()]
 
 
 @pytest.fixture
@@ -156,7 +157,7 @@ def test_lqr_actions_are_clipped_to_the_unit_box(make):
 # ---------------------------------------------------------------------------------------------------- seeding
 
 
-def test_seed_of_the_constructor_and_of_reset_start_the_same_stream(make):
+def test_constructor_and_reset_seed_alike(make):
     constructed, reseeded = make("reacher", "easy", seed=7), make("reacher", "easy", seed=0)
     first = constructed.reset()[0]
     np.testing.assert_array_equal(first, reseeded.reset(seed=7)[0])
@@ -168,7 +169,7 @@ def test_seed_of_the_constructor_and_of_reset_start_the_same_stream(make):
     np.testing.assert_array_equal(first, constructed.reset(seed=7)[0])
 
 
-def test_without_seed_episodes_differ_but_lqr_physics_is_the_same(make):
+def test_unseeded_episodes_differ_in_same_physics(make):
     first, second = make("lqr", "lqr_2_1"), make("lqr", "lqr_2_1")
     first.reset()
     second.reset()
@@ -181,7 +182,7 @@ def test_without_seed_episodes_differ_but_lqr_physics_is_the_same(make):
 # ---------------------------------------------------------------------------------- renderers, videos, closing
 
 
-def test_fast_renderer_is_recorded_and_differs_only_in_pixels(make):
+def test_fast_renderer_differs_only_in_pixels(make):
     envs = {renderer: make("cheetah", "run", renderer=renderer, seed=1) for renderer in ("dmc", "fast")}
     obs = {renderer: env.reset()[0] for renderer, env in envs.items()}
     assert [env.get_wrapper_attr("renderer") for env in envs.values()] == ["dmc", "fast"]
@@ -242,8 +243,8 @@ def test_every_task_of_the_suite_is_registered():
         register_dmc_envs()
 
 
-@pytest.mark.parametrize("env_id", ALL_IDS)
-def test_every_id_makes_an_environment_that_steps_and_repeats(env_id):
+@pytest.mark.parametrize("env_id", IDS)
+def test_ids_make_environments_that_step_and_repeat(env_id):
     env = gym.make(env_id, image_size=36)
     obs, _ = env.reset(seed=0)
     next_obs, reward, terminated, truncated, _ = env.step(np.zeros(env.action_space.shape, np.float32))
@@ -274,7 +275,7 @@ def test_gymnasium_make_passes_every_argument_on():
 
 
 @pytest.mark.parametrize("through_gymnasium", [False, True])
-def test_checkers_of_gymnasium_and_sb3_find_nothing(through_gymnasium):
+def test_environment_checkers_find_nothing(through_gymnasium):
     kwargs = {"image_size": 36, "renderer": "fast", "render_mode": "rgb_array"}
     env = (
         gym.make("dmc_pixels/finger-spin-v0", **kwargs)
@@ -289,7 +290,7 @@ def test_checkers_of_gymnasium_and_sb3_find_nothing(through_gymnasium):
     env.close()
 
 
-def test_an_environment_that_has_rendered_can_be_copied(make):
+def test_environment_that_rendered_can_be_copied(make):
     """For planning, say: both go on alike, each with a camera of its own."""
     env = make()
     env.reset(seed=1)
@@ -311,12 +312,11 @@ def test_spec_makes_a_copy(make):
     copy.close()
 
 
-@pytest.mark.parametrize("start_method", ["forkserver", "spawn"])
-def test_vectorised_environments_give_the_same_stream(start_method):
+def test_vectorised_environments_give_the_same_stream():
     factories = [
         partial(make_dmc_env, "point_mass", "easy", image_size=36, renderer="fast", seed=seed) for seed in (1, 2)
     ]
-    local, remote = DummyVecEnv(factories), SubprocVecEnv(factories, start_method=start_method)
+    local, remote = DummyVecEnv(factories), SubprocVecEnv(factories)
     try:
         first = local.reset()
         assert (first[0] != first[1]).any()
@@ -342,7 +342,7 @@ def test_vectorised_environments_give_the_same_stream(start_method):
 # --------------------------------------------------------------------------------- any Gymnasium environment
 
 
-def test_repeats_of_ones_own_environment_are_counted():
+def test_repeats_of_the_environment_are_counted():
     """An environment that tells its own repeat, inside another one."""
     painting = Painting()
     painting.action_repeat = 4
@@ -352,7 +352,7 @@ def test_repeats_of_ones_own_environment_are_counted():
     assert twice.metadata["render_fps"] == 15
 
 
-def test_any_environment_that_renders_can_be_seen_through_pixels():
+def test_rendered_environment_is_seen_through_pixels():
     painting = Painting(action_space=spaces.Box(np.float32([0, -2]), np.float32([10, 2])))
     env = make_pixel_env(painting, image_size=40, frame_stack=3, action_repeat=4)
     assert env.observation_space == spaces.Box(0, 255, (9, 40, 40), np.uint8)
@@ -371,7 +371,7 @@ def test_any_environment_that_renders_can_be_seen_through_pixels():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_actions_that_an_environment_gets_are_of_its_space(dtype):
+def test_actions_lie_in_the_environments_space(dtype):
     """Many environments assert it: the dtype, and bounds that a rounding error would cross or that are one alone."""
     low, high = np.array([-0.1, 0, 2, -np.inf, -np.inf], dtype), np.array([0.7, np.inf, np.inf, 3, np.inf], dtype)
     painting = Painting(action_space=spaces.Box(low, high, dtype=dtype))
@@ -403,7 +403,7 @@ def test_frames_that_are_none_are_described():
             env.reset()
 
 
-def test_images_with_the_channels_last_are_stacked():
+def test_channels_last_images_are_stacked():
     """As SB3's VecFrameStack does."""
     env = StackFrames(gym.wrappers.AddRenderObservation(Painting()), 3)
     height, width, _ = Painting().canvas.shape
@@ -446,9 +446,6 @@ def test_pixel_environment_from_an_id():
         ({"image_size": 8}, ["frame_stack=3 images of shape (3, 8, 8) have 9 channels", "image_size", "fewer frames"]),
         ({"action_repeat": 0}, ["action_repeat=0", "at least 1", "4"]),
         ({"action_repeat": 2.5}, ["action_repeat=2.5", "integer"]),
-        ({"camera_id": 2}, ["camera_id=2", "0 to 1", "-1"]),
-        ({"camera_id": -2}, ["camera_id=-2", "0 to 1"]),
-        ({"camera_id": "lookat"}, ["camera_id='lookat'", "0 to 1"]),
         ({"renderer": "slow"}, ["renderer='slow'", "'dmc'", "'fast'"]),
         ({"render_mode": "human"}, ["render_mode='human'", "'rgb_array'"]),
     ],
@@ -465,7 +462,7 @@ def test_bad_input_is_answered_in_one_sentence(kwargs, named):
 @pytest.mark.parametrize(
     ("build", "match"),
     [
-        (lambda: make_pixel_env(Painting(render_mode=None)), "render_mode=None.*render_mode='rgb_array'"),
+        (lambda: make_pixel_env(Painting(render_mode=None)).reset(), "render_mode=None.*make it with 'rgb_array'"),
         (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*make it with 'rgb_array'"),
         (lambda: make_pixel_env(Painting(), action_repeat=-1), "action_repeat=-1"),
         (lambda: ActionRepeat(Painting(), 0), "action_repeat=0"),
@@ -536,7 +533,7 @@ def test_working_gl_names_its_renderer():
     ("environment", "chosen"),
     [({}, "egl"), ({"DISPLAY": ":0"}, None), ({"WAYLAND_DISPLAY": "wayland-0"}, None), ({"MUJOCO_GL": "glfw"}, "glfw")],
 )
-def test_egl_is_chosen_only_without_a_display_and_a_choice(environment, chosen):
+def test_egl_is_chosen_only_without_display(environment, chosen):
     with (
         mock.patch.dict(os.environ, environment, clear=True),
         mock.patch.object(sys, "platform", "linux"),
@@ -546,7 +543,7 @@ def test_egl_is_chosen_only_without_a_display_and_a_choice(environment, chosen):
         assert os.environ.get("MUJOCO_GL") == chosen
 
 
-def test_a_display_that_cannot_be_opened_is_none():
+def test_display_that_cannot_be_opened_is_none():
     """As that of an ssh connection that has ended: frames are drawn, without a word about displays."""
     code = "from sb3_cure import make_dmc_env as make; print(make('cartpole', 'swingup').reset()[0].std())"
     result = run_python(code, DISPLAY=":77")
@@ -555,7 +552,7 @@ def test_a_display_that_cannot_be_opened_is_none():
 
 
 @pytest.mark.parametrize(("backend", "fix"), [("off", "apt-get install"), (None, "apt-get"), ("glfw", "MUJOCO_GL=egl")])
-def test_backend_that_cannot_render_is_answered_in_one_sentence(backend, fix):
+def test_backend_that_cannot_render_is_refused(backend, fix):
     with (
         mock.patch.dict(os.environ, clear=True),
         mock.patch.object(sys, "platform", "linux"),
@@ -602,7 +599,7 @@ def test_true_state_is_that_of_the_physics_by_name(
     assert not np.array_equal(physics_state(env), before)
 
 
-def test_angles_that_turn_all_around_are_wrapped(make: Callable[..., gym.Env]) -> None:
+def test_angles_without_limits_are_wrapped(make: Callable[..., gym.Env]) -> None:
     """To (-pi, pi], whatever their turns; places and velocities are left as they are."""
     env = make("cartpole", "swingup")
     env.reset(seed=0)

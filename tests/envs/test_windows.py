@@ -50,7 +50,7 @@ def display(tmp_path: Path) -> Iterator[tuple[str, Path]]:
 
 
 @pytest.mark.parametrize("backend", ["egl", "glfw"])
-def test_a_window_shows_every_frame_and_leaves_observations_alone(
+def test_window_shows_frames_and_leaves_observations_alone(
     backend: str, display: tuple[str, Path], tmp_path: Path
 ) -> None:
     """Windows that draw with OpenGL take the renderer's: no process, or the first frame for ever."""

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -535,6 +536,10 @@ def test_one_folder_under_two_names(tmp_path: Path) -> None:
 
 class NoState(gym.Wrapper):
     """Keeps to itself what it is like."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.lock = threading.Lock()
 
 
 def test_secretive_environments_begin_a_new_episode(tmp_path: Path) -> None:

@@ -1,0 +1,246 @@
+"""Nothing of a fault is sampled: buffers never draw transitions that their infos mark."""
+
+import os
+import pickle
+import signal
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from gymnasium import spaces
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cure import buffers
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.callbacks import _spread_over
+from sb3_cure.evaluation import most_uncomfortable
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
+
+ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
+
+pytestmark = pytest.mark.filterwarnings("ignore:Environment [0-9]+ :RuntimeWarning", "ignore:.*fork:DeprecationWarning")
+
+EVENTS = ("go on", "truncate", "terminate", "raise", "die", "black", "freeze")
+
+
+class Tagged(gym.Env):
+    """Each frame says where it is from: environment, process, episode, step. The action says what happens."""
+
+    observation_space = spaces.Box(0, 255, (12, 2, 2), np.uint8)
+    action_space = spaces.Box(0, len(EVENTS), (1,), np.float32)
+    frame_stack = 2
+
+    def __init__(self, index: int) -> None:
+        self.index, self.episode, self.frozen = index, 0, False
+
+    def frame(self) -> np.ndarray:
+        pid = os.getpid()
+        tag = [self.index + 1, self.episode, self.n_steps, pid % 256, pid // 256 % 256, pid // 65536]
+        return np.broadcast_to(np.array(tag, np.uint8)[:, None, None], (6, 2, 2))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        self.n_steps, self.episode = 0, self.episode + 1
+        if not self.frozen:
+            self.frames = [self.frame()] * 2
+        return np.concatenate(self.frames), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        event = EVENTS[int(action[0])]
+        self.n_steps += 1
+        if event == "raise":
+            raise RuntimeError
+        if event == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.frozen |= event == "freeze"
+        frame = np.zeros_like(self.frames[1]) if event == "black" else self.frame()
+        self.frames = [self.frames[1], self.frames[1] if self.frozen else frame]
+        return np.concatenate(self.frames), 0.0, event == "terminate", event == "truncate", {}
+
+
+def clock(env: gym.Env) -> np.ndarray:
+    return np.array([env.unwrapped.episode, env.unwrapped.n_steps])
+
+
+def filled_buffers(events: np.ndarray, buffer_size: int) -> list[ReplayBuffer]:
+    """Both kinds of buffer, fed as SB3 does it."""
+    n_envs = events.shape[1]
+    watch: dict[str, Any] = dict(frozen_steps=3, frozen_motion=0.5, state=clock)
+    makers = [partial(Tagged, i) for i in range(n_envs)]
+    env = FaultTolerantSubprocVecEnv(makers, on_env_fault="restart", start_method="fork", max_faults=100, **watch)
+    arguments = (buffer_size, env.observation_space, env.action_space, "cpu", n_envs)
+    both = [FrameStackReplayBuffer(*arguments, frame_stack=2), SkippingReplayBuffer(*arguments)]
+    obs = env.reset()
+    for row in events:
+        actions = row[:, None].astype(np.float32)
+        new_obs, rewards, dones, infos = env.step(actions)
+        next_obs = new_obs.copy()
+        for i in np.flatnonzero(dones):
+            next_obs[i] = infos[i]["terminal_observation"]
+        for buffer in both:
+            buffer.add(obs, next_obs, actions, rewards, dones, infos)
+        obs = new_obs
+    env.close()
+    return both
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.data())
+def test_no_transition_that_spans_a_fault_is_sampled(data: st.DataObject) -> None:
+    n_envs, n_steps = data.draw(st.integers(1, 2)), data.draw(st.integers(5, 25))
+    row = st.lists(st.sampled_from([0, 0, 0, *range(len(EVENTS))]), min_size=n_envs, max_size=n_envs)
+    events = np.array(data.draw(st.lists(row, min_size=n_steps, max_size=n_steps)))
+    # The last steps move, so that a picture that is stuck has been noticed
+    events = np.concatenate([events, np.zeros((4, n_envs), int)])
+    both = filled_buffers(events, data.draw(st.sampled_from([n_envs * n_steps // 2, 1000])))
+    for buffer in both:
+        np.random.seed(0)
+        batch = buffer.sample(500)
+        tags, next_tags = (
+            getattr(batch, name).numpy()[:, 6:, 0, 0].astype(int) for name in ("observations", "next_observations")
+        )
+        step = np.array([0, 0, 1, 0, 0, 0])
+        assert np.array_equal(tags + step, next_tags)
+        kinds = np.array(EVENTS)[batch.actions.numpy().astype(int).ravel()]
+        assert not set(kinds) & {"raise", "die", "black", "freeze"}
+        assert not batch.dones.numpy()[kinds != "terminate"].any()
+    # Sharing frames changes nothing of all that
+    if both[0].size() == both[1].size():
+        batches = []
+        for buffer in both:
+            np.random.seed(1)
+            batches.append(buffer.sample(200))
+        assert differences(tuple(batches[0]), tuple(batches[1])) == []
+
+
+def stream(n_envs: int, n_steps: int, marks: set[tuple[int, int]], key: str) -> Iterator[tuple[Any, ...]]:
+    """Transitions with their number as the reward; the marked ones have a key in ``info``."""
+    rng = np.random.default_rng(0)
+    obs = rng.integers(0, 256, (n_envs, 2, 3, 3), dtype=np.uint8)
+    for row in range(n_steps):
+        new = rng.integers(0, 256, (n_envs, 1, 3, 3), dtype=np.uint8)
+        next_obs = np.concatenate([obs[:, 1:], new], axis=1)
+        infos = [{key: "why"} if (row, i) in marks else {} for i in range(n_envs)]
+        numbers = np.arange(row * n_envs, (row + 1) * n_envs, dtype=np.float32)
+        yield obs, next_obs, rng.uniform(-1, 1, (n_envs, 2)), numbers, np.zeros(n_envs), infos
+        obs = next_obs
+
+
+def buffer_of(kind: type[ReplayBuffer], size: int, n_envs: int) -> Any:
+    space = spaces.Box(0, 255, (2, 3, 3), np.uint8)
+    stacks = {"frame_stack": 2} if kind is FrameStackReplayBuffer else {}
+    return kind(size, space, ACTIONS, "cpu", n_envs, **stacks)
+
+
+@pytest.mark.parametrize("kind", [FrameStackReplayBuffer, SkippingReplayBuffer])
+@pytest.mark.parametrize("key", buffers.MARKS)
+def test_other_transitions_are_drawn_evenly(kind: type[ReplayBuffer], key: str) -> None:
+    marks = {(0, 0), (1, 0), (1, 1), (3, 1), (5, 0)}
+    buffer = buffer_of(kind, 16, 2)
+    for transition in stream(2, 8, marks, key):
+        buffer.add(*transition)
+    good = {row * 2 + i for row in range(8) for i in range(2) if (row, i) not in marks}
+    np.random.seed(0)
+    drawn, counts = np.unique(buffer.sample(110_000).rewards.numpy().astype(int), return_counts=True)
+    assert set(drawn) == good
+    # 10 000 each, with a standard deviation of 95
+    assert np.abs(counts - 10_000).max() < 500
+    copy = pickle.loads(pickle.dumps(buffer))
+    assert np.array_equal(copy.marked, buffer.marked)
+    assert not np.any(buffer.rewards[buffer.marked]) and not np.any(buffer.actions[buffer.marked])
+
+
+@pytest.mark.parametrize("kind", [FrameStackReplayBuffer, SkippingReplayBuffer])
+def test_mark_is_gone_with_its_transition(kind: type[ReplayBuffer]) -> None:
+    buffer = buffer_of(kind, 8, 2)
+    for transition in stream(2, 4 + 3, {(2, 0), (6, 1)}, "env_fault"):  # row 2 is overwritten by row 6
+        buffer.add(*transition)
+    assert np.argwhere(buffer.marked).tolist() == [[2, 1]]
+
+
+def test_skipping_changes_nothing_without_marks() -> None:
+    batches = []
+    for kind in (ReplayBuffer, SkippingReplayBuffer, FrameStackReplayBuffer):
+        buffer = buffer_of(kind, 20, 2)
+        for transition in stream(2, 14, set(), "env_fault"):
+            buffer.add(*transition)
+        np.random.seed(0)
+        batches.append([tuple(buffer.sample(64)) for _ in range(3)])
+    assert differences(batches[0], batches[1]) == differences(batches[0], batches[2]) == []
+
+
+def test_sb3_buffers_learn_to_skip_or_refuse() -> None:
+    buffer = buffer_of(ReplayBuffer, 20, 2)
+    for transition in stream(2, 10, {(7, 1)}, "bad_transition"):
+        buffers.skip_marked(buffer, transition[-1])
+        assert type(buffer) is (ReplayBuffer if transition[3][0] < 14 else SkippingReplayBuffer)
+        buffer.add(*transition)
+    assert 15 not in buffer.sample(2000).rewards
+    with pytest.raises(ValueError, match=r"out of the replay buffer \(broken\), which a DictReplayBuffer cannot do"):
+        images = spaces.Dict({"image": spaces.Box(0, 255, (2, 3, 3), np.uint8)})
+        buffers.skip_marked(DictReplayBuffer(10, images, ACTIONS), [{"env_fault": "broken"}])
+    with pytest.raises(ValueError, match=r"optimize_memory_usage is True.*: leave it False"):
+        SkippingReplayBuffer(
+            10, buffer.observation_space, ACTIONS, optimize_memory_usage=True, handle_timeout_termination=False
+        )
+    only_faults = buffer_of(SkippingReplayBuffer, 20, 1)
+    for transition in stream(1, 2, {(0, 0), (1, 0)}, "env_fault"):
+        only_faults.add(*transition)
+    with pytest.raises(ValueError, match="All 2 transitions in the replay buffer are marked"):
+        only_faults.sample(1)
+
+
+class KillNow(BaseCallback):
+    """Kills the worker of environment 1 at some steps."""
+
+    def __init__(self, *at: int) -> None:
+        super().__init__()
+        self.at, self.faults = at, 0
+
+    def _on_step(self) -> bool:
+        self.faults += sum("env_fault" in info for info in self.locals["infos"])
+        if self.n_calls in self.at:
+            os.kill(self.training_env.unwrapped.processes[1].pid, signal.SIGKILL)
+        return True
+
+
+def test_pictures_and_measurements_leave_out_marked_ones() -> None:
+    env = FaultTolerantSubprocVecEnv([partial(PixelBox, size=36)] * 2, on_env_fault="restart", start_method="fork")
+    model = tiny_model("CnnPolicy", env)
+    callback = KillNow(3, 6, 9, 12)
+    model.learn(40, callback=callback)
+    env.close()
+    buffer = model.replay_buffer
+    assert callback.faults == buffer.marked.sum() == 4
+    looked_at = []
+    original = buffer.transitions
+    buffer.transitions = lambda rows, env_inds, *rest: (  # type: ignore[method-assign]
+        looked_at.append(buffer.marked[rows, env_inds]),
+        original(rows, env_inds, *rest),
+    )[1]
+    buffer.marked[0, 0] = True  # one that a picture from the first to the last would begin with
+    _spread_over(buffer, 10)
+    most_uncomfortable(model, k=40)
+    assert len(looked_at) > 1 and not np.concatenate(looked_at).any()
+    buffer.marked[:, 0] = True
+    assert len(_spread_over(buffer, 10)) == 10 and not looked_at[-1].any(), "those of the other environment"
+    buffer.marked[:] = True
+    assert _spread_over(buffer, 10) is None
+    with pytest.raises(ValueError, match="all transitions in the replay buffer are marked as faulty"):
+        most_uncomfortable(model, k=40)
+
+
+def test_buffer_that_cannot_leave_faults_out_is_warned_of() -> None:
+    """When training begins, not at the first fault."""
+    venv = FaultTolerantSubprocVecEnv([VectorBox], on_env_fault="restart", start_method="fork")
+    try:
+        with pytest.warns(UserWarning, match=r"on_env_fault='restart' leaves .*NStepReplayBuffer cannot"):
+            tiny_model("MlpPolicy", venv, curiosity=None, n_steps=3).learn(2)
+    finally:
+        venv.close()
