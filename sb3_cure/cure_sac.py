@@ -1078,7 +1078,13 @@ class CuReSAC(Persistence, SAC):
     # ---------------------------------------------------------------- saving
 
     def _stateful_parts(self) -> dict[str, Any]:
-        parts = {"mixer": self._mixer, "metrics": self._metrics, "transition_guard": self._transition_guard}
+        parts: dict[str, Any] = {
+            "mixer": self._mixer,
+            "metrics": self._metrics,
+            "transition_guard": self._transition_guard,
+        }
+        if not self.is_plain_sac:
+            parts["encoder_shares"] = _EncoderShares(self.policy)
         return {name: part for name, part in parts.items() if part is not None}
 
     def _before_checkpoint(self) -> None:
@@ -1104,6 +1110,19 @@ class CuReSAC(Persistence, SAC):
                 state_dicts.append("curious_ent_coef_optimizer")
                 variables = [*variables, "curious_log_ent_coef"]
         return state_dicts, variables
+
+
+class _EncoderShares:
+    """Shares of the encoder's sources as a part of a checkpoint: measured now and then, logged every time."""
+
+    def __init__(self, policy: CuRePolicy):
+        self.optimizer = policy.encoder_optimizer
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        return dict(self.optimizer.shares)
+
+    def load_state_dict(self, state: dict[str, th.Tensor]) -> None:
+        self.optimizer.shares = dict(state)
 
 
 @th.no_grad()

@@ -159,8 +159,6 @@ class EncoderOptimizer:
             "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
             "weights": dict(self.weights),
             "n_steps": self._n_steps,
-            # Measured now and then, logged every time (sequential updates)
-            "shares": dict(self.shares),
         }
 
     def check_origin(self, state: dict[str, Any]) -> None:
@@ -193,4 +191,4 @@ class EncoderOptimizer:
             optimizer.load_state_dict(state["optimizers"][name])
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
         self.weights = dict(state["weights"])
-        self._n_steps, self.shares = state["n_steps"], dict(state["shares"])
+        self._n_steps = state["n_steps"]
