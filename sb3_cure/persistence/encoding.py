@@ -212,7 +212,7 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
 
 def _revived(kind: type, attributes: dict[str, Any]) -> Any:
     """An object of a class whose state is its attributes."""
-    value = object.__new__(kind)
+    value: Any = object.__new__(kind)
     vars(value).update(attributes)
     return value
 
