@@ -13,7 +13,7 @@ import stable_baselines3.sac.policies as sb3_policies
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
-from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
@@ -24,7 +24,6 @@ from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.callbacks import (
     CuriosityMapCallback,
     EvalBothCallback,
-    ExactCheckpoint,
     PolicyVideoCallback,
     ReconstructionCallback,
 )
@@ -1542,74 +1541,10 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: CuriosityMapCallback(PixelBox(), "new", coordinates=3, **MAP),
         "coordinates are 3, but a map needs two of the state's: choose of x, y.",
     ),
-    "load: missing": (
-        lambda: CuReSAC.load("missing"),
-        "there is neither a file 'missing' nor 'missing.zip': give the path that it was saved to.",
-    ),
-    "load: no archive": (
-        lambda: CuReSAC.load("there"),
-        "'there' is no zip file, or the end of it is missing: it was not written by this package, or was damaged "
-        "since.",
-    ),
-    "load: folder": (lambda: CuReSAC.load("."), "'.' is a folder: give the path of a file in it."),
-    "load: a replay buffer": (
-        lambda: CuReSAC.load(saved("save_replay_buffer")),
-        "'there' holds no model, but a replay buffer or a part of a checkpoint: read it with load_replay_buffer, or "
-        "give resume the folder of the checkpoints.",
-    ),
-    "load: number": (
-        lambda: CuReSAC.load(3),
-        "got 3 for a file, but expected a path, or a file that is open in binary mode.",
-    ),
-    "load: environment": (
-        lambda: CuReSAC.load("there", env=3),
-        "env is 3, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for example "
-        "make_dmc_env('cartpole', 'swingup').",
-    ),
     "set_env: environment": (
         lambda: model_of().set_env(None),
         "env is None, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for "
         "example make_dmc_env('cartpole', 'swingup').",
-    ),
-    "load: custom_objects": (
-        lambda: CuReSAC.load("there", custom_objects=3),
-        "custom_objects is a int, but it must be a dict or None.",
-    ),
-    "save: folder is a file": (
-        lambda: model_of().save("there/model"),
-        "cannot write 'there/model.zip', as 'there' is a file: choose another path.",
-    ),
-    "save: number": (
-        lambda: model_of().save(3),
-        "got 3 for a file, but expected a path, or a file that is open in binary mode.",
-    ),
-    "load: other observations": (
-        lambda: reloaded(PixelBox(size=40)),
-        "the file was trained with the observations Box(0, 255, (6, 36, 36), uint8), but the environment has "
-        "Box(0, 255, (6, 40, 40), uint8): make it as for that training (images: the same image_size, grayscale, "
-        "frame_stack), or train anew.",
-    ),
-    "load: other actions": (
-        lambda: reloaded(PixelBox(low=-2)),
-        "the file was trained with the actions Box(-1.0, 1.0, (2,), float32), but the environment has "
-        "Box(-2.0, 1.0, (2,), float32): give the environment that it was trained on, or train anew.",
-    ),
-    "set_parameters: missing": (
-        lambda: model_of().set_parameters("missing"),
-        "there is neither a file 'missing' nor 'missing.zip': give the path that it was saved to.",
-    ),
-    "load_replay_buffer: a model": (
-        lambda: model_of().load_replay_buffer(saved("save")),
-        "'there' holds a model: give what was written in this place, or read it with load.",
-    ),
-    "load_replay_buffer: missing": (
-        lambda: model_of().load_replay_buffer("missing"),
-        "there is neither a file 'missing' nor 'missing.pkl': give the path that it was saved to.",
-    ),
-    "load_replay_buffer: no buffer": (
-        lambda: model_of().load_replay_buffer("there"),
-        "'there' is no replay buffer that this package saved without pickle, and unpickling runs any code that is in "
-        "a file: if you know where it comes from, load it with trusted=True.",
     ),
     "resume: missing": (
         lambda: CuReSAC.resume("missing", PixelBox()),
@@ -1619,40 +1554,6 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
     "resume: file": (
         lambda: CuReSAC.resume("there", PixelBox()),
         "there is no checkpoint in there: give the path of an ExactCheckpoint that has begun a training, or start one.",
-    ),
-    "resume: number": (
-        lambda: CuReSAC.resume(3, PixelBox()),
-        "resume got path=3, but it must be the folder of an ExactCheckpoint: give it.",
-    ),
-    "resume: no environment": (
-        lambda: CuReSAC.resume("there", None),
-        "resume got no environment: give those of the training, made as they were then.",
-    ),
-    "resume: environment": (
-        lambda: CuReSAC.resume("there", 3),
-        "env is 3, but it must be a Gymnasium environment, a VecEnv or a Gymnasium id: give one of them, for example "
-        "make_dmc_env('cartpole', 'swingup').",
-    ),
-    "ExactCheckpoint: save_freq": (
-        lambda: ExactCheckpoint(0, "new"),
-        "ExactCheckpoint got save_freq=0, but it must be a whole number of at least 1: change save_freq.",
-    ),
-    "ExactCheckpoint: keep": (
-        lambda: ExactCheckpoint(10, "new", keep=1.5),
-        "ExactCheckpoint got keep=1.5, but it must be a whole number of at least 1: change keep.",
-    ),
-    "ExactCheckpoint: path": (
-        lambda: ExactCheckpoint(10, 3),
-        "ExactCheckpoint got path=3, but it must be the path of a folder: give one.",
-    ),
-    "ExactCheckpoint: path is a file": (
-        lambda: model_of().learn(3, callback=ExactCheckpoint(10, "there")),
-        "ExactCheckpoint cannot write to there (File exists): choose another path.",
-    ),
-    "ExactCheckpoint: algorithm": (
-        lambda: SAC("MlpPolicy", VectorBox(), buffer_size=10).learn(3, callback=ExactCheckpoint(10, "new")),
-        "ExactCheckpoint got a SAC, but only CuReSAC can resume exactly: use SB3's CheckpointCallback, or CuReSAC "
-        "(with srl=None, curiosity=None it is SB3's SAC).",
     ),
 }
 

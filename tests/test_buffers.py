@@ -744,4 +744,4 @@ def test_samples_begin_with_sb3s_fields() -> None:
     buffer.add(*next(stream(1, 1, set(), "env_fault")))
     batch = Samples(*buffer.sample(4))
     assert batch._fields[:6] == ReplayBufferSamples._fields
-    assert batch[5:] == (None,) * 7 and batch.observations.shape == (4, 2, 3, 3)
+    assert batch[5:] == (None,) * 2 and batch.observations.shape == (4, 2, 3, 3)

@@ -14,6 +14,7 @@ import stable_baselines3
 import torch as th
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
@@ -223,7 +224,13 @@ class SavesModels(OffPolicyAlgorithm):
             print("".join(char for char in archive.system_info if char.isprintable() or char == "\n"))
         settings = archive.settings(cls, custom_objects or {}, kwargs)
         if kwargs.get("policy_kwargs", settings.get("policy_kwargs")) != settings.get("policy_kwargs"):
-            raise ValueError(f"load got other policy_kwargs than {name} was saved with: leave them out.")
+            raise ValueError(f"the policy kwargs do not equal those that {name} was saved with: leave them out.")
+        chosen = {key: settings.get(key) for key in ("n_steps", "gamma")}
+        arguments = settings.get("replay_buffer_kwargs", {})
+        if settings.get("replay_buffer_class") is NStepReplayBuffer and chosen.items() <= arguments.items():
+            # SB3 chose it for these, and does so anew: `load` may be given others.
+            arguments = {key: value for key, value in arguments.items() if key not in chosen}
+            settings |= {"replay_buffer_class": None, "replay_buffer_kwargs": arguments}
         if env is not None:
             env = cls._wrap_env(env, settings.get("verbose", 0))
             check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])

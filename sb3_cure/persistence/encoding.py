@@ -40,7 +40,7 @@ from sb3_cure.srl import SRL_HEADS
 VERSION = 2
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
-    **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64", th.complex64: "C64"},
+    **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64"},
     **{th.uint8: "U8", th.uint16: "U16", th.uint32: "U32", th.uint64: "U64"},
 }
 
@@ -82,7 +82,7 @@ BUFFERS: tuple[type[sb3_buffers.ReplayBuffer], ...] = (
 )
 #: Types of the numbers in arrays
 NUMBERS: tuple[type[np.generic], ...] = (
-    *(np.bool_, np.float16, np.float32, np.float64, np.complex64),
+    *(np.bool_, np.float16, np.float32, np.float64),
     *(np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
 )
 
@@ -214,7 +214,7 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
 
 def _revived(kind: type, attributes: dict[str, Any]) -> Any:
     """An object of a class whose state is its attributes."""
-    value = object.__new__(kind)
+    value: Any = object.__new__(kind)
     vars(value).update(attributes)
     return value
 

@@ -481,7 +481,7 @@ def test_callbacks_go_on_counting(case: str, kill_at: int, tmp_path: Path) -> No
 
 
 def test_changed_attributes_of_callbacks_come_back(tmp_path: Path) -> None:
-    """Whatever their types became, dictionaries of any kind too; not what has no plain type, and not what is private."""
+    """Whatever their types became, dictionaries of any kind too; but not what has no plain type or is private."""
 
     class Best(BaseCallback):
         def __init__(self) -> None:

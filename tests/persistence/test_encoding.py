@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from benchmarks.fuzz import parts_of, safetensors_of, watching
 from sb3_cure.persistence import ArchiveError, read_state, write_state
 
-TENSOR_DTYPES = [th.uint8, th.int16, th.int64, th.bool, th.bfloat16, th.float16, th.float32, th.float64, th.complex64]
+TENSOR_DTYPES = [th.uint8, th.int16, th.int64, th.bool, th.bfloat16, th.float16, th.float32, th.float64]
 
 numeric_dtypes = st.one_of(
     hnp.boolean_dtypes(),
