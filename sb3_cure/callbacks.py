@@ -335,6 +335,7 @@ class ReconstructionCallback(_PictureCallback):
     :param probe_updates: Updates of the decoder for heads that do not draw; 0: say once that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
+    :param title: Put before the picture's title, such as the names of task and method
     :raises ValueError: if an argument is out of range, or the model does not learn from images with an encoder
     :raises ImportError: if matplotlib is not installed
     """
@@ -349,6 +350,7 @@ class ReconstructionCallback(_PictureCallback):
         probe_updates: int = 500,
         max_rows: int = 12,
         verbose: int = 0,
+        title: str = "",
     ):
         super().__init__(folder, every, "plots", verbose)
         if not (is_integer(columns, 1) and is_integer(probe_updates, 0) and is_integer(max_rows, 2)):
@@ -370,6 +372,7 @@ class ReconstructionCallback(_PictureCallback):
         self.frame_stack = frame_stack
         self.probe_updates = probe_updates
         self.max_rows = max_rows
+        self.title = title
         #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
         self.rows: list[tuple[int, np.ndarray]] = []
         self._said = False
@@ -440,8 +443,17 @@ class ReconstructionCallback(_PictureCallback):
             self._path("reconstructions.png"),
             newest_frames(observed, frame_stack).cpu().numpy(),
             [self.rows[index] for index in shown],
-            title,
+            f"{title}\n{self.title}" if self.title else title,
         )
+
+    def draw(self, model: BaseAlgorithm) -> None:
+        """Add a row now, outside of a training.
+
+        :param model: A model that has been trained, or loaded with a replay buffer
+        """
+        self.init_callback(model)
+        self.num_timesteps = model.num_timesteps
+        self.on_period()
 
     @property
     def _buffer(self) -> ReplayBuffer | None:
