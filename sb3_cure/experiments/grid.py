@@ -265,7 +265,7 @@ def constructor_defaults(algorithm: type) -> dict[str, Any]:
     """
     defaults: dict[str, Any] = {}
     for cls in inspect.getmro(algorithm):
-        parameters = inspect.signature(cls.__init__).parameters if "__init__" in vars(cls) else {}
+        parameters = inspect.signature(vars(cls)["__init__"]).parameters if "__init__" in vars(cls) else {}
         for name, parameter in parameters.items():
             if parameter.default is not parameter.empty and not name.startswith("_"):
                 defaults.setdefault(name, parameter.default)

@@ -359,7 +359,7 @@ def _seed_choice(text: str) -> int | list[int]:
 
 
 def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",") if name.strip()]
+    return [name.strip() for name in text.strip(", ").split(",")]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -397,7 +397,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(parser.parse_args(arguments))
     if "" not in sys.path:
         sys.path.append("")  # a grid may name a head of a module in the working directory
-    of_ray = [name for name in ("address", "gpus_per_cell", "cpus_per_cell", "retries")]
+    of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
     given = [name for name in of_ray if options[name] != parser.get_default(name)]
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
