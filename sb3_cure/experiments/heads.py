@@ -38,10 +38,14 @@ class CommonHeads:
 
     :param grid: The grid, whichever of its seeds and arms this call has chosen
     :param task: Gymnasium id
+    :param updates: How many fit each
+    :param share: Observations of each policy of a seed in the mix
     """
 
     grid: Grid
     task: str
+    updates: int
+    share: int
 
     #: As in tables beside cells
     method = "common heads"
@@ -75,7 +79,7 @@ class CommonHeads:
             for cells in self.seeds(results).values()
             for cell in cells
         }
-        return {"cells": finished, "updates": COMMON_UPDATES, "share": COMMON_SHARE, "policies": POLICIES}
+        return {"cells": finished, "updates": self.updates, "share": self.share, "policies": POLICIES}
 
     def is_done(self, results: Path) -> bool:
         """
@@ -98,7 +102,8 @@ def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list
         ``"visitation"``
     """
     tasks = dict.fromkeys(cell.task for cell in grid.cells if grid.kind == "visitation")
-    return [heads for heads in (CommonHeads(grid, task) for task in tasks) if len(heads.seeds(results, coming)) > 1]
+    every = [CommonHeads(grid, task, COMMON_UPDATES, COMMON_SHARE) for task in tasks]
+    return [heads for heads in every if len(heads.seeds(results, coming)) > 1]
 
 
 def run_heads(heads: CommonHeads, results: Path) -> None:
@@ -117,17 +122,16 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
             return
         (folder / ERROR).unlink(missing_ok=True)
         made_of, seeds = heads.made_of(results), heads.seeds(results)
-        write_progress(folder, updates=0, total=COMMON_UPDATES * len(seeds), seconds=0)
-        mixes = {seed: _mix(cells, results) for seed, cells in seeds.items()}
-        begun = told = time.monotonic()
+        mixes = {seed: _mix(cells, heads.share, results) for seed, cells in seeds.items()}
         tables: dict[Path, list[Row]] = {}
+        begun, told, total = time.monotonic(), -np.inf, heads.updates * len(seeds)
         for index, (seed, cells) in enumerate(seeds.items()):
             judge = _judge(cells[0])
             others = np.concatenate([mixes[other] for other in mixes if other != seed])
-            for number in fit_head(judge, others, COMMON_UPDATES):
-                if time.monotonic() - told > PROGRESS_SECONDS:
-                    told, updates = time.monotonic(), COMMON_UPDATES * index + number
-                    write_progress(folder, updates=updates, total=COMMON_UPDATES * len(seeds), seconds=told - begun)
+            for number in fit_head(judge, others, heads.updates):
+                if (now := time.monotonic()) - told > PROGRESS_SECONDS:
+                    told = now
+                    write_progress(folder, done=heads.updates * index + number, total=total, seconds=now - begun)
             for cell in cells:
                 path = results / cell.folder / "visitation.csv"
                 kept = [row for row in read_rows(path) if row["head"] != "common"]
@@ -149,13 +153,13 @@ def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator
     env.close()
 
 
-def _mix(cells: Sequence[Cell], results: Path) -> np.ndarray:
+def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
     """Observations of one seed's policies, as many of each kind."""
     seen: dict[str, np.ndarray] = {}
     for cell in cells:
         for actor, episodes in _episodes(cell, results, seen):
             observations = np.concatenate([episode.observations for episode in episodes])
-            seen[actor] = observations[np.linspace(0, len(observations) - 1, COMMON_SHARE).astype(int)]
+            seen[actor] = observations[np.linspace(0, len(observations) - 1, share).astype(int)]
     return np.concatenate(list(seen.values()))
 
 
