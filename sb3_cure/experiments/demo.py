@@ -40,6 +40,8 @@ SETTINGS: dict[str, Any] = dict(
 )
 TOTAL_STEPS = 12_000
 EVALUATIONS = 12
+#: Episodes of each policy in the end, and updates of the decoder that draws from the latents
+EPISODES, PROBE_UPDATES = 10, 1000
 
 
 class TimeLimit(BaseCallback):
@@ -121,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     even_negatives(model, eval_env, seed=15_000)
     errors, returns = {}, {}
     for actor in ("random", "task", "curious"):
-        episodes = list(run_episodes(model, eval_env, 10, actor, seed=20_000))
+        episodes = list(run_episodes(model, eval_env, EPISODES, actor, seed=20_000))
         errors[actor] = np.concatenate([episode.srl_errors for episode in episodes])
         returns[actor] = np.array([episode.total_reward for episode in episodes])
     table = [
@@ -146,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_json(out / "summary.json", summary)
     plots.learning_curve(out / "learning_curve.png", curve.rows, returns["random"].mean(), title)
     plots.srl_error_bars(out / "srl_error.png", errors, "SRL error that each policy sees\n(deterministic actions)")
-    ReconstructionCallback(out, probe_updates=1000, title=title).draw(model)
+    ReconstructionCallback(out, probe_updates=PROBE_UPDATES, title=title).draw(model)
     (episode,) = run_episodes(model, eval_env, 1, "task", seed=30_000, render=True)
     fps = round(eval_env.metadata["render_fps"])
     write_video(out / "policy.mp4", episode, fps, repeat, "task policy, deterministic actions")

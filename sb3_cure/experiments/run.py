@@ -197,8 +197,6 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
             return failed
 
         yield run_all
-    except ValueError as error:
-        raise GridError(f"Ray refuses {resources}: {error}") from error
     finally:
         ray.shutdown()
 
