@@ -77,7 +77,7 @@ def check_settings(folder: Path, config: dict[str, Any], name: str = "config.jso
     if not path.exists():
         return
     begun, now = read_kept(path), json.loads(json.dumps(config, default=str))
-    for key in now.keys() & begun.keys():
+    for key in (key for key in now if key in begun):
         there, here = comparable(key, begun[key], now[key])
         if there != here:
             if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ

@@ -12,11 +12,11 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
+import numpy as np
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 
 from sb3_cure.allocator import tune_allocator
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
@@ -27,6 +27,8 @@ from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_head
 ENGINES = ("local", "ray")
 #: In the log of a job, between two lines about the whole
 SUMMARY_SECONDS = 300.0
+_PLURALS = {Cell: "cells", CommonHeads: "tasks' common heads"}
+_ALL, _ENDED = Path("all"), re.compile(": (done|failed)")
 #: Folder of results, minutes between checkpoints, whether to draw
 Settings: TypeAlias = tuple[Path, float, bool]
 #: Runs all of some units, and returns those that failed
@@ -220,20 +222,6 @@ def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any])
 # -------------------------------------------------------------------- progress
 
 
-class _Progress(NamedTuple):
-    """How far a unit is, as its files tell, whichever process or machine runs it."""
-
-    unit: Unit
-    state: str
-    #: Environment steps, or updates of common heads
-    done: int
-    total: int
-    #: Of these, per second
-    rate: float
-    #: Return
-    best: float | None
-
-
 def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
     """
     :param unit: A cell or a task's common heads
@@ -256,43 +244,38 @@ def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
     return ("running" if may_run else "interrupted" if progress else "waiting"), progress
 
 
-def _progress_of(unit: Unit, results: Path) -> _Progress:
-    state, progress = read_progress(unit, results)
-    total = unit.budget + unit.pretraining_steps if isinstance(unit, Cell) else progress.get("total", 0)
-    done = progress.get("done", 0)
-    rate = done / progress["seconds"] if progress.get("seconds") else 0.0
-    return _Progress(unit, state, done, total, rate, progress.get("best_return"))
-
-
-def summary(rows: Sequence[_Progress]) -> str:
+def tell(units: Sequence[Unit], results: Path) -> dict[Path, str]:
     """
-    :param rows: How far all units are
-    :return: What is done and under way, how fast it goes, when it will be finished, and the best return of all cells
+    :param units: Cells and common heads
+    :param results: Folder of all results
+    :return: By folder, the state of each and, where it has begun, how far it is, how fast it goes, when it will be
+        finished, and its best return; last, as if of a unit, the same of all
     """
-    told = []
-    for name, kind in (("cells", Cell), ("tasks' common heads", CommonHeads)):
-        states = [row.state for row in rows if isinstance(row.unit, kind)]
-        if states:
-            told.append(f"{states.count('done')} of {len(states)} {name} done")
-    running = [row for row in rows if row.state == "running"]
-    told += [f"{len(running)} running"] if running else []
-    speed = sum(row.rate for row in running if isinstance(row.unit, Cell))
-    if speed:
-        left = [row for row in rows if row.state not in ("done", "failed") and isinstance(row.unit, Cell)]
-        seconds = sum(row.total - row.done for row in left) / speed
-        told.append(f"{speed:.1f} environment steps/s, about {_duration(seconds)} left")
-    best = max(((row.best, str(row.unit.folder)) for row in rows if row.best is not None), default=None)
-    return ", ".join([*told, *([f"best return {best[0]:.4g} ({best[1]})"] if best else [])])
-
-
-def _table(rows: Sequence[_Progress]) -> Table:
-    table = Table("task", "method", "seed", "state", "steps", "steps/s", "left", "best return", caption=summary(rows))
-    for unit, state, done, total, rate, best in rows:
+    lines: dict[Path, str] = {}
+    states: dict[type, list[str]] = {}
+    speed, left, best = 0.0, 0, (-np.inf, "")
+    for unit in units:
+        state, progress = read_progress(unit, results)
+        states.setdefault(type(unit), []).append(state)
+        done, seconds = progress.get("done", 0), progress.get("seconds", 0)
+        total = unit.budget + unit.pretraining_steps if isinstance(unit, Cell) else progress.get("total", 0)
+        rate = done / seconds if seconds else 0.0
+        line = f"{unit.folder}: {state}"
         if state in ("running", "interrupted", "failed"):
-            left = _duration((total - done) / rate) if rate else ""
-            numbers = (f"{done:,} of {total:,}", f"{rate:.1f}", left, "" if best is None else f"{best:.4g}")
-            table.add_row(unit.folder.parts[1], unit.method, str(unit.seed), state, *numbers)
-    return table
+            line += f", {done:,} of {total:,}" + (f", {rate:.1f}/s, {_duration((total - done) / rate)}" if rate else "")
+        if (own := progress.get("best_return")) is not None:
+            line += f", best return {own:.4g}"
+            best = max(best, (own, str(unit.folder)))
+        lines[unit.folder] = line
+        if isinstance(unit, Cell) and state not in ("done", "failed"):
+            left += total - done
+            speed += rate if state == "running" else 0.0
+    told = [f"{each.count('done')} of {len(each)} {_PLURALS[kind]} done" for kind, each in states.items()]
+    running = sum(each.count("running") for each in states.values())
+    told += [f"{running} running"] if running else []
+    told += [f"{speed:.1f} environment steps/s, about {_duration(left / speed)} left"] if speed else []
+    told += [f"best return {best[0]:.4g} ({best[1]})"] if best[1] else []
+    return {**lines, _ALL: ", ".join(told)}
 
 
 def _duration(seconds: float) -> str:
@@ -302,27 +285,27 @@ def _duration(seconds: float) -> str:
 
 @contextmanager
 def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Iterator[None]:
-    """Show how far all units are: a table on a terminal; elsewhere a line when one ends, and one now and then."""
+    """Show how far all units are: on a terminal all the time; elsewhere a line when one ends, and one now and then."""
     live = Live(auto_refresh=False) if Console().is_terminal else None
     stopped = threading.Event()
-    ended = {unit.folder: read_progress(unit, results)[0] for unit in list_units()}
+    told = tell(list_units(), results)
 
     def watch() -> None:
         told_at, over = time.monotonic(), False
         while not over:
             over = stopped.wait(1.0)
-            rows = [_progress_of(unit, results) for unit in list_units()]
+            lines = tell(list_units(), results)
             try:
                 if live is not None:
-                    live.update(_table(rows), refresh=True)
+                    live.update("\n".join(line for line in lines.values() if ": waiting" not in line), refresh=True)
                     continue
-                for row in rows:
-                    if row.state in ("done", "failed") and ended.get(row.unit.folder) != row.state:
-                        ended[row.unit.folder] = row.state
-                        print(f"{row.unit.folder} {row.state}", flush=True)
+                for folder, line in lines.items():
+                    if _ENDED.search(line) and told.get(folder) != line:
+                        told[folder] = line
+                        print(line, flush=True)
                 if over or time.monotonic() - told_at >= SUMMARY_SECONDS:
                     told_at = time.monotonic()
-                    print(summary(rows), flush=True)
+                    print(lines[_ALL], flush=True)
             except BrokenPipeError:  # nobody reads on, and the cells are to be finished all the same
                 _write_to_nobody()
 
@@ -406,7 +389,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if dry_run:
             check_grid(grid, out)
             units: list[Unit] = [*grid.cells, *common_heads(grid, out, grid.cells)]
-            print("\n".join(f"{unit.folder}: {read_progress(unit, out)[0]}" for unit in units), flush=True)
+            print("\n".join(list(tell(units, out).values())[:-1]), flush=True)
             return 0
         failed = run_grid(grid, out, **options)
         print("".join(f"{_failure(unit, out)}\n" for unit in failed), end="", flush=True)

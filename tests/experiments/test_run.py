@@ -201,11 +201,11 @@ def test_list_of_cells_may_be_cut_off(tmp_path: Path) -> None:
 def test_cells_are_finished_though_nobody_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """``sb3-cure experiment | tee log``, whose ``tee`` has died: neither cells nor what is shown later know of it."""
     monkeypatch.setattr(run, "SUMMARY_SECONDS", 0.0)
-    write_line, run_cell, told = run.summary, run.run_cell, threading.Event()
+    tell, run_cell, told = run.tell, run.run_cell, threading.Event()
 
-    def line(rows: Any) -> str:
+    def lines(*arguments: Any) -> Any:
         told.set()
-        return write_line(rows)
+        return tell(*arguments)
 
     def run_later(*arguments: Any) -> None:
         """Each cell sees another line being told."""
@@ -213,7 +213,7 @@ def test_cells_are_finished_though_nobody_reads(tmp_path: Path, monkeypatch: pyt
         assert told.wait(60)
         run_cell(*arguments)
 
-    monkeypatch.setattr(run, "summary", line)
+    monkeypatch.setattr(run, "tell", lines)
     monkeypatch.setattr(run, "run_cell", run_later)
     grid = load_grid(write_grid(tmp_path, seeds=2, **QUICK))
     with unread_stdout():
