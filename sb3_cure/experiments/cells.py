@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import platform
 import shutil
 import time
@@ -253,27 +252,22 @@ class _Record(BaseCallback):
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")
         row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
         for actor in trained_actors(model):
-            errors, returns = [], []
             # Environments may draw from the common random numbers of Python or NumPy, as training does.
             with untouched_randomness(model.device, EVAL_SEED):
-                episodes = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
-                for number, episode in enumerate(episodes):
-                    returns.append(float(episode.total_reward))
-                    if not math.isfinite(returns[-1]):  # reports could not be made of it
-                        raise ValueError(
-                            f"episode {number} of the evaluation at {row['environment_steps']} environment steps has "
-                            f"the return {returns[-1]}, but curves need finite ones: mend the rewards of "
-                            f"{self.cell.task}."
-                        )
-                    errors.append(episode.srl_errors)
-                    values = (row["environment_steps"], actor, number, returns[-1])
-                    self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
+                rolled_out = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
+                seen = [(float(episode.total_reward), episode.srl_errors) for episode in rolled_out]
+            returns = [value for value, _ in seen]
+            if not np.isfinite(returns).all():  # reports could not be made of it
+                raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: mend its rewards.")
+            for number, value in enumerate(returns):
+                values = (row["environment_steps"], actor, number, value)
+                self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
             if actor == "task":
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
             if getattr(model.policy, "srl", None) is not None:
-                row[f"{actor}_srl_error"] = float(np.concatenate(errors).mean())
+                row[f"{actor}_srl_error"] = float(np.concatenate([errors for _, errors in seen]).mean())
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
@@ -321,10 +315,8 @@ class _Record(BaseCallback):
 
 
 def _resolved_arguments(model: CuReSAC) -> dict[str, Any]:
-    """Every argument of the constructor that is a plain value, as the model has it: given, by default or chosen for
-    this machine."""
-    values = {name: getattr(model, name, None) for name in constructor_defaults(type(model))}
-    return {name: value for name, value in values.items() if value is not None}
+    """The constructor's arguments as the model has them: given, by default, or chosen for this machine."""
+    return {name: getattr(model, name) for name in constructor_defaults(type(model)) if hasattr(model, name)}
 
 
 def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finished: bool) -> bool:

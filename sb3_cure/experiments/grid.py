@@ -205,8 +205,8 @@ class Cell:
 
     def custom_objects(self) -> dict[str, Any]:
         """What loading its model needs besides the archive: classes that are named by their modules."""
-        given = {name: self.arguments[name] for name in _CLASSES if name in self.arguments}
-        return {name: pkgutil.resolve_name(value) if "." in str(value) else value for name, value in given.items()}
+        given = {name: str(self.arguments.get(name)) for name in _CLASSES}
+        return {name: pkgutil.resolve_name(value) for name, value in given.items() if "." in value}
 
     def make_model(self, env: Any, **changes: Any) -> CuReSAC:
         """
@@ -343,13 +343,13 @@ def load_grid(
     content = _read_yaml(path)
     file = _validated(path, content)
     if budget is not None and budget != file.budget:
-        content = {**content, "budget": budget, "methods": _scaled(file, content["methods"], budget, path)}
+        _scale(file, budget, path)
     if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
         if seeds > len(file.seeds):
             raise GridError(f"--seeds asks for {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
-    file = _validated(path, {**content, "seeds": sorted({*file.seeds, *chosen})})
+    file.seeds = sorted({*file.seeds, *chosen})
     of_tasks = _choose(tasks, {**{short_name(task): task for task in file.tasks}, **{t: t for t in file.tasks}}, path)
     of_arms = _choose(methods, {name: name for name in file.methods}, path)
     arms = tuple(
@@ -380,19 +380,15 @@ def _validated(path: Path, content: Any) -> GridFile:
         raise GridError(f"{path} is no grid: {'; '.join(wrong)}.") from None
 
 
-def _scaled(file: GridFile, methods: dict[str, Any], budget: int, path: Path) -> dict[str, Any]:
-    """The methods with phases of pretraining as long in proportion to another budget as they are to the file's."""
-    scaled = dict(methods)
-    for arm, method in file.methods.items():
+def _scale(file: GridFile, budget: int, path: Path) -> None:
+    """Another budget, and phases of pretraining as long in proportion to it as they are to the file's."""
+    for method in file.methods.values():
         if method.pretrain is not None:
             if file.budget == 0:
-                raise GridError(
-                    f"budget in {path} is 0 (pretraining alone), but {budget} was asked for, to which pretraining "
-                    "cannot be scaled: change the budgets in the file instead."
-                )
+                raise GridError(f"budget in {path} is 0 (pretraining alone), to which no other is in proportion.")
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
-            scaled[arm] = {**methods[arm], "pretrain": {**methods[arm]["pretrain"], "budget": steps}}
-    return scaled
+            method.pretrain = replace(method.pretrain, budget=steps)
+    file.budget = budget
 
 
 def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
