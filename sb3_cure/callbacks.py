@@ -256,6 +256,7 @@ class ReconstructionCallback(PeriodicCallback):
     :param probe_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
+    :param title: Put before the picture's title, such as the names of task and method
     :raises ValueError: if the model does not learn from images with an encoder, or from other images
     :raises ImportError: if matplotlib is not installed
     """
@@ -270,10 +271,12 @@ class ReconstructionCallback(PeriodicCallback):
         probe_updates: int = 500,
         max_rows: int = 12,
         verbose: int = 0,
+        title: str = "",
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
         self.frame_stack, self.probe_updates, self.max_rows = frame_stack, probe_updates, max_rows
+        self.title = title
         #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
         self.rows: list[tuple[int, np.ndarray]] = []
         self._latest: deque[np.ndarray] = deque(maxlen=LATEST)
@@ -331,8 +334,17 @@ class ReconstructionCallback(PeriodicCallback):
             _file(self, self.folder, "reconstructions.png"),
             newest_frames(observed, frame_stack).cpu().numpy(),
             [self.rows[index] for index in shown],
-            title,
+            f"{title}\n{self.title}" if self.title else title,
         )
+
+    def draw(self, model: BaseAlgorithm) -> None:
+        """Add a row now, outside of a training.
+
+        :param model: A model that has been trained, or loaded with a replay buffer
+        """
+        self.init_callback(model)
+        self.num_timesteps = model.num_timesteps
+        self.on_period()
 
     @property
     def _buffer(self) -> Any:

@@ -19,7 +19,7 @@ from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import even_negatives, evenly_measured, most_uncomfortable, run_episodes
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.probe import reconstruct_with_probe
+from sb3_cure.experiments.probe import draw_with_probe, fit_probe
 from sb3_cure.metrics import reconstruction_strip
 
 
@@ -162,9 +162,9 @@ def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
     for updates in (1, 150):
         th.manual_seed(0)
         np.random.seed(0)
-        strip = reconstruct_with_probe(model, frame_stack=1, updates=updates, batch_size=16, columns=4)
-        observed, drawn = strip[:, :36].astype(float), strip[:, 36:].astype(float)
-        distances.append(np.abs(observed - drawn).mean())
+        decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, updates, batch_size=16)
+        observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+        distances.append(float((observed - drawn).abs().mean()))
     assert distances[1] < 0.5 * distances[0]
     assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
 

@@ -1,19 +1,16 @@
 """One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
 
-import errno
-import itertools
+import contextlib
 import json
-import math
-import os
 import platform
 import shutil
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import torch as th
@@ -25,14 +22,9 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import run_episodes, trained_actors
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.grid import DONE, Cell, GridError, comparable, read_kept
+from sb3_cure.experiments.grid import ALGOS, DONE, Cell, GridError, comparable, constructor_defaults, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 #: Evaluations start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
@@ -68,7 +60,6 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     with alone_in(folder):
         if not (folder / DONE).exists():
             (folder / ERROR).unlink(missing_ok=True)
-            _keep_config(cell, folder)
             _CellRun(cell, folder, checkpoint_minutes, pictures).finish()
         shutil.rmtree(folder / "checkpoint", ignore_errors=True)
     return folder
@@ -84,9 +75,9 @@ def check_settings(folder: Path, config: dict[str, Any], name: str = "config.jso
     path = folder / name
     if not path.exists():
         return
-    begun, now = read_kept(path), _plain(config)
-    for key in now:
-        there, here = comparable(key, begun.get(key), now[key])
+    begun, now = read_kept(path), json.loads(json.dumps(config, default=str))
+    for key in (key for key in now if key in begun):
+        there, here = comparable(key, begun[key], now[key])
         if there != here:
             if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ
                 names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
@@ -104,7 +95,8 @@ class _CellRun:
         self.cell, self.folder, self.pictures = cell, folder, pictures
         self.checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
         self.record = _Record(cell, folder)
-        self.model = self._resume() or CuReSAC(env=self._make_env(), seed=cell.seed, **cell.build_arguments())
+        write_json(folder / "config.json", {**cell.config(), "action_repeat": self.record.action_repeat})
+        self.model = self._resume() or cell.make_model(self._make_env())
 
     def finish(self) -> None:
         try:
@@ -151,19 +143,13 @@ class _CellRun:
 
     def _resume(self) -> CuReSAC | None:
         """The model of the newest whole checkpoint, or None."""
-        path = self.checkpoints.path
-        if not path.exists():
+        cell, path = self.cell, self.checkpoints.path
+        if not ExactCheckpoint.exists(path):
             return None
         try:
-            return CuReSAC.resume(path, self._make_env(), custom_objects=self.cell.custom_objects())
+            return ALGOS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
         except ValueError as error:
-            if not ExactCheckpoint.exists(path):  # killed before there was one
-                return None
-            aside = next(
-                path.with_name(f"unusable-{n}")
-                for n in itertools.count()
-                if not path.with_name(f"unusable-{n}").exists()
-            )
+            aside = path.with_name(f"unusable-{time.time_ns()}")
             print(f"{self.folder} begins anew, its checkpoints are kept in {aside.name}: {error}")
             path.rename(aside)
             return None
@@ -266,27 +252,22 @@ class _Record(BaseCallback):
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")
         row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
         for actor in trained_actors(model):
-            errors, returns = [], []
             # Environments may draw from the common random numbers of Python or NumPy, as training does.
             with untouched_randomness(model.device, EVAL_SEED):
-                episodes = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
-                for number, episode in enumerate(episodes):
-                    returns.append(float(episode.total_reward))
-                    if not math.isfinite(returns[-1]):  # reports could not be made of it
-                        raise ValueError(
-                            f"episode {number} of the evaluation at {row['environment_steps']} environment steps has "
-                            f"the return {returns[-1]}, but curves need finite ones: mend the rewards of "
-                            f"{self.cell.task}."
-                        )
-                    errors.append(episode.srl_errors)
-                    values = (row["environment_steps"], actor, number, returns[-1])
-                    self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
+                rolled_out = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
+                seen = [(float(episode.total_reward), episode.srl_errors) for episode in rolled_out]
+            returns = [value for value, _ in seen]
+            if not np.isfinite(returns).all():  # reports could not be made of it
+                raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: mend its rewards.")
+            for number, value in enumerate(returns):
+                values = (row["environment_steps"], actor, number, value)
+                self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
             if actor == "task":
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
             if getattr(model.policy, "srl", None) is not None:
-                row[f"{actor}_srl_error"] = float(np.concatenate(errors).mean())
+                row[f"{actor}_srl_error"] = float(np.concatenate([errors for _, errors in seen]).mean())
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
@@ -308,9 +289,7 @@ class _Record(BaseCallback):
         returns = [row["return_mean"] for row in self.evaluations if row["return_mean"] != ""]
         write_progress(
             self.folder,
-            phase="train" if self.evaluates else "pretrain",
-            agent_steps=model.num_timesteps,
-            environment_steps=model.num_timesteps * self.action_repeat,
+            done=model.num_timesteps * self.action_repeat + (self.cell.pretraining_steps if self.evaluates else 0),
             seconds=self.seconds,
             best_return=max(returns, default=None),
         )
@@ -325,6 +304,7 @@ class _Record(BaseCallback):
             **describe_run(),
             "device": str(model.device),
             "precision": getattr(model, "_computed_precision", "fp32"),
+            "arguments": _resolved_arguments(model),
             "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
@@ -332,6 +312,11 @@ class _Record(BaseCallback):
             # Where it was interrupted: what each attempt ran on
             **({"history": self.attempts} if len(self.attempts) > 1 else {}),
         }
+
+
+def _resolved_arguments(model: CuReSAC) -> dict[str, Any]:
+    """The constructor's arguments as the model has them: given, by default, or chosen for this machine."""
+    return {name: getattr(model, name) for name in constructor_defaults(type(model)) if hasattr(model, name)}
 
 
 def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finished: bool) -> bool:
@@ -352,7 +337,7 @@ class CellIsRunning(GridError):
     """Another process is at this cell."""
 
 
-@contextmanager
+@contextlib.contextmanager
 def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
     """Hold a folder's lock, which goes with the process, however that ends.
 
@@ -360,23 +345,19 @@ def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
     :param wait: Whether to wait for another process that holds it
     :raises CellIsRunning: if another process holds it
     """
-    with (folder / ".lock").open("w") as file:
-        # Not at once: `is_held` holds it for a moment, too.
-        deadline = math.inf if wait else time.monotonic() + 1
-        while True:
-            try:
-                lock(file)
-                break
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise CellIsRunning(
-                        f"{folder} is being run by another process: wait for it, or choose another --out."
-                    ) from None
-                time.sleep(0.1)
-            except OSError as error:
-                print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this.")
-                break
+    lock = filelock.FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=-1 if wait else 1)  # not at once: `is_held` holds it for a moment, too
+    except filelock.Timeout:
+        raise CellIsRunning(
+            f"{folder} is being run by another process: wait for it, or choose another --out."
+        ) from None
+    except OSError as error:
+        print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this.")
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def is_held(folder: Path) -> bool:
@@ -384,14 +365,15 @@ def is_held(folder: Path) -> bool:
     :param folder: Of a cell, whether it exists or not
     :return: Whether a process runs it; of other machines this may not be known
     """
+    if not (folder / ".lock").exists():
+        return False
     try:
-        with (folder / ".lock").open() as file:
-            lock(file, shared=True)
-    except BlockingIOError:
+        with filelock.FileLock(folder / ".lock", timeout=0):
+            return False
+    except filelock.Timeout:
         return True
     except OSError:
         return False
-    return False
 
 
 def write_progress(folder: Path, **progress: Any) -> None:
@@ -400,32 +382,8 @@ def write_progress(folder: Path, **progress: Any) -> None:
     :param folder: Of the cell
     :param progress: What to tell, besides when and where
     """
-    with suppress(OSError):
+    with contextlib.suppress(OSError):
         write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
-
-
-def lock(file: IO[Any], shared: bool = False) -> None:
-    """Lock a file, which the end of the process unlocks, however it ends.
-
-    :param file: The open file
-    :param shared: Whether others may share the lock
-    :raises BlockingIOError: if another process holds it
-    :raises OSError: where there are no locks
-    """
-    if fcntl is None:
-        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
-    fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-
-
-def _keep_config(cell: Cell, folder: Path) -> None:
-    env = gym.make(cell.task, **cell.env_kwargs)
-    write_json(folder / "config.json", {**_plain(cell.config()), "action_repeat": action_repeat_of(env)})
-    env.close()
-
-
-def _plain(config: dict[str, Any]) -> dict[str, Any]:
-    """As it comes back from a file."""
-    return json.loads(json.dumps(config, default=repr))
 
 
 def _now() -> str:

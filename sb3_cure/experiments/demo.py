@@ -7,7 +7,6 @@ Writes ``learning_curve.csv/png``, ``reconstructions.png``, ``srl_error.csv/png`
 """
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,11 +17,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.allocator import tune_allocator
-from sb3_cure.callbacks import EvalBothCallback
+from sb3_cure.callbacks import EvalBothCallback, ReconstructionCallback
 from sb3_cure.evaluation import even_negatives, run_episodes
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.files import describe_run, write_csv
-from sb3_cure.experiments.probe import reconstruct_with_probe
+from sb3_cure.experiments.files import describe_run, write_csv, write_json
 from sb3_cure.experiments.video import write_video
 
 DOMAIN, TASK = "cartpole", "swingup"
@@ -42,6 +40,8 @@ SETTINGS: dict[str, Any] = dict(
 )
 TOTAL_STEPS = 12_000
 EVALUATIONS = 12
+#: Episodes of each policy in the end, and updates of the decoder that draws from the latents
+EPISODES, PROBE_UPDATES = 10, 1000
 
 
 class TimeLimit(BaseCallback):
@@ -100,82 +100,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.minutes <= 0 or options.steps < 1:
         parser.error(f"--minutes is {options.minutes} and --steps {options.steps}, but both must be positive")
-    options.out.mkdir(parents=True, exist_ok=True)
+    out: Path = options.out
+    out.mkdir(parents=True, exist_ok=True)
     tune_allocator()
 
     env = make_dmc_env(DOMAIN, TASK, seed=options.seed, **ENV_KWARGS)
     eval_env = make_dmc_env(DOMAIN, TASK, render_mode="rgb_array", **ENV_KWARGS)
-    action_repeat = env.get_wrapper_attr("action_repeat")
+    repeat = env.get_wrapper_attr("action_repeat")
     model = CuReSAC("CnnPolicy", env, seed=options.seed, **SETTINGS)
-    curve = RecordCurve(
-        eval_env, max(options.steps // EVALUATIONS, 1), n_episodes=3, seed=10_000, action_repeat=action_repeat
-    )
-    print(
-        f"Training CuReSAC on {DOMAIN}-{TASK} from {ENV_KWARGS['image_size']} px images, at most {options.minutes:g} "
-        f"minutes and {options.steps} agent steps = {options.steps * action_repeat} environment steps"
-    )
+    curve = RecordCurve(eval_env, max(options.steps // EVALUATIONS, 1), n_episodes=3, seed=10_000, action_repeat=repeat)
+    title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({SETTINGS['srl']}), seed {options.seed}"
+    print(f"{title}: at most {options.minutes:g} minutes and {options.steps} agent steps")
     start = time.monotonic()
     model.learn(options.steps, callback=[curve, TimeLimit(options.minutes)], progress_bar=True)
-    seconds = time.monotonic() - start
+    seconds = round(time.monotonic() - start)
     if not curve.rows or curve.rows[-1]["agent_steps"] < model.num_timesteps:
         curve.evaluate()
+    steps = {"agent_steps": model.num_timesteps, "environment_steps": model.num_timesteps * repeat}
+    model.save(out / "model.zip")
 
     print("Measuring the random, task and curious policies")
     even_negatives(model, eval_env, seed=15_000)
     errors, returns = {}, {}
     for actor in ("random", "task", "curious"):
-        episodes = list(run_episodes(model, eval_env, 10, actor, seed=20_000))
+        episodes = list(run_episodes(model, eval_env, EPISODES, actor, seed=20_000))
         errors[actor] = np.concatenate([episode.srl_errors for episode in episodes])
-        returns[actor] = [episode.total_reward for episode in episodes]
-    random_return, final_return = float(np.mean(returns["random"])), float(np.mean(returns["task"]))
-
-    title = f"{DOMAIN}-{TASK} from pixels, CuReSAC ({SETTINGS['srl']}), seed {options.seed}"
-    write_csv(options.out / "learning_curve.csv", list(curve.rows[0]), curve.rows)
-    plots.learning_curve(options.out / "learning_curve.png", curve.rows, random_return, title)
+        returns[actor] = np.array([episode.total_reward for episode in episodes])
     table = [
         {
-            "policy": actor,
-            "min": errors[actor].min(),
-            "mean": errors[actor].mean(),
-            "max": errors[actor].max(),
-            "return_mean": np.mean(returns[actor]),
-            "return_std": np.std(returns[actor]),
+            **{"policy": actor, "min": seen.min(), "mean": seen.mean(), "max": seen.max()},
+            **{"return_mean": returns[actor].mean(), "return_std": returns[actor].std()},
         }
-        for actor in errors
+        for actor, seen in errors.items()
     ]
-    write_csv(options.out / "srl_error.csv", list(table[0]), table)
-    plots.srl_error_bars(
-        options.out / "srl_error.png", errors, "SRL error that each policy sees\n(deterministic actions)"
-    )
-    strip = reconstruct_with_probe(model, env.get_wrapper_attr("frame_stack"))
-    if strip is not None:
-        plots.reconstruction_grid(options.out / "reconstructions.png", strip, "What the latents know of the image")
-    episode = next(run_episodes(model, eval_env, 1, "task", seed=30_000, render=True))
-    fps = round(eval_env.metadata["render_fps"])
-    write_video(options.out / "policy.mp4", episode, fps, action_repeat, "task policy, deterministic actions")
-    model.save(options.out / "model.zip")
+    ratio = returns["task"].mean() / returns["random"].mean()
     summary = {
-        "task": f"{DOMAIN}-{TASK}",
-        "seed": options.seed,
-        "agent_steps": model.num_timesteps,
-        "environment_steps": model.num_timesteps * action_repeat,
-        "updates": model._n_updates,
-        "update_mode": model.update,
-        "training_seconds": round(seconds),
-        "final_return_mean": round(final_return, 1),
-        "final_return_std": round(float(np.std(returns["task"])), 1),
-        "random_return_mean": round(random_return, 1),
-        "ratio": round(final_return / random_return, 2),
-        "settings": SETTINGS,
-        "environment": ENV_KWARGS,
-        **describe_run(),
-        "precision": model._computed_precision,
+        **{"task": f"{DOMAIN}-{TASK}", "seed": options.seed, **steps, "updates": model._n_updates},
+        **{"update_mode": model.update, "training_seconds": seconds},
+        "final_return_mean": round(float(returns["task"].mean()), 1),
+        "final_return_std": round(float(returns["task"].std()), 1),
+        "random_return_mean": round(float(returns["random"].mean()), 1),
+        **{"ratio": round(float(ratio), 2), "settings": SETTINGS, "environment": ENV_KWARGS},
+        **{**describe_run(), "precision": model._computed_precision},
     }
-    (options.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    ratio = final_return / random_return
+    write_csv(out / "learning_curve.csv", list(curve.rows[0]), curve.rows)
+    write_csv(out / "srl_error.csv", list(table[0]), table)
+    write_json(out / "summary.json", summary)
+    plots.learning_curve(out / "learning_curve.png", curve.rows, returns["random"].mean(), title)
+    plots.srl_error_bars(out / "srl_error.png", errors, "SRL error that each policy sees\n(deterministic actions)")
+    ReconstructionCallback(out, probe_updates=PROBE_UPDATES, title=title).draw(model)
+    (episode,) = run_episodes(model, eval_env, 1, "task", seed=30_000, render=True)
+    fps = round(eval_env.metadata["render_fps"])
+    write_video(out / "policy.mp4", episode, fps, repeat, "task policy, deterministic actions")
     print(
-        f"Return after {model.num_timesteps} agent steps ({seconds:.0f} s): {final_return:.0f}, random policy: "
-        f"{random_return:.0f}, ratio {ratio:.1f}. Pictures and video: {options.out}/"
+        f"Return after {model.num_timesteps} agent steps ({seconds} s): {returns['task'].mean():.0f}, random policy: "
+        f"{returns['random'].mean():.0f}, ratio {ratio:.1f}. Pictures and video: {out}/"
     )
     return 0 if ratio >= 3 else 1
 

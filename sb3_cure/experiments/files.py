@@ -18,21 +18,20 @@ from sb3_cure.persistence.files import replacing
 
 Row = dict[str, Any]
 #: What decides what is computed: algorithms, physics, pixels
-_DEPENDENCIES = ("stable_baselines3", "torch", "numpy", "gymnasium", "shimmy", "dm_control", "mujoco")
+_DEPENDENCIES = ("stable_baselines3", "sb3_contrib", "torch", "numpy", "gymnasium", "shimmy", "dm_control", "mujoco")
 
 
 def describe_run() -> dict[str, Any]:
     """
     :return: Versions, machine and commit, to be kept beside results
     """
-    threads = th.get_num_threads()
     return {
         "versions": {
             "python": platform.python_version(),
             "sb3_cure": sb3_cure.__version__,
             **{name: version(name) for name in _DEPENDENCIES},
         },
-        "machine": f"{_processor()}, {threads} threads, {th.backends.cpu.get_cpu_capability()}",
+        "machine": f"{_processor()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "commit": _COMMIT,
     }
@@ -40,10 +39,8 @@ def describe_run() -> dict[str, Any]:
 
 def _processor() -> str:
     """Its model where Linux tells, else its architecture."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.machine()
 
@@ -54,10 +51,8 @@ def code_commit() -> str | None:
         checkout that the package lies in, marked where it has changes, else of the repository that pip installed it
         from; None where nothing tells
     """
-    if os.environ.get("SB3_CURE_COMMIT"):
-        return os.environ["SB3_CURE_COMMIT"]
-    root = Path(sb3_cure.__file__).parent.parent
-    if commit := checkout_commit(root):
+    commit = os.environ.get("SB3_CURE_COMMIT") or checkout_commit(Path(sb3_cure.__file__).parent.parent)
+    if commit:
         return commit
     try:
         origin = json.loads(distribution("sb3-cure").read_text("direct_url.json") or "{}")
@@ -91,13 +86,11 @@ def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     :return: Its rows; numbers are numbers, missing values ``""``
     :raises ValueError: saying what of the file's form is wrong
     """
-    with path.open(newline="", encoding="utf-8") as file:
-        text = file.read()
+    text = path.read_text(encoding="utf-8")
     reader = csv.DictReader(io.StringIO(text, newline=""))
-    rows, names = list(reader), reader.fieldnames or ()
-    for name in needed:
-        if name not in names:
-            raise ValueError(f"has no column {name!r}")
+    rows = list(reader)
+    for name in set(needed) - set(reader.fieldnames or ()):
+        raise ValueError(f"has no column {name!r}")
     if any(None in row or None in row.values() for row in rows):
         raise ValueError("has a row that is shorter or longer than its header")
     if not text.endswith("\n"):
@@ -127,9 +120,9 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """
     :param path: File to write, whole or not at all
-    :param content: Its content
+    :param content: Its content; what JSON does not know as a text
     """
-    write_text(path, json.dumps(content, indent=2) + "\n")
+    write_text(path, json.dumps(content, indent=2, default=str) + "\n")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:

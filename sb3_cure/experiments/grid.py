@@ -1,44 +1,75 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
 import copy
+import importlib
 import inspect
 import json
-import math
 import pkgutil
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
+import pydantic
 import torch as th
 import yaml
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.checks import check_arguments, check_curious_agent, check_parts, check_shared_encoder_space
+from sb3_cure.callbacks import untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.rendering import GLUnavailableError
-from sb3_cure.persistence.buffers import can_be_kept
-from sb3_cure.values import arguments_of, entry_for, import_environments, is_integer
 
 #: The file that tells that a cell is finished
 DONE = "DONE"
-KINDS = ("curves", "visitation", "pretraining")
-COLLECTORS = ("curious", "random")
-_GRID_KEYS = {"experiment", "kind", "budget", "seeds", "evaluation", "tasks", "methods", "baseline"}
-_METHOD_KEYS = {"config", "overrides", "pretrain", "train", "baseline"}
-# Of a zoo entry: what is no argument of CuReSAC. `n_timesteps` is rl-zoo's; here the grid's budget says how long.
-_ENTRY_KEYS = {"n_timesteps", "env_kwargs", "n_envs"}
+#: What methods train, by the name of rl-zoo's ``--algo``
+ALGOS: dict[str, type[CuReSAC]] = {"cure_sac": CuReSAC}
 # What a string with a dot names: a class of one's own.
-_CLASSES = ("srl", "replay_buffer_class")
-_ARGUMENTS = (arguments_of(CuReSAC) or set()) - {"env", "seed", "_init_setup_model"}
+_CLASSES = ("srl", "intrinsic", "replay_buffer_class")
 
 
 class GridError(ValueError):
     """A grid file or a choice from it that cannot be run; the message is for its author."""
 
 
-@dataclass(frozen=True)
+def short_name(task: str) -> str:
+    """
+    :param task: Gymnasium id
+    :return: The id without module, namespace and version: a folder's name
+    """
+    return re.sub(r"-v\d+$", "", re.split("[:/]", task)[-1])
+
+
+# --------------------------------------------------------------- what a file is
+
+
+def _check_registered(task: str) -> str:
+    module, _, name = task.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+        gym.spec(name)
+    except (gym.error.Error, ImportError, TypeError) as error:
+        raise ValueError(f"{' '.join(str(error).split())} (one of your own is my_module:My-v0)") from error
+    return task
+
+
+def _check_algo(algo: str) -> str:
+    if algo not in ALGOS:
+        raise ValueError(f"it must be one of {', '.join(ALGOS)}")
+    return algo
+
+
+_Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$")]
+_Seeds = Annotated[
+    list[Annotated[int, Field(ge=0, lt=2**31)]],
+    Field(min_length=1),
+    BeforeValidator(lambda value: list(range(value)) if type(value) is int else value),
+]
+
+
+@pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Pretraining:
     """A phase of representation learning without task reward, before training.
 
@@ -46,8 +77,80 @@ class Pretraining:
     :param budget: Environment steps
     """
 
-    collector: str
-    budget: int
+    collector: Literal["curious", "random"]
+    budget: PositiveInt
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Evaluation(_Part):
+    """When and how each cell is evaluated.
+
+    :param every: Environment steps between two evaluations
+    :param episodes: Episodes of an evaluation, of each policy
+    """
+
+    every: PositiveInt = 10_000
+    episodes: PositiveInt = 10
+
+
+class Method(_Part):
+    """An arm of the comparison.
+
+    :param config: Zoo file, by its path relative to the grid's
+    :param overrides: What differs from the file's entry
+    :param algo: A key of ``ALGOS``
+    :param pretrain: The phase before training, if any
+    :param train: Whether the task is learned at all
+    :param baseline: Another method, from which its difference is taken instead of from the grid's baseline
+    """
+
+    config: str
+    overrides: dict[str, Any] = {}
+    algo: Annotated[str, AfterValidator(_check_algo)] = "cure_sac"
+    pretrain: Pretraining | None = None
+    train: bool = True
+    baseline: str | None = None
+
+
+class GridFile(_Part):
+    """A grid's YAML file.
+
+    :param experiment: Its name, the folder of its results
+    :param kind: What the report makes of it
+    :param budget: Environment steps of training; 0: pretraining alone
+    :param tasks: Gymnasium ids
+    :param methods: The arms by name
+    :param seeds: How many, or which
+    :param evaluation: When and how to evaluate
+    :param baseline: The arm with which the others are compared, by default the first
+    """
+
+    experiment: _Name
+    kind: Literal["curves", "visitation", "pretraining"]
+    budget: Annotated[int, Field(ge=0)]
+    tasks: Annotated[list[Annotated[str, AfterValidator(_check_registered)]], Field(min_length=1)]
+    methods: Annotated[dict[_Name, Method], Field(min_length=1)]
+    seeds: _Seeds = [0]
+    evaluation: Evaluation = Evaluation()
+    baseline: str = ""
+
+    @pydantic.model_validator(mode="after")
+    def _check_names(self) -> "GridFile":
+        self.baseline = self.baseline or next(iter(self.methods))
+        if len({short_name(task) for task in self.tasks}) < len(self.tasks):
+            raise ValueError("two tasks would share a folder: write a grid for each, named differently")
+        for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
+            if name not in self.methods:
+                raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
+        if any(method.baseline == name for name, method in self.methods.items()):
+            raise ValueError("a method's baseline must be another method")
+        return self
+
+
+# ----------------------------------------------------------------- what is run
 
 
 @dataclass(frozen=True)
@@ -55,7 +158,7 @@ class Cell:
     """One training run.
 
     :param experiment: Name of the grid
-    :param kind: One of ``KINDS``
+    :param kind: Of the grid
     :param task: Gymnasium id
     :param method: Name of the arm
     :param seed: Seed of weights, warm-up, environment; the arms of a seed share them
@@ -64,8 +167,9 @@ class Cell:
     :param eval_episodes: Episodes of an evaluation
     :param n_envs: Environments side by side
     :param env_kwargs: Arguments of ``gymnasium.make``
-    :param arguments: Arguments of ``CuReSAC`` but for environment and seed
+    :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
+    :param algo: A key of ``ALGOS``
     """
 
     experiment: str
@@ -80,26 +184,37 @@ class Cell:
     env_kwargs: dict[str, Any]
     arguments: dict[str, Any]
     pretrain: Pretraining | None = None
+    algo: str = "cure_sac"
 
     @property
     def folder(self) -> Path:
         """Where it lies below the folder of results."""
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
 
+    @property
+    def pretraining_steps(self) -> int:
+        """Environment steps before training."""
+        return self.pretrain.budget if self.pretrain else 0
+
     def build_arguments(self) -> dict[str, Any]:
         """A copy of ``arguments``, as SB3 writes into some, with the classes that are named by their modules."""
         arguments = copy.deepcopy(self.arguments)
         if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
             arguments["train_freq"] = tuple(arguments["train_freq"])
-        for name in _CLASSES:
-            if "." in str(arguments.get(name)):
-                arguments[name] = pkgutil.resolve_name(arguments[name])
-        return arguments
+        return {**arguments, **self.custom_objects()}
 
     def custom_objects(self) -> dict[str, Any]:
-        """What ``CuReSAC.load`` needs besides the archive: classes that are named by their modules."""
-        arguments = self.build_arguments()
-        return {name: arguments[name] for name in _CLASSES if name in arguments}
+        """What loading its model needs besides the archive: classes that are named by their modules."""
+        given = {name: str(self.arguments.get(name)) for name in _CLASSES}
+        return {name: pkgutil.resolve_name(value) for name, value in given.items() if "." in value}
+
+    def make_model(self, env: Any, **changes: Any) -> CuReSAC:
+        """
+        :param env: Its environment, or several as a ``VecEnv``
+        :param changes: Arguments instead of its own
+        :return: Its model before training
+        """
+        return ALGOS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
 
     def is_done(self, results: Path) -> bool:
         """
@@ -110,12 +225,8 @@ class Cell:
 
     def config(self) -> dict[str, Any]:
         """What its ``config.json`` holds: with the values of the arguments that are not given, which may change."""
-        parameters = inspect.signature(CuReSAC.__init__).parameters.values()
-        names = _ARGUMENTS - self.arguments.keys()
-        defaults = {
-            each.name: each.default for each in parameters if each.name in names and each.default is not each.empty
-        }
-        return {**asdict(self), "defaults": defaults}
+        known = constructor_defaults(ALGOS[self.algo])
+        return {**asdict(self), "defaults": {name: known[name] for name in known if name not in self.arguments}}
 
 
 @dataclass(frozen=True)
@@ -123,10 +234,10 @@ class Grid:
     """All cells of an experiment.
 
     :param experiment: Its name, the folder of its results
-    :param kind: One of ``KINDS``
+    :param kind: What the report makes of it
     :param baseline: The arm with which those are compared that name no ``baseline`` of their own
     :param cells: What was chosen, seed by seed, so that whole comparisons are finished early
-    :param complete: All that the file (or an earlier choice of seeds) makes of it
+    :param arms: A cell of each method on each task of the file
     :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
     """
 
@@ -134,18 +245,34 @@ class Grid:
     kind: str
     baseline: str
     cells: tuple[Cell, ...]
-    complete: tuple[Cell, ...]
+    arms: tuple[Cell, ...]
     description: dict[str, Any]
 
     def with_seeds_in(self, results: Path) -> list[Cell]:
         """
         :param results: Folder of all results
-        :return: All that the file makes of it, and of the further seeds that other calls have run there
+        :return: All arms with the seeds that were chosen, and the further ones that other calls have run there
         """
-        arms = [cell for cell in self.complete if cell.seed == self.complete[0].seed]
-        run = (seed_of(folder) for arm in arms for folder in (results / arm.folder.parent).glob("seed*"))
-        seeds = {cell.seed for cell in self.complete} | {seed for seed in run if seed is not None}
-        return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in arms]
+        found = (seed_of(folder) for arm in self.arms for folder in (results / arm.folder.parent).glob("seed*"))
+        seeds = {cell.seed for cell in self.cells} | {seed for seed in found if seed is not None}
+        return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in self.arms]
+
+
+def constructor_defaults(algorithm: type) -> dict[str, Any]:
+    """
+    :param algorithm: Class of an algorithm that hands on to its bases what it does not name
+    :return: Values of the arguments that need not be given, but for the seed and what only SB3 itself gives
+    """
+    defaults: dict[str, Any] = {}
+    for cls in inspect.getmro(algorithm):
+        parameters = inspect.signature(vars(cls)["__init__"]).parameters if "__init__" in vars(cls) else {}
+        for name, parameter in parameters.items():
+            if parameter.default is not parameter.empty and not name.startswith("_"):
+                defaults.setdefault(name, parameter.default)
+        if parameters and all(each.kind is not each.VAR_KEYWORD for each in parameters.values()):
+            break
+    defaults.pop("seed", None)
+    return defaults
 
 
 def comparable(key: str, one: Any, other: Any) -> tuple[Any, Any]:
@@ -179,14 +306,6 @@ def read_kept(path: Path, *keys: str) -> dict[str, Any]:
     return content
 
 
-def short_name(task: str) -> str:
-    """
-    :param task: Gymnasium id
-    :return: The id without module, namespace and version: a folder's name
-    """
-    return re.sub(r"-v\d+$", "", re.split("[:/]", task)[-1])
-
-
 def seed_of(folder: Path) -> int | None:
     """
     :param folder: In that of an arm
@@ -194,6 +313,9 @@ def seed_of(folder: Path) -> int | None:
     """
     number = folder.name.removeprefix("seed")
     return int(number) if folder.is_dir() and number.isdecimal() else None
+
+
+# --------------------------------------------------------------------- reading
 
 
 def load_grid(
@@ -219,324 +341,132 @@ def load_grid(
     """
     path = Path(path)
     content = _read_yaml(path)
-    _check_keys(content, _GRID_KEYS, {"experiment", "kind", "budget", "tasks", "methods"}, f"{path}")
-    if content["kind"] not in KINDS:
-        raise GridError(f"kind in {path} is {content['kind']!r}, but it must be one of {', '.join(KINDS)}: change it.")
-    _check_name("experiment", content["experiment"], path)
-    own_budget = _whole_number("budget", content["budget"], path, least=0)
-    budget = own_budget if budget is None else _whole_number("budget", budget, path, least=0)
-    evaluation = _mapping("evaluation", content.get("evaluation", {}), path)
-    _check_keys(evaluation, {"every", "episodes"}, set(), f"evaluation in {path}")
-    every = _whole_number("evaluation.every", evaluation.get("every", 10_000), path, least=1)
-    episodes = _whole_number("evaluation.episodes", evaluation.get("episodes", 10), path, least=1)
-    all_seeds = _seeds(content.get("seeds", 1), f"seeds in {path}")
-    chosen_seeds = all_seeds if seeds is None else _seeds(seeds, "--seeds")
+    file = _validated(path, content)
+    if budget is not None and budget != file.budget:
+        _scale(file, budget, path)
     if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
-        if seeds > len(all_seeds):
-            raise GridError(
-                f"--seeds asks for {seeds}, but seeds in {path} lists {len(all_seeds)}: ask for fewer, or say which "
-                "(0,3,4)."
-            )
-        chosen_seeds = all_seeds[:seeds]
-    all_tasks = _tasks(content["tasks"], path)
-    chosen_tasks = _choose(tasks, all_tasks, "task", path)
-    arms = _mapping("methods", content["methods"], path)
-    if not arms:
-        raise GridError(f"methods in {path} are none, but a grid compares at least one: name some.")
-    for arm in arms:
-        _check_name("a method", arm, path)
-    chosen_arms = _choose(methods, {name: name for name in arms}, "method", path)
-    baseline = content.get("baseline", next(iter(arms)))
-    if not isinstance(baseline, str) or baseline not in arms:
-        raise GridError(f"baseline in {path} is {baseline!r}, but the methods are {', '.join(arms)}: name one of them.")
-
-    resolved = {
-        (task, arm): _resolve(path, task, arm, _mapping(f"methods.{arm}", arms[arm], path))
-        for task in dict.fromkeys(all_tasks.values())
-        for arm in arms
-    }
-    for arm, method in arms.items():
-        others = [name for name in arms if name != arm]
-        if "baseline" in method and method["baseline"] not in others:
-            raise GridError(
-                f"baseline of methods.{arm} in {path} is {method['baseline']!r}, but a method is compared with another "
-                f"one ({', '.join(others) or 'there is none'}): name one, or remove it."
-            )
-    if budget != own_budget:
-        for (_, arm), settings in resolved.items():
-            if settings["pretrain"] is not None:
-                settings["pretrain"] = _scale(settings["pretrain"], own_budget, budget, path)
-                arms[arm] = {**arms[arm], "pretrain": asdict(settings["pretrain"])}
-    every_seed = sorted({*all_seeds, *chosen_seeds})
-    complete = tuple(
+        if seeds > len(file.seeds):
+            raise GridError(f"--seeds asks for {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
+        seeds = file.seeds[:seeds]
+    chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
+    file.seeds = sorted({*file.seeds, *chosen})
+    of_tasks = _choose(tasks, {**{short_name(task): task for task in file.tasks}, **{t: t for t in file.tasks}}, path)
+    of_arms = _choose(methods, {name: name for name in file.methods}, path)
+    arms = tuple(
         Cell(
-            experiment=content["experiment"],
-            kind=content["kind"],
-            task=task,
-            method=arm,
-            seed=seed,
-            eval_every=every,
-            eval_episodes=episodes,
-            budget=budget if resolved[task, arm]["train"] else 0,
-            **{key: value for key, value in resolved[task, arm].items() if key != "train"},
+            *(file.experiment, file.kind, task, arm, chosen[0], file.budget if method.train else 0),
+            *(file.evaluation.every, file.evaluation.episodes, *_settings(path, task, method)),
+            *(method.pretrain, method.algo),
         )
-        for seed in every_seed
-        for task in dict.fromkeys(all_tasks.values())
-        for arm in arms
+        for task in file.tasks
+        for arm, method in file.methods.items()
     )
-    cells = tuple(
-        cell
-        for cell in complete
-        if cell.seed in chosen_seeds and cell.task in chosen_tasks and cell.method in chosen_arms
-    )
-    description = {
-        "experiment": content["experiment"],
-        "kind": content["kind"],
-        "budget": budget,
-        "seeds": every_seed,
-        "tasks": list(dict.fromkeys(all_tasks.values())),
-        "methods": arms,
-        "baseline": baseline,
-        "evaluation": {"every": every, "episodes": episodes},
-    }
-    return Grid(content["experiment"], content["kind"], baseline, cells, complete, description)
+    _check_arms_together(arms, path)
+    of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
+    cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
+    description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump()}
+    return Grid(file.experiment, file.kind, file.baseline, cells, arms, description)
 
 
-def check_arms(cells: Iterable[Cell]) -> None:
-    """Whether environments and arguments of the arms can work, before the first of them is trained.
-
-    :param cells: Cells that are to be run; of a grid of kind ``"visitation"`` all that common heads are made of
-    :raises GridError: for the first that cannot be
-    """
-    envs: dict[tuple[str, str], gym.Env] = {}
-    first: dict[str, tuple[str, Any]] = {}
-    built: set[str] = set()
+def _validated(path: Path, content: Any) -> GridFile:
     try:
-        for task, arm, cell in {(cell.task, cell.method): (cell.task, cell.method, cell) for cell in cells}.values():
-            try:
-                key = task, str(cell.env_kwargs)
-                if key not in envs:
-                    envs[key] = _make(task, cell.env_kwargs)
-                model = CuReSAC(env=envs[key], _init_setup_model=False, **cell.build_arguments())
-                check_arguments(model)
-                if not model.is_plain_sac:
-                    check_shared_encoder_space(model.observation_space, model.policy_class)
-                    model._choose_replay_buffer()
-                check_parts(model)
-                _check_cell(cell, model)
-                networks = f"{model.observation_space} {cell.arguments}"
-                if networks not in built:
-                    _build_networks(model)
-                    built.add(networks)
-            except GLUnavailableError:  # with Ray other machines may have what this one has not
-                return
-            except GridError:
-                raise
-            except Exception as error:
-                known = isinstance(error, ValueError | TypeError | gym.error.Error)
-                reason = f"{'' if known else type(error).__name__ + ': '}{' '.join(str(error).split())}"
-                raise GridError(f"method {arm!r} on {task} cannot work: {reason}") from error
-            shape = model.observation_space.shape
-            other, others = first.setdefault(task, (arm, shape))
-            if cell.kind == "visitation" and shape != others:
-                raise GridError(
-                    f"methods {other!r} and {arm!r} see {task} in observations of shape {others} and {shape}, but "
-                    "common heads judge all methods alike: give them the same env_kwargs, or write a grid for each."
-                )
-        limits = ("_max_episode_steps", "max_episode_steps", "physics")  # those of dm_control end by themselves
-        unlimited = [task for (task, _), env in envs.items() if not any(map(env.has_wrapper_attr, limits))]
-        for task in dict.fromkeys(unlimited):
-            print(
-                f"{task} tells no time limit: if its episodes do not end by themselves, its first evaluation never "
-                "ends; then register it with max_episode_steps=1000, for example."
-            )
-    finally:
-        for env in envs.values():
-            env.close()
+        return GridFile.model_validate(content)
+    except pydantic.ValidationError as error:
+        wrong = [
+            f"{'.'.join(map(str, each['loc'])) or 'it'}: {each['msg'].removeprefix('Value error, ')}"
+            + (f" (got {each['input']!r:.60})" if each["loc"] else "")
+            for each in error.errors()
+        ]
+        raise GridError(f"{path} is no grid: {'; '.join(wrong)}.") from None
 
 
-def _build_networks(model: CuReSAC) -> None:
-    """On the CPU, as the cells may run on another machine, and without a replay buffer, which may fill the memory."""
-    model.device, model.compile = th.device("cpu"), False
-    model.replay_buffer = object()  # type: ignore[assignment]  # else SB3 would make one
-    with th.random.fork_rng(devices=[]):
-        model._setup_model()
+def _scale(file: GridFile, budget: int, path: Path) -> None:
+    """Another budget, and phases of pretraining as long in proportion to it as they are to the file's."""
+    for method in file.methods.values():
+        if method.pretrain is not None:
+            if file.budget == 0:
+                raise GridError(f"budget in {path} is 0 (pretraining alone), to which no other is in proportion.")
+            steps = max(round(method.pretrain.budget * budget / file.budget), 1)
+            method.pretrain = replace(method.pretrain, budget=steps)
+    file.budget = budget
 
 
-def _check_cell(cell: Cell, model: CuReSAC) -> None:
-    buffer = model.replay_buffer_class
-    if buffer is not None and not can_be_kept(buffer):
-        raise ValueError(
-            f"replay_buffer_class is {buffer.__name__}, which checkpoints of cells cannot hold without pickle: leave "
-            "it out, or name FrameStackReplayBuffer or one of SB3's (but HerReplayBuffer)."
-        )
-    if cell.pretrain is None and cell.budget == 0:
-        raise ValueError(
-            "it neither trains nor pretrains: add pretrain, or give a budget of at least 1 without train: false."
-        )
-    if cell.pretrain is not None and model.srl is None:
-        raise ValueError(
-            "it pretrains the representation, but srl is None: choose srl: rae, curl or a head of your own, or remove "
-            "pretrain."
-        )
-    if cell.pretrain is not None and cell.pretrain.collector == "curious":
-        check_curious_agent(model)
+def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
+    """What an arm means on a task, of the zoo file's entry with the grid's overrides: ``n_envs``, ``env_kwargs`` and
+    arguments of the algorithm."""
+    config = path.parent / method.config
+    entries, name = _read_yaml(config), task.rpartition(":")[2]
+    found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
+    if not found:
+        raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
+    entry = {"policy": "CnnPolicy", **entries[found[0]], **method.overrides}
+    entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
+    return entry.pop("n_envs", 1), entry.pop("env_kwargs", {}), entry
 
 
-def _make(task: str, env_kwargs: dict[str, Any]) -> gym.Env:
-    try:
-        return gym.make(task, **env_kwargs)
-    except (ValueError, TypeError) as error:
-        reason = " ".join(str(error).split()).removesuffix(".")
-        raise GridError(
-            f"env_kwargs of {task} are {env_kwargs}, which it does not take ({reason}): correct them."
-        ) from error
-
-
-def _resolve(path: Path, task: str, arm: str, method: dict[str, Any]) -> dict[str, Any]:
-    """What an arm means on a task: the zoo file's entry with the grid's overrides."""
-    where = f"methods.{arm} in {path}"
-    _check_keys(method, _METHOD_KEYS, {"config"}, where)
-    config_path = path.parent / str(method["config"])
-    entries = _read_yaml(config_path)
-    name = entry_for(task, entries)
-    if name is None:
-        raise GridError(f"{config_path} has neither {task!r} nor 'default', but {where} needs one: add one of them.")
-    entry = _mapping(name, entries[name], config_path)
-    entry = {**entry, **_mapping("overrides", method.get("overrides", {}), path)}
-    unknown = sorted(set(entry) - _ENTRY_KEYS - _ARGUMENTS)
-    if unknown:
-        raise GridError(
-            f"{unknown[0]!r} in {config_path} or the overrides of {where} is no argument of CuReSAC: correct or "
-            "remove it (grids know n_envs and env_kwargs besides, but no other key of rl-zoo)."
-        )
-    arguments = {key: value for key, value in entry.items() if key not in _ENTRY_KEYS}
-    for key, value in arguments.items():
-        if key.endswith("_kwargs") and not isinstance(value, dict):
+def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
+    """What would train nothing, or end in an error after everything is trained."""
+    seen: dict[str, dict[str, Any]] = {}
+    for cell in arms:
+        if cell.budget == 0 and cell.pretrain is None:
             raise GridError(
-                f"{key} in {config_path} is {value!r}, but grids evaluate no strings: write a YAML mapping."
+                f"method {cell.method!r} in {path} neither trains nor pretrains: add pretrain, or train it."
             )
-    for key in _CLASSES:
-        if "." not in str(arguments.get(key)):
-            continue
-        try:
-            pkgutil.resolve_name(arguments[key])
-        except (ImportError, AttributeError, ValueError) as error:
+        if cell.kind == "visitation" and seen.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
             raise GridError(
-                f"{key} of {where} is {arguments[key]!r}, which cannot be imported ({error}): name a class as "
-                "module.Class, in a module of the working directory or an installed one."
-            ) from None
-    pretrain = None
-    if "pretrain" in method:
-        phase = _mapping("pretrain", method["pretrain"], path)
-        _check_keys(phase, {"collector", "budget"}, {"collector", "budget"}, f"pretrain of {where}")
-        if phase["collector"] not in COLLECTORS:
-            raise GridError(
-                f"pretrain.collector of {where} is {phase['collector']!r}, but it must be 'curious' or 'random': "
-                "choose one of them."
+                f"methods in {path} differ in env_kwargs on {cell.task}, but common heads judge all alike: give them "
+                "the same, or write a grid for each."
             )
-        pretrain = Pretraining(phase["collector"], _whole_number("pretrain.budget", phase["budget"], path, least=1))
-    trains = method.get("train", True)
-    if not isinstance(trains, bool):
-        raise GridError(f"train of {where} is {trains!r}, but it must be true or false: change it.")
-    return {
-        "n_envs": _whole_number("n_envs", entry.get("n_envs", 1), config_path, least=1),
-        "env_kwargs": _mapping("env_kwargs", entry.get("env_kwargs", {}), config_path),
-        "arguments": {"policy": "CnnPolicy", **arguments},
-        "pretrain": pretrain,
-        "train": trains,
-    }
-
-
-def _scale(phase: Pretraining, own_budget: int, budget: int, path: Path) -> Pretraining:
-    """A phase as long in proportion to another budget as it is to the file's."""
-    if own_budget == 0:
-        raise GridError(
-            f"budget in {path} is 0 (pretraining alone), but {budget} was asked for, to which pretraining cannot be "
-            "scaled: change the budgets in the file instead."
-        )
-    return Pretraining(phase.collector, max(round(phase.budget * budget / own_budget), 1))
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise GridError(f"{path} cannot be read ({error.strerror}): give the path of a YAML file.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GridError(f"{path} is no YAML ({' '.join(str(error).split())}): correct it.") from None
-    return _mapping("the content", content, path)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise GridError(f"{path} cannot be read ({' '.join(str(error).split())}): give a YAML file.") from None
+    if not isinstance(content, dict):
+        raise GridError(f"{path} holds {content!r:.60}, but it must be a mapping (key: value).")
+    return content
 
 
-def _mapping(name: str, value: Any, path: Path) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise GridError(f"{name} in {path} is {value!r}, but it must be a mapping (key: value): change it.")
-    return dict(value)
-
-
-def _check_keys(mapping: dict[str, Any], known: set[str], needed: set[str], where: str) -> None:
-    for key in mapping:
-        if key not in known:
-            raise GridError(f"{key!r} in {where} is unknown, but the keys are {', '.join(sorted(known))}: correct it.")
-    for key in sorted(needed - set(mapping)):
-        raise GridError(f"{where} has no {key!r}, which it needs: add it.")
-
-
-def _check_name(key: str, value: Any, path: Path) -> None:
-    if not isinstance(value, str) or not re.fullmatch(r"[\w.-]*\w[\w.-]*", value):
-        raise GridError(
-            f"{key} in {path} is {value!r}, but it names a folder: use letters, digits, '-', '_' and '.' only."
-        )
-
-
-def _whole_number(key: str, value: Any, path: Path, least: int) -> int:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or value != int(value) or value < least:
-        raise GridError(f"{key} in {path} is {value!r}, but it must be a whole number, {least} or more: change it.")
-    return int(value)
-
-
-def _seeds(value: Any, name: str) -> list[int]:
-    numbers = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
-    valid = isinstance(numbers, Sequence) and not isinstance(numbers, str) and len(numbers) > 0
-    if not valid or not all(is_integer(number, 0) and number < 2**31 for number in numbers):
-        raise GridError(
-            f"{name} is {value!r}, but it must be how many (1 or more) or which, each from 0 to 2**31 - 1: change it."
-        )
-    return list(dict.fromkeys(numbers))
-
-
-def _tasks(value: Any, path: Path) -> dict[str, str]:
-    """By both their names."""
-    if not isinstance(value, list) or not value:
-        raise GridError(f"tasks in {path} is {value!r}, but it must be a list of Gymnasium ids: write some.")
-    for task in value:
-        module, _, name = task.rpartition(":") if isinstance(task, str) else ("", "", task)
-        if module:
-            try:
-                import_environments(module, f"task {task!r} in {path}")
-            except ValueError as error:
-                raise GridError(str(error)) from error
-        if not isinstance(name, str) or name not in gym.registry:
-            raise GridError(
-                f"task {task!r} in {path} is not registered with Gymnasium: correct it (sb3_cure registers "
-                "dmc_pixels/<domain>-<task>-v0; one of your own is my_module:My-v0, with the module that registers it)."
-            )
-    by_name: dict[str, str] = {}
-    for task in value:
-        other = by_name.setdefault(short_name(task), task)
-        if other != task:
-            raise GridError(
-                f"tasks in {path} has both {other!r} and {task!r}, whose results would share the folder "
-                f"{short_name(task)!r}: write a grid for each, with another name of the experiment."
-            )
-    return {**by_name, **{task: task for task in value}}
-
-
-def _choose(names: Sequence[str] | None, known: dict[str, str], what: str, path: Path) -> list[str]:
-    """In the file's order; known: by each of its names."""
+def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> set[str]:
     for name in names or ():
         if name not in known:
-            raise GridError(f"{what} {name!r} is not in {path}, which has {', '.join(known)}: choose among these.")
-    chosen = known.values() if names is None else {known[name] for name in names}
-    return [name for name in dict.fromkeys(known.values()) if name in set(chosen)]
+            raise GridError(f"{name!r} is not in {path}, which has {', '.join(known)}: choose among these.")
+    return {known[name] for name in (known if names is None else names)}
+
+
+def check_arms(cells: Iterable[Cell]) -> None:
+    """Build the model of each arm on each task once, before the first of them is trained.
+
+    On the CPU, as the cells may run on another machine, and with next to no replay buffer, which may fill the memory.
+
+    :param cells: Cells that are to be run
+    :raises GridError: for the first that cannot be
+    """
+    envs: dict[str, gym.Env] = {}
+    for cell in {(cell.task, cell.method): cell for cell in cells}.values():
+        key = f"{cell.task} {cell.env_kwargs}"
+        try:
+            if key not in envs:
+                envs[key] = gym.make(cell.task, **cell.env_kwargs)
+                _tell_time_limit(envs[key], cell.task)
+            with untouched_randomness(th.device("cpu")):
+                cell.make_model(envs[key], device="cpu", compile=False, buffer_size=1)
+        except GLUnavailableError:  # with Ray other machines may have what this one has not
+            break
+        except Exception as error:
+            known = isinstance(error, ValueError | TypeError)
+            reason = f"{'' if known else type(error).__name__ + ': '}{' '.join(str(error).split())}"
+            raise GridError(f"method {cell.method!r} on {cell.task} cannot work: {reason}") from error
+    for env in envs.values():
+        env.close()
+
+
+def _tell_time_limit(env: gym.Env, task: str) -> None:
+    limits = ("_max_episode_steps", "max_episode_steps", "physics")  # those of dm_control end by themselves
+    if not any(map(env.has_wrapper_attr, limits)):
+        print(
+            f"{task} tells no time limit: if its episodes do not end by themselves, its first evaluation never ends; "
+            "then register it with max_episode_steps=1000, for example."
+        )

@@ -1,5 +1,6 @@
 """Pictures and videos of a cell."""
 
+import contextlib
 from pathlib import Path
 
 import gymnasium as gym
@@ -37,7 +38,15 @@ def watch_reconstructions(cell: Cell, action_repeat: int, folder: Path) -> list[
     if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
         return []
     every = max(cell.budget // action_repeat // ROWS_OF_RECONSTRUCTIONS, 1)
-    return [ReconstructionCallback(folder, every, _random_observations(cell))]
+    return [ReconstructionCallback(folder, every, _random_observations(cell), title=name_of(cell))]
+
+
+def name_of(cell: Cell) -> str:
+    """
+    :param cell: A cell
+    :return: What its pictures are called
+    """
+    return f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
 
 
 def _random_observations(cell: Cell) -> np.ndarray:
@@ -67,63 +76,43 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param cell: The cell
     :param folder: Where to write
     """
-    name = f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
-    env = gym.make(cell.task, **cell.env_kwargs)
-    can_film = "rgb_array" in env.metadata.get("render_modes", [])
-    repeat = action_repeat_of(env)
-    if env.has_wrapper_attr("physics") and visiting_actors(model, cell) != ["random"]:
-        visits = _measured_visits(model, cell, env, folder)
-        title = f"Where policies go with sampled actions: {name}"
-        names, units = physics_state_names(env), physics_state_units(env)
-        plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
-    env.close()
-    if cell.budget > 0 and can_film:
-        env = gym.make(cell.task, **{**cell.env_kwargs, "render_mode": "rgb_array"})
-        fps = max(round(env.metadata.get("render_fps") or 30), 1)
-        for actor in trained_actors(model):
-            (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
-            title = f"{actor} policy, deterministic actions: {name}"
-            write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
-        env.close()
+    name = name_of(cell)
+    with contextlib.closing(gym.make(cell.task, **cell.env_kwargs)) as env:
+        repeat = action_repeat_of(env)
+        can_film = cell.budget > 0 and "rgb_array" in env.metadata.get("render_modes", [])
+        actors = visiting_actors(model, cell)
+        if env.has_wrapper_attr("physics") and actors != ["random"]:
+            visits = {}
+            with evenly_measured(model, env, VISIT_SEED - 1):
+                for actor in actors:
+                    episodes = roll_out(model, cell, env, actor, states=True)
+                    states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
+                    visits[actor] = np.concatenate(states), np.concatenate(errors)
+            title = f"Where policies go with sampled actions: {name}"
+            names, units = physics_state_names(env), physics_state_units(env)
+            plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
+    if can_film:
+        with contextlib.closing(gym.make(cell.task, **{**cell.env_kwargs, "render_mode": "rgb_array"})) as env:
+            fps = max(round(env.metadata.get("render_fps") or 30), 1)
+            for actor in trained_actors(model):
+                (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
+                title = f"{actor} policy, deterministic actions: {name}"
+                write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
     head = getattr(model.policy, "srl", None)
     if head is None or not is_image_space(model.observation_space) or model.replay_buffer.size() == 0:  # type: ignore[union-attr]
         return
     if not (folder / "reconstructions.png").exists():  # not drawn in training
         for callback in watch_reconstructions(cell, repeat, folder):
-            callback.init_callback(model)
-            callback.num_timesteps = model.num_timesteps
-            callback.on_period()
+            callback.draw(model)
     found = most_uncomfortable(model, FRAMES)
     with th.no_grad():
         latents = model.policy.encode(th.as_tensor(found.observations, device=model.device))
         drawn = head.reconstruct(latents)
-    plots.uncomfortable_frames(
-        folder / "uncomfortable.png",
-        found,
-        _frames_per_observation(model),
-        f"What the agent finds uncomfortable: {name}",
-        None if drawn is None else drawn.cpu().numpy(),
-    )
+    title, drawn = f"What the agent finds uncomfortable: {name}", None if drawn is None else drawn.cpu().numpy()
+    plots.uncomfortable_frames(folder / "uncomfortable.png", found, _frames_per_observation(model), title, drawn)
 
 
 def _frames_per_observation(model: CuReSAC) -> int:
     """As the environments tell, if frames then are grey or in colour; else each channel counts as a frame."""
     told, (channels, *_) = frame_stack_of(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
     return told if channels in (told, 3 * told) else channels
-
-
-def _measured_visits(
-    model: CuReSAC, cell: Cell, env: gym.Env, folder: Path
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """States and SRL errors of ``measure_visits`` by policy: in cells of kind "visitation" they lie in a file."""
-    actors = visiting_actors(model, cell)
-    if cell.kind == "visitation":
-        with np.load(folder / "visits.npz") as kept:
-            return {actor: (kept[f"{actor}_states"], kept[f"{actor}_errors"]) for actor in actors}
-    visits = {}
-    with evenly_measured(model, env, VISIT_SEED - 1):
-        for actor in actors:
-            episodes = roll_out(model, cell, env, actor, states=True)
-            states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
-            visits[actor] = np.concatenate(states), np.concatenate(errors)
-    return visits

@@ -3,42 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.metrics import image_strip, reconstruction_strip
 from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import PixelDecoder
-
-
-def reconstruct_with_probe(
-    model: CuReSAC, frame_stack: int, updates: int = 1000, batch_size: int = 64, columns: int = 8
-) -> np.ndarray | None:
-    """Observations of the replay buffer above what can be drawn from their latents.
-
-    Heads that reconstruct do it themselves. For the others (contrastive ones, say) a decoder is fitted to the latents
-    first; the encoder is not trained by it.
-
-    :param model: A trained model with images as observations
-    :param frame_stack: Frames per observation
-    :param updates: Updates of the decoder
-    :param batch_size: Observations per update
-    :param columns: How many observations to draw
-    :return: uint8 image (C, 2 * H, columns * W), see ``reconstruction_strip``
-    """
-    policy, buffer = model.policy, model.replay_buffer
-    if buffer is None:
-        raise ValueError("the model has no replay buffer to take observations from: train it, or load one.")
-    shown = buffer.sample(columns)
-    strip = reconstruction_strip(policy, shown, frame_stack, columns)
-    if strip is not None:
-        return strip
-    decoder = fit_probe(model, lambda n: buffer.sample(n).observations, updates, batch_size)
-    return image_strip(*draw_with_probe(model, decoder, shown.observations), frame_stack)
 
 
 def fit_probe(

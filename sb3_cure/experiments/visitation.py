@@ -5,6 +5,7 @@ A policy's own head is one yardstick, but heads differ from run to run: see ``he
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -47,28 +48,25 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     env = gym.make(cell.task, **cell.env_kwargs)
     even_negatives(model, env, seed=VISIT_SEED - 1)
     has_physics = env.has_wrapper_attr("physics")
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     if has_physics:
-        arrays["state_names"] = np.array(physics_state_names(env))
-        arrays["state_units"] = np.array(physics_state_units(env))
+        arrays.update(state_names=physics_state_names(env), state_units=physics_state_units(env))
     episodes = {}
     for actor in visiting_actors(model, cell):
-        episodes[actor] = roll_out(model, cell, env, actor, has_physics)
-        arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in episodes[actor]]).astype(np.float32)
+        episodes[actor] = seen = roll_out(model, cell, env, actor, has_physics)
+        arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in seen], dtype=np.float32)
         if has_physics:
-            states = np.concatenate([each.states for each in episodes[actor]])
-            arrays[f"{actor}_states"] = states.astype(np.float32)
+            arrays[f"{actor}_states"] = np.concatenate([each.states for each in seen], dtype=np.float32)
+    env.close()
     mean_image = np.mean([mean_target(model, seen) for seen in episodes.values()], axis=0)
     rows: list[Row] = []
     for actor, seen in episodes.items():
         for number, each in enumerate(seen):
-            constant = {"zero": np.zeros_like(mean_image), "mean_image": mean_image}
-            errors = {head: constant_errors(model, each.observations, image) for head, image in constant.items()}
-            own = {"own": each.srl_errors} if len(each.srl_errors) else {}  # none without a head
-            for head, values in {**own, **errors}.items():
-                rows.append(visit_row(actor, head, number, values, each))
-    env.close()
-    np.savez_compressed(folder / "visits.npz", **arrays)  # type: ignore[arg-type]
+            errors = {"own": each.srl_errors} if len(each.srl_errors) else {}  # none without a head
+            for head, image in (("zero", np.zeros_like(mean_image)), ("mean_image", mean_image)):
+                errors[head] = constant_errors(model, each.observations, image)
+            rows += [visit_row(actor, head, number, values, each) for head, values in errors.items()]
+    np.savez_compressed(folder / "visits.npz", **arrays)
     write_csv(folder / "visitation.csv", COLUMNS, rows)
 
 
@@ -130,12 +128,5 @@ def visit_row(actor: str, head: str, number: int, errors: np.ndarray, episode: E
     :param episode: The episode
     :return: A row of ``visitation.csv``
     """
-    return {
-        "actor": actor,
-        "head": head,
-        "episode": number,
-        "error_min": float(errors.min()),
-        "error_mean": float(errors.mean()),
-        "error_max": float(errors.max()),
-        "return": episode.total_reward,
-    }
+    numbers = map(float, (errors.min(), errors.mean(), errors.max(), episode.total_reward))
+    return dict(zip(COLUMNS, (actor, head, number, *numbers), strict=True))

@@ -10,7 +10,7 @@ import yaml
 
 from sb3_cure.experiments.run import main
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CLUSTER = ROOT / "zoo_configs" / "cluster"
 
 

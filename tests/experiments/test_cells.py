@@ -1,0 +1,481 @@
+"""Cells: what one training keeps, that the arms of a seed are paired, and that no interruption shows in the results."""
+
+import json
+import math
+import os
+import random
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cure import CuReSAC
+from sb3_cure.experiments import cells, media, plots, probe, run, visitation
+from sb3_cure.experiments.cells import run_cell
+from sb3_cure.experiments.files import read_rows
+from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
+
+
+@pytest.fixture(autouse=True)
+def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints do not wait for the disk."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+
+
+def only_cell(folder: Path, **changes: Any) -> Cell:
+    (cell,) = load_grid(write_grid(folder, **changes)).cells
+    return cell
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cell, Path]:
+    """A cell that was trained without pictures, and the folder of all results."""
+    out = tmp_path_factory.mktemp("finished")
+    cell = only_cell(out)
+    run_cell(cell, out, pictures=False)
+    return cell, out
+
+
+# -------------------------------------------------------------------- results
+
+
+def test_cell_keeps_its_curve(finished: tuple[Cell, Path]) -> None:
+    """Evaluated untrained, at every interval and at the end."""
+    cell, out = finished
+    rows = read_rows(out / cell.folder / "eval.csv")
+    assert [row["environment_steps"] for row in rows] == [0, 160, 320, 400]
+    assert [row["agent_steps"] for row in rows] == [0, 40, 80, 100]
+    # 2 of the burst, and one per step after the 20 of the warm-up
+    assert [row["updates"] for row in rows] == [0, 2 + 20, 2 + 60, 2 + 80]
+    assert all(row["curious_srl_error"] > 0 and row["task_srl_error"] > 0 for row in rows)
+    assert rows[0]["srl_loss"] == "" and rows[-1]["srl_loss"] < rows[1]["srl_loss"], "the autoencoder has learned"
+    episodes = read_rows(out / cell.folder / "episodes.csv")
+    for row in rows:
+        at = (row["environment_steps"], "task")
+        returns = [each["return"] for each in episodes if (each["environment_steps"], each["actor"]) == at]
+        assert len(returns) == 2 and row["return_mean"] == pytest.approx(np.mean(returns))
+    assert CuReSAC.load(out / cell.folder / "model.zip").num_timesteps == 100
+    assert not (out / cell.folder / "checkpoint").exists()
+
+
+def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
+    """Versions, commit, and every argument: as given, by default, and as the model resolved it."""
+    cell, out = finished
+    conditions = json.loads((out / cell.folder / "run.json").read_text())
+    assert conditions["attempts"] == 1 and conditions["device"] == "cpu" and conditions["precision"] == "fp32"
+    assert {"mujoco", "torch", "sb3_contrib", "sb3_cure"} <= conditions["versions"].keys() and "commit" in conditions
+    arguments = conditions["arguments"]
+    assert arguments["warmup_updates"] == 2 and arguments["gamma"] == 0.99 and arguments["target_entropy"] != "auto"
+    assert arguments["tensorboard_log"] is None, "what is switched off is told as well"
+    config = json.loads((out / cell.folder / "config.json").read_text())
+    assert config["action_repeat"] == 4 and config["arguments"]["batch_size"] == 8
+    assert config["defaults"]["curiosity_prob"] == 0.2 and config["defaults"]["gamma"] == 0.99
+
+
+def test_finished_cell_is_not_run_twice(finished: tuple[Cell, Path]) -> None:
+    cell, out = finished
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.name != ".lock"}
+    run_cell(cell, out, pictures=False)
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.name != ".lock"}
+
+
+def test_arms_without_srl_or_curiosity_are_measured(tmp_path: Path) -> None:
+    """SB3's own SAC, and a shared encoder without head, as baselines: returns and visits without SRL errors."""
+    none = {"srl": None, "curiosity": None, "warmup_updates": None}
+    shared = {**TINY["policy_kwargs"], "share_encoder": True}
+    methods = {"sac": method(**none, policy_kwargs={"net_arch": [8]}), "encoder": method(**none, policy_kwargs=shared)}
+    for cell in load_grid(write_grid(tmp_path, kind="visitation", budget=100, methods=methods)).cells:
+        folder = run_cell(cell, tmp_path)
+        last = read_rows(folder / "eval.csv")[-1]
+        assert last["return_mean"] > 0 and last["task_srl_error"] == "" == last["curious_return_mean"]
+        heads = {(row["actor"], row["head"]) for row in read_rows(folder / "visitation.csv")}
+        assert heads == {(actor, head) for actor in ("task", "random") for head in ("zero", "mean_image")}
+
+
+OWN = """
+import gymnasium as gym
+from envs_for_tests import PixelBox
+from sb3_cure.srl import RAE
+
+gym.register("tests/Camera-v0", lambda **kwargs: PixelBox(channels_last=True, **kwargs))
+
+class Head(RAE):
+    pass
+"""
+
+
+def test_own_environment_and_head_are_named_by_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images have the channels last, and frames lie on disk; the model that is kept loads with what the cell names."""
+    (tmp_path / "camera_of_a_grid.py").write_text(OWN)
+    (tmp_path / "frames").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    on_disk = {"frames_dir": str(tmp_path / "frames"), "frame_stack": 2}
+    buffer = "sb3_cure.buffers.FrameStackReplayBuffer"
+    overrides = dict(srl="camera_of_a_grid.Head", replay_buffer_class=buffer, replay_buffer_kwargs=on_disk)
+    task = "camera_of_a_grid:tests/Camera-v0"
+    cell = only_cell(tmp_path, tasks=[task], methods={"cure": method(**overrides)}, budget=160)
+    try:
+        run.check_grid(load_grid(tmp_path / "grid.yml"), tmp_path / "out")
+        folder = run_cell(cell, tmp_path / "out")
+    finally:
+        gym.registry.pop("tests/Camera-v0", None)
+    assert cell.folder == Path("tiny", "Camera", "cure", "seed0") and cell.is_done(tmp_path / "out")
+    assert (folder / "reconstructions.png").is_file()
+    loaded = CuReSAC.load(folder / "model.zip", custom_objects=cell.custom_objects())
+    assert type(loaded.policy.srl).__name__ == "Head"
+    assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "camera_of_a_grid.Head"
+
+
+def test_infinite_returns_end_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With transitions skipped it was DONE, and the report of all experiments refused it, however often it was run."""
+    step = PixelBox.step
+
+    def step_or_nan(self: PixelBox, action: np.ndarray) -> tuple[Any, ...]:
+        observation, reward, terminated, truncated, info = step(self, action)
+        return observation, math.nan if truncated else reward, terminated, truncated, info
+
+    monkeypatch.setattr(PixelBox, "step", step_or_nan)
+    with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: mend its rewards"):
+        run_cell(only_cell(tmp_path, methods={"a": method(on_bad_transition="skip")}), tmp_path, pictures=False)
+
+
+# --------------------------------------------------------------------- pairing
+
+
+def test_arms_of_a_seed_are_paired(tmp_path: Path) -> None:
+    """Same weights, same warm-up, same starts of evaluations with and without curiosity; another seed differs."""
+    methods = {"cure": method(), "none": method(curiosity=None)}
+    grid = load_grid(write_grid(tmp_path, methods=methods, seeds=2, budget=76))
+    models = {}
+    for cell in grid.cells:
+        run_cell(cell, tmp_path, pictures=False)
+        # 19 steps, all of the warm-up: no update yet
+        models[cell.method, cell.seed] = state_of(CuReSAC.load(tmp_path / cell.folder / "model.zip"))
+        assert steps_of(tmp_path / cell.folder) == [0, 76]
+    own = models["none", 0]["policy"]
+    pairs = {seed: {key: models["cure", seed]["policy"][key] for key in own} for seed in (0, 1)}
+    assert differences(own, pairs[0]) == []
+    assert differences(own, pairs[1]) != []
+    first, second = (read_rows(tmp_path / cell.folder / "episodes.csv") for cell in grid.cells[:2])
+    assert [row for row in first if row["actor"] == "task"] == second
+
+
+def test_arms_have_the_same_warm_up(tmp_path: Path) -> None:
+    """The replay buffers of paired arms are equal when learning starts."""
+    buffers = []
+    for curiosity in ("separate", "random", None):
+        model = CuReSAC("CnnPolicy", PixelBox(), seed=4, curiosity=curiosity, **{**TINY, "warmup_updates": 0})
+        model.learn(20)
+        buffers.append((model.replay_buffer.actions[:20].copy(), model.replay_buffer.rewards[:20].copy()))  # type: ignore[union-attr]
+    assert differences(buffers[0], buffers[1]) == differences(buffers[0], buffers[2]) == []
+
+
+def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **changes: Any) -> Grid:
+    """The three arms of the paper's table, in two environments each; every phase has the same budget."""
+    phases: dict[str, Any] = {"vanilla": {}}
+    for collector in ("random", "curious"):
+        phases[collector] = {"pretrain": {"collector": collector, "budget": budget}}
+    arm = method(curiosity=None, learning_starts=warm_up, n_envs=2)
+    methods = {name: {**arm, **phase} for name, phase in phases.items()}
+    evaluation = dict(every=budget, episodes=1)
+    return load_grid(write_grid(folder, tasks=[task], methods=methods, budget=budget, evaluation=evaluation, **changes))
+
+
+@pytest.fixture
+def warm_ups(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Filled by each cell: what its replay buffer holds of the first steps."""
+    found: list[Any] = []
+    finish = cells._CellRun._keep_results
+
+    def keep(run_of_cell: Any) -> None:
+        buffer = run_of_cell.model.replay_buffer
+        found.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy()))
+        finish(run_of_cell)
+
+    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+    return found
+
+
+@pytest.mark.parametrize(("task", "budget"), [(TASK, 200), (DMC_TASK, 400)])
+def test_pretrained_arms_have_the_same_warm_up(
+    task: str, budget: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warm_ups: list[Any]
+) -> None:
+    """After pretraining, environments and all random numbers begin as they do in the arm without it.
+
+    On the tiny task each environment is in its second episode, whose start is drawn, when the warm-up ends.
+    """
+    begun = []
+
+    class See(BaseCallback):
+        def _on_training_start(self) -> None:
+            begun.append((np.random.get_state(), th.get_rng_state(), random.getstate(), self.model._last_obs))
+
+        def _on_step(self) -> bool:
+            return True
+
+    learn = CuReSAC.learn
+    monkeypatch.setattr(CuReSAC, "learn", lambda self, steps, callback: learn(self, steps, callback=[See(), *callback]))
+    for cell in pretrained_grid(tmp_path, task, 46, budget, seeds=2).cells[:4]:
+        run_cell(cell, tmp_path, pictures=False)
+    assert differences(begun[0], begun[1]) == differences(begun[0], begun[2]) == []
+    assert differences(warm_ups[0], warm_ups[1]) == differences(warm_ups[0], warm_ups[2]) == []
+    assert len(differences(warm_ups[0], warm_ups[3])) == 2, "another seed has another warm-up"
+
+
+def test_common_generators_do_not_break_pairs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warm_ups: list[Any]
+) -> None:
+    """Where environments draw from Python's and NumPy's own numbers, neither evaluations, of one policy or two, nor
+    pictures change a training; evaluations start alike all along."""
+    starts: list[float] = []
+    reset, evaluated, evaluations = PixelBox.reset, cells._Record.evaluate, set()
+
+    def careless(self: PixelBox, *, seed: int | None = None, options: Any = None) -> Any:
+        reset(self, seed=seed)
+        self.position = np.array([random.uniform(-1, 1), np.random.uniform(-1, 1)])
+        starts.append(self.position.sum())
+        return self.observe(first=True), {}
+
+    def evaluate(self: Any) -> None:
+        before = len(starts)
+        evaluated(self)
+        n_actors = len(cells.trained_actors(self.model))
+        assert starts[before:] == starts[before : before + 2] * n_actors
+        evaluations.add(tuple(starts[before:][:2]))
+
+    monkeypatch.setattr(PixelBox, "reset", careless)
+    monkeypatch.setattr(cells._Record, "evaluate", evaluate)
+    methods = {name: method(curiosity=name or None, n_envs=2, learning_starts=40) for name in ("separate", "")}
+    methods["none"] = methods.pop("")
+    grid = load_grid(write_grid(tmp_path, methods=methods, budget=200, evaluation=dict(every=120, episodes=2)))
+    for out, pictures in (("with", True), ("without", False)):
+        for cell in grid.cells:
+            run_cell(cell, tmp_path / out, pictures=pictures)
+    assert differences(warm_ups[0], warm_ups[1]) == [] and len(evaluations) == 1
+    for cell in grid.cells:
+        tables = [(tmp_path / out / cell.folder / "episodes.csv").read_text() for out in ("with", "without")]
+        assert tables[0] == tables[1]
+
+
+# --------------------------------------------------------------- interruptions
+
+
+@pytest.fixture
+def power(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Counts the environments' steps in ``n_steps``, and fails at number ``fails_at``."""
+    counter, step = SimpleNamespace(n_steps=0, fails_at=0), PixelBox.step
+
+    def count(self: PixelBox, action: np.ndarray) -> Any:
+        counter.n_steps += 1
+        if counter.n_steps == counter.fails_at:
+            raise RuntimeError("the power went")
+        return step(self, action)
+
+    monkeypatch.setattr(PixelBox, "step", count)
+    return counter
+
+
+@pytest.mark.parametrize("minutes", [0, 10], ids=["each step is kept", "only starts are kept"])
+def test_killed_cell_ends_like_one_that_was_not(minutes: float, tmp_path: Path, power: SimpleNamespace) -> None:
+    """Random numbers begin anew when training does, neither before nor when it is gone on with."""
+    *_, cell = pretrained_grid(tmp_path, TASK, warm_up=20, budget=120).cells
+
+    def outcome(folder: Path) -> Any:
+        evaluations = [{**row, "seconds": 0} for row in read_rows(folder / "eval.csv")]
+        return state_of(CuReSAC.load(folder / "model.zip")), (folder / "episodes.csv").read_text(), evaluations
+
+    expected = outcome(run_cell(cell, tmp_path / "whole", minutes, pictures=False))
+    assert power.n_steps == 30 + 20 + 30 + 20
+    # In pretraining's warm-up, among its updates, at its end; in the first evaluation, in training's updates
+    for power.fails_at in (10, 26, 31, 60, 76):
+        power.n_steps, folder = 0, tmp_path / f"killed-{power.fails_at}"
+        with pytest.raises(RuntimeError, match="the power went"):
+            run_cell(cell, folder, minutes, pictures=False)
+        assert run.read_progress(cell, folder)[0] == "interrupted"
+        np.random.seed(99)  # whatever another process begins with
+        th.manual_seed(99)
+        steps, power.n_steps = power.fails_at, power.fails_at
+        assert differences(expected, outcome(run_cell(cell, folder, minutes, pictures=False))) == [], steps
+        if minutes == 0:  # of two environments one may be a step ahead
+            assert power.n_steps - steps <= 100 - steps + 2, "it began where the checkpoint was taken, not anew"
+        conditions = json.loads((folder / cell.folder / "run.json").read_text())
+        assert len(conditions["history"]) == conditions["attempts"] == 2
+        assert conditions["started"] == conditions["history"][0]["started"]
+
+
+def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped just before ``DONE``, a cell is finished from its checkpoint, with the same rows."""
+    cell = only_cell(tmp_path, budget=160)
+    with monkeypatch.context() as full:
+        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_cell(cell, tmp_path, 0, pictures=False)
+    before = read_rows(tmp_path / cell.folder / "episodes.csv")
+    folder = run_cell(cell, tmp_path, 0, pictures=False)
+    assert cell.is_done(tmp_path) and not (folder / "checkpoint").exists()
+    assert read_rows(folder / "episodes.csv") == before and steps_of(folder) == [0, 160]
+
+
+def test_damaged_checkpoint_is_put_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """The cell begins anew rather than failing for ever, and says why."""
+    cell = only_cell(tmp_path, budget=120)
+    with monkeypatch.context() as full:
+        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_cell(cell, tmp_path, 0, pictures=False)
+    for path in (tmp_path / cell.folder / "checkpoint").rglob("model.zip"):
+        path.write_bytes(path.read_bytes()[:1000])
+    folder = run_cell(cell, tmp_path, 10, pictures=False)
+    assert "begins anew, its checkpoints are kept in unusable-" in capsys.readouterr().out
+    assert list(folder.glob("unusable-*/**/model.zip"))
+    assert steps_of(folder) == [0, 120] and cell.is_done(tmp_path)
+
+
+def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second one is told so, while the first is at it."""
+    cell = only_cell(tmp_path, budget=40)
+    refusals = []
+    learn = CuReSAC.learn
+
+    def learn_while_another_tries(self: CuReSAC, *args: Any, **kwargs: Any) -> CuReSAC:
+        with pytest.raises(GridError, match="is being run by another process") as refusal:
+            run_cell(cell, tmp_path, pictures=False)
+        refusals.append(refusal)
+        assert run.read_progress(cell, tmp_path)[0] == "running"
+        return learn(self, *args, **kwargs)
+
+    monkeypatch.setattr(CuReSAC, "learn", learn_while_another_tries)
+    run_cell(cell, tmp_path, pictures=False)
+    assert len(refusals) == 1 and not cells.is_held(tmp_path / cell.folder)
+
+
+# -------------------------------------------------------------------- pictures
+
+
+def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstructed observations are those of all arms, so that their errors compare; and a cell that is drawn is
+    trained as one that is not."""
+    fit = probe.fit_probe
+    monkeypatch.setattr(probe, "fit_probe", lambda model, sample, updates: fit(model, sample, 1))  # not 500
+    observed, rows, titles = [], [], []
+
+    def keep(path: Path, shown: np.ndarray, drawn: Any, title: str) -> None:
+        observed.append(shown)
+        rows.append([steps for steps, _ in drawn])
+        titles.append(title)
+
+    monkeypatch.setattr(plots, "reconstructions_over_training", keep)
+    methods = {"cure": method(), "curl": method(srl="curl", srl_kwargs={"bank_size": 8})}
+    for cell in load_grid(write_grid(tmp_path, budget=160, methods=methods)).cells:
+        both = [run_cell(cell, tmp_path / name, pictures=name == "drawn") for name in ("drawn", "not drawn")]
+        drawn, plain = (CuReSAC.load(folder / "model.zip").get_parameters() for folder in both)
+        assert differences(drawn, plain) == []
+    assert rows[8] == [0, 5, 10, 15, 20, 25, 30, 35, 40], "with the untrained autoencoder"
+    assert rows[9] == [40], "drawn at the end where no picture was left by training"
+    assert titles[8].endswith("\nPixelBox, cure, seed 0") and titles[-1].endswith("\nPixelBox, curl, seed 0")
+    assert all(np.array_equal(shown, observed[0]) for shown in observed) and len(observed) == 10 + 9
+    assert len(np.unique(observed[0], axis=0)) == len(observed[0]) == 8
+
+
+def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films of both policies; the map is that of the measured visits, of sampled and random actions."""
+    maps: list[dict[str, Any]] = []
+    titles: list[str] = []
+    draw, write = plots.curiosity_map, media.write_video
+    monkeypatch.setattr(plots, "curiosity_map", lambda *args, **how: (maps.append(args[1]), titles.append(args[3])))
+    monkeypatch.setattr(media, "write_video", lambda *args: (titles.append(args[-1]), write(*args)))
+    cell = only_cell(tmp_path, kind="visitation", budget=80, tasks=[DMC_TASK], evaluation=dict(every=240, episodes=1))
+    folder = run_cell(cell, tmp_path)
+    assert sorted(path.name for path in folder.glob("*.mp4")) == ["curious_policy.mp4", "task_policy.mp4"]
+    named = "cartpole-swingup, cure, seed 0"
+    assert titles == [
+        f"Where policies go with sampled actions: {named}",
+        f"task policy, deterministic actions: {named}",
+        f"curious policy, deterministic actions: {named}",
+    ]
+    (drawn,), measured = maps, np.load(folder / "visits.npz")
+    assert list(drawn) == ["task", "curious", "random"]
+    for actor, (states, errors) in drawn.items():
+        np.testing.assert_allclose(states, measured[f"{actor}_states"], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(errors, measured[f"{actor}_errors"], rtol=1e-4, atol=1e-6)
+        assert len(states) == len(errors) == 125
+    draw(tmp_path / "map.png", drawn, [str(number) for number in range(4)], "", coordinates=("0", "1"))
+    assert (tmp_path / "map.png").exists()
+
+
+@pytest.mark.parametrize(("channels", "wraps", "shown"), [(3, False, 3), (4, True, 1), (4, False, 1)])
+def test_pictures_are_drawn_of_any_channels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, wraps: bool, shown: int
+) -> None:
+    """Whether or not an environment tells its frames: four channels are not a picture with transparency."""
+
+    class Channels(PixelBox):
+        def __init__(self) -> None:
+            super().__init__(frame_stack=3, tells_frame_stack=False)
+            self.observation_space = gym.spaces.Box(0, 255, (36, 36) if wraps else (channels, 36, 36), np.uint8)
+
+        def observe(self, first: bool = False) -> np.ndarray:
+            seen = super().observe(first)
+            return seen[0] if wraps else seen[:channels]
+
+    def make() -> gym.Env:
+        return gym.wrappers.FrameStackObservation(Channels(), channels) if wraps else Channels()
+
+    monkeypatch.setitem(gym.registry, TASK, gym.envs.registration.EnvSpec(TASK, make))
+    drawn: list[int] = []
+    draw = plots._picture
+    monkeypatch.setattr(plots, "_picture", lambda image: (drawn.append(image.shape[-1]), draw(image))[1])
+    folder = run_cell(only_cell(tmp_path, budget=100), tmp_path / "out")
+    assert (folder / "uncomfortable.png").is_file() and (folder / "DONE").is_file()
+    assert set(drawn) == {shown}
+
+
+def test_failing_pictures_cost_no_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("no\nfont")
+
+    monkeypatch.setattr(plots, "uncomfortable_frames", fail)
+    cell = only_cell(tmp_path, budget=80)
+    folder = run_cell(cell, tmp_path / "out")
+    assert cell.is_done(tmp_path / "out") and (folder / "run.json").is_file()
+    assert f"{folder} is without some of its pictures: RuntimeError: no font\n" in capsys.readouterr().out
+
+
+# -------------------------------------------------------------------- visits
+
+
+class _Rooms(gym.ObservationWrapper):
+    def __init__(self) -> None:
+        super().__init__(VectorBox())
+        self.observation_space = gym.spaces.Discrete(2)
+
+    def observation(self, observation: np.ndarray) -> Any:
+        return np.int64(observation[0] > 0)
+
+
+@pytest.mark.parametrize("srl", ["rae", None])
+def test_constant_predictions_err_alike_with_any_head(srl: str | None) -> None:
+    """Zero and the mean of vectors, which are not quantised, and of discrete observations, as one-hot vectors."""
+    seen = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    model = tiny_model("MlpPolicy", VectorBox(), srl=srl, curiosity=None)
+    mean = visitation.mean_target(model, [SimpleNamespace(observations=seen)])  # type: ignore[list-item]
+    assert mean == pytest.approx(seen.mean(axis=0), abs=1e-6)
+    for constant in (mean, np.zeros(2)):
+        expected = np.square(seen - constant).mean(axis=1)
+        assert visitation.constant_errors(model, seen, constant) == pytest.approx(expected, abs=1e-6)
+    model = tiny_model("MlpPolicy", _Rooms(), srl=srl, curiosity=None)
+    rooms = np.array([0, 0, 1, 0])
+    mean = visitation.mean_target(model, [SimpleNamespace(observations=rooms)])  # type: ignore[list-item]
+    assert mean == pytest.approx([0.75, 0.25])
+    assert visitation.constant_errors(model, rooms, mean) == pytest.approx([0.0625, 0.0625, 0.5625, 0.0625])

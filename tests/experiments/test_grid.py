@@ -1,0 +1,281 @@
+"""Grid files: what they hold, and that what cannot be run is refused before the first cell."""
+
+import random
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from envs_for_tests import PixelBox
+from grids_for_tests import DMC_TASK, TASK, TINY, method, write_grid
+
+from sb3_cure.experiments import run
+from sb3_cure.experiments.grid import Cell, GridError, check_arms, load_grid, short_name
+
+GRIDS = Path(__file__).parents[2] / "zoo_configs" / "experiments"
+
+
+def test_grid_is_every_task_method_and_seed(tmp_path: Path) -> None:
+    """Seeds are outermost: an interrupted grid holds whole comparisons. Overrides beat the zoo's entry."""
+    methods = {"a": {"config": "zoo.yml"}, "b": method(curiosity_prob=0.7, train_freq=[1, "episode"])}
+    path = write_grid(tmp_path, methods=methods, seeds=[3, 5], baseline="b")
+    grid = load_grid(path)
+    assert [(cell.seed, cell.method) for cell in grid.cells] == [(3, "a"), (3, "b"), (5, "a"), (5, "b")]
+    assert [cell.arguments.get("curiosity_prob") for cell in grid.cells[:2]] == [None, 0.7]
+    assert grid.cells[1].build_arguments()["train_freq"] == (1, "episode"), "YAML knows no pairs"
+    assert grid.cells[0].folder == Path("tiny", "PixelBox", "a", "seed3")
+    assert all(cell.arguments["batch_size"] == 8 and "env_kwargs" not in cell.arguments for cell in grid.cells)
+    few = load_grid(path, seeds=[5], methods=["b"], tasks=["PixelBox"], budget=40)
+    assert [(cell.seed, cell.method, cell.budget) for cell in few.cells] == [(5, "b", 40)]
+    assert few.description["methods"].keys() == {"a", "b"}, "what was not chosen is still part of the experiment"
+    assert few.description["seeds"] == [3, 5] and few.baseline == few.description["baseline"] == "b"
+
+
+def test_number_of_seeds_counts_those_listed(tmp_path: Path) -> None:
+    listed = write_grid(tmp_path, seeds=[5, 3, 4])
+    assert [cell.seed for cell in load_grid(listed, seeds=2).cells] == [3, 5]
+    assert [cell.seed for cell in load_grid(listed, seeds=[0]).cells] == [0]
+    with pytest.raises(GridError, match=r"--seeds asks for 4, but .* lists 3: say which"):
+        load_grid(listed, seeds=4)
+    assert [cell.seed for cell in load_grid(write_grid(tmp_path, seeds=2), seeds=3).cells] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("own", "asked", "expected"),
+    [(400, 400, (400, 100)), (400, 40, (40, 10)), (400, 1, (1, 1)), (300, 1000, (1000, 333))],
+)
+def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int, expected: tuple[int, int]) -> None:
+    """In proportion, at least a step, in cells and in the description; a method that does not pretrain has no phase."""
+    pretrain = {"collector": "random", "budget": 100}
+    methods = {
+        "none": {"config": "zoo.yml"},
+        "both": {"config": "zoo.yml", "pretrain": pretrain},
+        "alone": {"config": "zoo.yml", "pretrain": pretrain, "train": False},
+    }
+    path = write_grid(tmp_path, budget=own, methods=methods)
+    grid = load_grid(path, budget=asked)
+    assert [(cell.budget, cell.pretraining_steps) for cell in grid.cells] == [(asked, 0), expected, (0, expected[1])]
+    described = grid.description["methods"]
+    assert "pretrain" not in described["none"] and grid.description["budget"] == asked
+    assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}
+    assert load_grid(path).description["methods"] == methods
+
+
+def test_nothing_is_proportional_to_no_training(tmp_path: Path) -> None:
+    """A file's budget of 0 is pretraining alone; another one can be asked for if there is no pretraining."""
+    pretrained = {"config": "zoo.yml", "pretrain": {"collector": "random", "budget": 100}}
+    path = write_grid(tmp_path, budget=0, methods={"p": pretrained})
+    assert [(cell.budget, cell.pretraining_steps) for cell in load_grid(path).cells] == [(0, 100)]
+    with pytest.raises(GridError, match=r"is 0 \(pretraining alone\), to which no other"):
+        load_grid(path, budget=80)
+
+
+def test_method_may_have_its_own_baseline(tmp_path: Path) -> None:
+    """Reports find it in ``grid.json``; the cells, which it does not change, are those without it."""
+    methods: dict[str, Any] = {name: {"config": "zoo.yml"} for name in "abc"}
+    cells_without = load_grid(write_grid(tmp_path, methods=methods)).cells
+    methods["c"]["baseline"] = "b"
+    grid = load_grid(write_grid(tmp_path, methods=methods))
+    assert grid.baseline == "a" and grid.description["methods"] == methods
+    assert grid.cells == cells_without
+
+
+def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:
+    """A task's own, with or without its module, then its namespace's, then the default."""
+    path = write_grid(tmp_path, tasks=[DMC_TASK, "dmc_pixels/reacher-easy-v0", TASK])
+    entries = {DMC_TASK: {"gamma": 0.1}, "dmc_pixels": {"gamma": 0.2}, "default": {"gamma": 0.3}}
+    (tmp_path / "zoo.yml").write_text(yaml.safe_dump(entries))
+    assert [cell.arguments["gamma"] for cell in load_grid(path).cells] == [0.1, 0.2, 0.3]
+
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "an unknown kind": (dict(kind="curve"), "kind: Input should be 'curves', 'visitation' or 'pretraining'"),
+    "a budget in words": (dict(budget="many"), r"budget: .*integer.* \(got 'many'\)"),
+    "no end": (dict(budget=float("inf")), "budget: .*finite"),
+    "no budget": (dict(budget=None), "budget: Field required"),
+    "an unknown key": (dict(budgets=3), "budgets: Extra inputs are not permitted"),
+    "no seeds": (dict(seeds=0), "seeds: .*at least 1 item"),
+    "a negative seed": (dict(seeds=[1, -2]), "seeds.1: .*greater than or equal to 0"),
+    "a seed too large": (dict(seeds=[2**31]), "seeds.0: .*less than 2147483648"),
+    "an unknown task": (dict(tasks=["dmc_pixels/cartpole-swing-v0"]), "tasks.0: .*`cartpole-swing` doesn't exist"),
+    "no module": (dict(tasks=["no_camera:tests/Camera-v0"]), "tasks.0: No module named 'no_camera'"),
+    "no list of tasks": (dict(tasks="all"), "tasks: .*valid list"),
+    "tasks of one folder": (dict(tasks=["CartPole-v0", "CartPole-v1"]), "two tasks would share a folder"),
+    "no folder": (dict(experiment="../elsewhere"), "experiment: String should match pattern"),
+    "no methods": (dict(methods={}), "methods: .*at least 1 item"),
+    "a method that is no folder": (dict(methods={"a/b": {"config": "zoo.yml"}}), "methods.a/b.*should match pattern"),
+    "no zoo file": (dict(methods={"a": {"config": "no.yml"}}), "no.yml cannot be read"),
+    "no config": (dict(methods={"a": {}}), "methods.a.config: Field required"),
+    "a method's key": (dict(methods={"a": {"config": "zoo.yml", "override": {}}}), "methods.a.override: Extra inputs"),
+    "a list of overrides": (dict(methods={"a": {"config": "zoo.yml", "overrides": [1]}}), "a.overrides: .*dictionary"),
+    "an unknown algorithm": (dict(methods={"a": {"config": "zoo.yml", "algo": "ppo"}}), "a.algo: it must be one of"),
+    "a collector": (
+        dict(methods={"a": {"config": "zoo.yml", "pretrain": {"collector": "task", "budget": 8}}}),
+        "a.pretrain.collector: Input should be 'curious' or 'random'",
+    ),
+    "neither of both": (dict(methods={"a": {"config": "zoo.yml", "train": False}}), "'a' .* neither trains nor"),
+    "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
+    "itself as baseline": (
+        dict(methods={"a": {"config": "zoo.yml", "baseline": "a"}, "b": {"config": "zoo.yml"}}),
+        "baseline must be another method",
+    ),
+    "no evaluations": (dict(evaluation={"every": 0}), "evaluation.every: .*greater than 0"),
+    "pictures that heads cannot judge alike": (
+        dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),
+        "differ in env_kwargs .*, but common heads judge all alike",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_grid_is_one_sentence(tmp_path: Path, name: str) -> None:
+    changes, sentence = WRONG[name]
+    with pytest.raises(GridError, match=sentence) as refusal:
+        load_grid(write_grid(tmp_path, **changes))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"curiosity_prob": 1.4},
+        {"prob": 1},
+        {"policy_kwargs": "dict(net_arch=[1])"},
+        {"srl": "my_heads.Nowhere"},
+        {"env_kwargs": {"imagesize": 36}},
+        {"policy_kwargs": {"features_extractor_kwargs": {"n_layers": 12}}},
+    ],
+    ids=lambda overrides: next(iter(overrides)),
+)
+def test_settings_that_cannot_work_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture, overrides: dict[str, Any]
+) -> None:
+    """By a dry run as by a run, before anything is written."""
+    path = write_grid(tmp_path, methods={"right": {"config": "zoo.yml"}, "wrong": method(**overrides)})
+    for more in ([], ["--dry-run"]):
+        assert run.main([str(path), "--out", str(tmp_path / "out"), *more]) == 2
+        assert f"method 'wrong' on {TASK} cannot work: " in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_environment_that_raises_is_told_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_display(self: PixelBox, **_: Any) -> None:
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(PixelBox, "__init__", no_display)
+    with pytest.raises(GridError, match=f"'cure' on {TASK} cannot work: RuntimeError: no display"):
+        check_arms(load_grid(write_grid(tmp_path)).cells)
+
+
+def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The options of ``sb3-cure experiment``, before anything is written."""
+    path = str(write_grid(tmp_path))
+    for wrong, sentence in {
+        "--tasks finger": "'finger' is not in",
+        "--methods none": "'none' is not in",
+        "--budget 10m": "'10m' is no number of steps",
+        "--seeds x": "argument --seeds: invalid",
+        "--seeds ,": "seeds: List should have at least 1 item",
+        "--tasks ,": "'' is not in",
+        "--seeds 0": "seeds: List should have at least 1 item",
+        "--retries 1": "--retries is of Ray: add --engine ray",
+        "--address auto": "--address is of Ray: add --engine ray",
+        "--out grid.yml/results": "cannot be written to (Not a directory): give another --out",
+    }.items():
+        try:
+            status = run.main([path, "--out", str(tmp_path / "out"), *wrong.replace("grid.yml", path).split()])
+        except SystemExit as stop:  # argparse's
+            status = stop.code  # type: ignore[assignment]
+        assert status == 2
+        assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_unlimited_episodes_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Else the first evaluation would hang without a word; environments of dm_control and of Gymnasium tell theirs."""
+    gym.register("grids/LimitedBox-v0", PixelBox, max_episode_steps=7)
+    try:
+        check_arms(load_grid(write_grid(tmp_path, tasks=[DMC_TASK, "grids/LimitedBox-v0", TASK])).cells)
+    finally:
+        del gym.registry["grids/LimitedBox-v0"]
+    (told,) = capsys.readouterr().out.splitlines()
+    assert told.startswith(f"{TASK} tells no time limit: if its episodes do not end by themselves")
+
+
+def test_checking_arms_leaves_randomness_and_memory_alone(tmp_path: Path) -> None:
+    """Their networks are built, without the replay buffer."""
+    grid = load_grid(write_grid(tmp_path, methods={"a": method(buffer_size=10**12)}))
+    before = th.get_rng_state(), np.random.get_state()[1].tolist(), random.getstate()  # type: ignore[index, union-attr]
+    check_arms(grid.cells)
+    assert th.equal(th.get_rng_state(), before[0])
+    assert (np.random.get_state()[1].tolist(), random.getstate()) == before[1:]  # type: ignore[index, union-attr]
+
+
+def project_cells() -> list[Cell]:
+    """A cell of each arm of the project's grids, those of other tasks and budgets left out."""
+    arms: dict[str, Cell] = {}
+    for path in sorted(GRIDS.rglob("*.yml")):
+        grid = load_grid(path, seeds=1)
+        assert grid.experiment == ("fast_" if path.parent.name == "fast" else "") + path.stem
+        for cell in grid.cells:
+            collector = cell.pretrain and cell.pretrain.collector
+            size = cell.env_kwargs.get("image_size", 84)
+            arms.setdefault(f"{cell.arguments} {size} {collector} {cell.budget > 0}", cell)
+    return list(arms.values())
+
+
+def test_project_grids_can_be_built() -> None:
+    """Every arm's arguments are accepted in spaces like the task's, with the agents that they ask for."""
+    kwargs = {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2}}
+    arms = project_cells()
+    assert len(arms) > 20
+    for cell in arms:
+        env = PixelBox(3, size=cell.env_kwargs.get("image_size", 84))
+        model = cell.make_model(env, policy_kwargs=kwargs, buffer_size=1, device="cpu")
+        assert model.policy.srl is not None
+        assert hasattr(model.policy, "encoder") and model.seed == cell.seed
+
+
+def test_project_pretraining_trains_in_miniature() -> None:
+    """Each collector pretrains for 40 steps in the project's own settings, then the task is learned."""
+    few = {"buffer_size": 50, "learning_starts": 30, "warmup_updates": 2, "batch_size": 4}
+    few["policy_kwargs"] = {"net_arch": [8], "features_extractor_kwargs": {"n_filters": 2}}
+    for collector in ("random", "curious"):
+        cell = next(cell for cell in project_cells() if cell.pretrain and cell.pretrain.collector == collector)
+        model = cell.make_model(PixelBox(3, size=48), device="cpu", **few)
+        model.pretrain(40, collector)
+        model.learn(40)
+        assert model.num_timesteps == 40
+        assert float(model.logger.name_to_value["train/srl_loss"]) > 0
+
+
+def test_changed_default_is_another_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Of a newer version: its seeds are not mixed with those of before; further arguments are no difference."""
+    out = tmp_path / "out"
+    arguments = [str(write_grid(tmp_path)), "--out", str(out), "--dry-run"]
+    (cell,) = load_grid(tmp_path / "grid.yml").cells
+    config = cell.config()
+    assert config["defaults"]["update"] == "joint" and config["defaults"]["target_entropy"] == "auto"
+    assert not config["defaults"].keys() & {*TINY, "seed", "env", "support_multi_env"}
+    (out / cell.folder).mkdir(parents=True)
+    kept = out / cell.folder / "config.json"
+    for defaults, status in (
+        ({"update": "joint", "gone": 1}, 0),
+        ({"update": "sequential"}, 2),
+        (None, 0),  # of before they were kept
+    ):
+        run.write_json(kept, {**config, "defaults": defaults})
+        assert run.main(arguments) == status
+    told = capsys.readouterr().err
+    assert "defaults is {'update': 'sequential'} there and {'update': 'joint'} now." in told
+
+
+def test_short_names_are_folder_names() -> None:
+    """Without module, namespace and version."""
+    assert short_name("dmc_pixels/ball_in_cup-catch-v0") == "ball_in_cup-catch"
+    assert short_name("my_module:HalfCheetah-v5") == "HalfCheetah"

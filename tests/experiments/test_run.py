@@ -1,0 +1,388 @@
+"""Runs of grids: what fails stops nothing else, what differs is not mixed, and progress is told wherever it is."""
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from grids_for_tests import method, steps_of, write_grid
+
+import sb3_cure
+from sb3_cure import CuReSAC
+from sb3_cure.experiments import cells, heads, run
+from sb3_cure.experiments import files as experiment_files
+from sb3_cure.experiments.files import read_rows
+from sb3_cure.experiments.grid import GridError, load_grid
+
+QUICK: dict[str, Any] = dict(budget=40, evaluation=dict(every=40, episodes=1))
+
+
+@pytest.fixture(autouse=True)
+def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints do not wait for the disk."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+
+
+# -------------------------------------------------------------------- failures
+
+
+def test_failing_cell_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Its sentence is printed and its traceback kept; the exit status tells; run again it is finished."""
+    path, out = write_grid(tmp_path, seeds=2, **QUICK), tmp_path / "out"
+    command = [str(path), "--out", str(out), "--no-pictures"]
+    learn = CuReSAC.learn
+
+    def learn_or_fail(self: CuReSAC, *args: Any, **kwargs: Any) -> CuReSAC:
+        if self.seed == 0:
+            raise RuntimeError("no luck")
+        return learn(self, *args, **kwargs)
+
+    with monkeypatch.context() as unlucky:
+        unlucky.setattr(CuReSAC, "learn", learn_or_fail)
+        assert run.main(command) == 1
+    told = capsys.readouterr().out
+    assert "seed0 failed: RuntimeError: no luck" in told and "1 of 2 cells done" in told
+    folder = out / "tiny" / "PixelBox" / "cure"
+    assert "learn_or_fail" in (folder / "seed0" / "error.txt").read_text()
+    assert (folder / "seed1" / "DONE").exists() and not (folder / "seed0" / "DONE").exists()
+    assert run.main(command) == 0
+    assert (folder / "seed0" / "DONE").exists() and not (folder / "seed0" / "error.txt").exists()
+    capsys.readouterr()
+    assert run.main(command) == 0
+    told = capsys.readouterr().out
+    assert re.fullmatch(r"2 of 2 cells done, best return [\d.]+ \(tiny/PixelBox/cure/seed\d\)\n", told)
+    assert run.main([*command, "--dry-run", "--tasks", "PixelBox, "]) == 0
+    assert capsys.readouterr().out.count(": done") == 2
+
+
+def test_unwritable_cell_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Not even its error can be kept: it is printed. What only tells how far a cell is may be missing."""
+    path, out = write_grid(tmp_path, seeds=2, **QUICK), tmp_path / "out"
+    folder = out / "tiny" / "PixelBox" / "cure"
+    folder.mkdir(parents=True)
+    (folder / "seed0").write_text("in its place")
+    write = cells.write_json
+
+    def disk_is_full(path: Path, content: Any) -> None:
+        if path.name == "progress.json":
+            raise OSError("No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(cells, "write_json", disk_is_full)
+    assert run.main([str(path), "--out", str(out), "--no-pictures"]) == 1
+    told = capsys.readouterr().out
+    assert "error.txt cannot be written (" in told and "it would tell: FileExistsError" in told
+    assert "seed0 failed: there is no file any more that tells why" in told
+    assert (folder / "seed1" / "DONE").exists()
+
+
+# -------------------------------------------------------------- other settings
+
+
+def test_other_settings_in_the_folder_are_refused(tmp_path: Path) -> None:
+    """Of whatever seed and arm, as they are compared; what was there stays as it was. Further seeds and arms go in."""
+    path, out = write_grid(tmp_path, **QUICK), tmp_path / "out"
+    assert run.run_grid(load_grid(path, seeds=[7]), out, pictures=False) == []
+    files = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    changed = {"cure": method(batch_size=9)}
+    for changes, sentence in (
+        (dict(budget=80), "tiny was run with other settings: budget is 40 there and 80 now"),
+        (dict(evaluation=dict(every=20, episodes=1)), "evaluation is {'every': 40} there and {'every': 20} now"),
+        (dict(kind="visitation", methods={"other": method()}), "kind is 'curves' there and 'visitation' now"),
+        (dict(methods=changed), r"seed7 was run with other settings: arguments is {'batch_size': 8} there and"),
+    ):
+        with pytest.raises(GridError, match=sentence):
+            run.run_grid(load_grid(write_grid(tmp_path, **{**QUICK, **changes}), seeds=[8]), out, pictures=False)
+    assert {file: file.read_bytes() for file in out.rglob("*") if file.is_file()} == files
+    more = write_grid(tmp_path, **QUICK, methods={"further": method(curiosity=None)})
+    assert run.run_grid(load_grid(more, seeds=[8]), out, pictures=False) == []
+    described = json.loads((out / "tiny" / "grid.json").read_text())
+    assert described["seeds"] == [0, 7, 8] and described["methods"].keys() == {"cure", "further"}
+
+
+def test_damaged_files_of_results_are_named(tmp_path: Path) -> None:
+    """In one sentence, with what to do; how far a cell was, is not worth one."""
+    grid, out = load_grid(write_grid(tmp_path, **QUICK)), tmp_path / "out"
+    assert run.run_grid(grid, out, pictures=False) == []
+    cell = out / grid.cells[0].folder
+    for path in (cell / "config.json", out / "tiny" / "grid.json"):
+        whole = path.read_text()
+        for damaged in ("", "[]", "{"):
+            path.write_text(damaged)
+            with pytest.raises(GridError, match=f"{path} is damaged: put it back, or remove .*, which is then made"):
+                run.run_grid(grid, out, pictures=False)
+        path.write_text(whole)
+    (cell / "DONE").unlink()
+    for damaged in ("", "{}", "[1]", '{"seconds": 1}'):
+        (cell / "progress.json").write_text(damaged)
+        assert run.read_progress(grid.cells[0], out) == ("waiting", {})
+
+
+# -------------------------------------------------------------------- progress
+
+
+def test_logs_tell_how_far_everything_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Without a terminal a line now and then, although no cell is finished; not between these moments."""
+    done, running, waiting = load_grid(write_grid(tmp_path, seeds=3)).cells
+    for cell in (done, running):
+        (tmp_path / cell.folder).mkdir(parents=True)
+    (tmp_path / done.folder / "DONE").touch()
+    cells.write_progress(tmp_path / done.folder, done=400, seconds=80, best_return=4.2)
+    cells.write_progress(tmp_path / running.folder, done=100, seconds=10, best_return=7.4)
+    line = "1 of 3 cells done, 1 running, 10.0 environment steps/s, about 1 min left, best return 7.4 "
+    line += f"({running.folder})\n"  # 300 and 400 steps are left: 70 s
+    looks = threading.Semaphore(0)
+
+    def list_units() -> list[heads.Unit]:
+        looks.release()
+        return [done, running, waiting]
+
+    with cells.alone_in(tmp_path / running.folder):
+        for seconds, lines in ((300.0, 0), (0.0, 2)):
+            monkeypatch.setattr(run, "SUMMARY_SECONDS", seconds)
+            with run._live_progress(list_units, tmp_path):
+                for _ in range(4):
+                    assert looks.acquire(timeout=60)
+                told = capsys.readouterr().out
+                assert told.count(line) >= lines and (lines or not told), "five minutes are not over"
+            assert capsys.readouterr().out.endswith(line), "at the end in any case"
+            looks = threading.Semaphore(0)
+
+
+def test_only_of_other_machines_the_clock_counts(tmp_path: Path) -> None:
+    """Their locks may be unknown here; of this machine a lock that nobody holds says that nothing runs."""
+    (cell,) = load_grid(write_grid(tmp_path)).cells
+    folder = tmp_path / cell.folder
+    folder.mkdir(parents=True)
+    assert run.read_progress(cell, tmp_path)[0] == "waiting"
+    cells.write_progress(folder, done=8, seconds=2)
+    here = json.loads((folder / "progress.json").read_text())
+    states = []
+    for change in ({}, {"machine": "another"}, {"machine": "another", "time": here["time"] - 3600}):
+        (folder / "progress.json").write_text(json.dumps({**here, **change}))
+        states.append(run.read_progress(cell, tmp_path)[0])
+    assert states == ["interrupted", "running", "interrupted"]
+
+
+@contextmanager
+def unread_stdout() -> Iterator[None]:
+    """Standard output is a pipe that nobody reads any more; what is left in it must not raise when Python ends."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as pipe, redirect_stdout(pipe):
+        yield
+        print("more", flush=True)
+
+
+def test_list_of_cells_may_be_cut_off(tmp_path: Path) -> None:
+    """``sb3-cure experiment --dry-run | head -1`` ends without a traceback, as a program that a pipe ends."""
+    path = write_grid(tmp_path)
+    with unread_stdout():
+        assert run.main([str(path), "--out", str(tmp_path / "out"), "--dry-run"]) == 128 + 13
+
+
+def test_cells_are_finished_though_nobody_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``sb3-cure experiment | tee log``, whose ``tee`` has died: neither cells nor what is shown later know of it."""
+    monkeypatch.setattr(run, "SUMMARY_SECONDS", 0.0)
+    tell, run_cell, told = run.tell, run.run_cell, threading.Event()
+
+    def lines(*arguments: Any) -> Any:
+        told.set()
+        return tell(*arguments)
+
+    def run_later(*arguments: Any) -> None:
+        """Each cell sees another line being told."""
+        told.clear()
+        assert told.wait(60)
+        run_cell(*arguments)
+
+    monkeypatch.setattr(run, "tell", lines)
+    monkeypatch.setattr(run, "run_cell", run_later)
+    grid = load_grid(write_grid(tmp_path, seeds=2, **QUICK))
+    with unread_stdout():
+        assert run.run_grid(grid, tmp_path / "out", pictures=False) == []
+    assert all(cell.is_done(tmp_path / "out") for cell in grid.cells)
+
+
+def test_results_name_their_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkout's, marked when changed; what pip was given; what an image says; nothing where nothing tells."""
+    package = tmp_path / "checkout" / "sb3_cure" / "__init__.py"
+    package.parent.mkdir(parents=True)
+    package.touch()
+    monkeypatch.setattr(sb3_cure, "__file__", str(package))
+    monkeypatch.delenv("SB3_CURE_COMMIT", raising=False)
+    origin = dict[str, Any]()
+    installed = SimpleNamespace(read_text=lambda name: json.dumps(origin) if name == "direct_url.json" else None)
+    monkeypatch.setattr(experiment_files, "distribution", lambda name: installed)
+    assert experiment_files.code_commit() is None
+    origin.update(url="https://example.com/repo", vcs_info={"vcs": "git", "commit_id": "0123456789abcdef"})
+    assert experiment_files.code_commit() == "0123456789ab"
+    git = ["git", "-C", str(package.parent.parent), "-c", "user.name=a", "-c", "user.email=a@example.com"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "all"]):
+        subprocess.run([*git, *command], check=True)
+    commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout[:12]
+    assert experiment_files.code_commit() == commit
+    assert experiment_files.checkout_commit(package.parent) is None, "of a folder inside another's checkout"
+    package.write_text("changed")
+    assert experiment_files.code_commit() == f"{commit}-dirty"
+    monkeypatch.setenv("SB3_CURE_COMMIT", "v1.2-3-gabc")
+    assert experiment_files.code_commit() == "v1.2-3-gabc"
+
+
+# ------------------------------------------------------------------- processes
+
+#: Steps take a while, so that there is something to be killed; with CARDS the first ones wait until two processes
+#: have begun, and tell what cards they see.
+SLOW_BOX = """
+import os, time
+from pathlib import Path
+
+import gymnasium as gym
+from envs_for_tests import PixelBox
+
+
+class SlowBox(PixelBox):
+    def step(self, action):
+        time.sleep(0.005)
+        if folder := os.environ.get("CARDS"):
+            (Path(folder) / str(os.getpid())).write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+            deadline = time.monotonic() + 120
+            while len(list(Path(folder).iterdir())) < 2:
+                assert time.monotonic() < deadline, "no other process has begun"
+                time.sleep(0.05)
+        return super().step(action)
+
+
+gym.register("tests/SlowBox-v0", SlowBox)
+"""
+#: The command, with common heads that are soon fitted
+COMMAND = "from sb3_cure.experiments import heads, run; heads.COMMON_UPDATES = 5; raise SystemExit(run.main())"
+
+
+@pytest.fixture
+def slow_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Function that writes a grid on a task whose steps take a while, in the working directory."""
+    (tmp_path / "slow_box.py").write_text(SLOW_BOX)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(["", *sys.path]))
+    return lambda **changes: write_grid(tmp_path, tasks=["slow_box:tests/SlowBox-v0"], **changes)
+
+
+def launch(path: Path, out: Path, *options: str) -> subprocess.Popen:
+    command = [sys.executable, "-c", COMMAND, str(path), "--out", str(out), "--no-pictures", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+
+def wait_for(what: Any, seconds: float = 400) -> Any:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if found := what():
+            return found
+        time.sleep(0.05)
+    raise TimeoutError(f"{what} did not come about in {seconds} s")
+
+
+def has_evaluated(folder: Path) -> bool:
+    """More than once, so that it is in the midst of training."""
+    path = folder / "eval.csv"
+    return path.exists() and len(read_rows(path)) > 1
+
+
+def outcome(folder: Path) -> Any:
+    return [{**row, "seconds": 0} for row in read_rows(folder / "eval.csv")], (folder / "episodes.csv").read_text()
+
+
+def test_killed_grid_ends_like_one_that_was_not(tmp_path: Path, slow_grid: Any) -> None:
+    """kill -9 in the middle of a cell: the same command finishes it with the same rows as without the kill."""
+    path = slow_grid(evaluation=dict(every=100, episodes=1))
+    (cell,) = load_grid(path).cells
+    process = launch(path, tmp_path / "out", "--checkpoint-minutes", "0")
+    wait_for(lambda: has_evaluated(tmp_path / "out" / cell.folder))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not cell.is_done(tmp_path / "out")
+    for out in ("out", "whole"):
+        assert run.run_grid(load_grid(path), tmp_path / out, pictures=False) == []
+    killed, whole = (outcome(tmp_path / out / cell.folder) for out in ("out", "whole"))
+    assert killed == whole and steps_of(tmp_path / "out" / cell.folder) == [0, 100, 200, 300, 400]
+    assert json.loads((tmp_path / "out" / cell.folder / "run.json").read_text())["attempts"] == 2
+
+
+def test_killed_ray_worker_costs_nothing(tmp_path: Path, slow_grid: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two cells of half a card each run at the same time, on that card; one is killed half-way and begun again. All
+    rows, also those of the common heads that follow, are those of one process without a kill."""
+    pytest.importorskip("ray")
+    (tmp_path / "seen").mkdir()
+    path = slow_grid(kind="visitation", seeds=2, evaluation=dict(every=100, episodes=1))
+    grid, out = load_grid(path), tmp_path / "out"
+    with monkeypatch.context() as card:
+        card.setenv("CARDS", str(tmp_path / "seen"))
+        card.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1, "CPU": 4}')  # Ray takes any machine's word for its cards
+        ray = ["--engine", "ray", "--gpus-per-cell", "0.5", "--checkpoint-minutes", "0"]
+        process = launch(path, out, *ray)
+        try:
+            victim = wait_for(lambda: next((cell for cell in grid.cells if has_evaluated(out / cell.folder)), None))
+            holders = [int(each.name) for each in (tmp_path / "seen").iterdir()]
+            locked = (out / victim.folder / ".lock").resolve()
+            (holder,) = [pid for pid in holders if locked in open_files(pid)]
+            os.kill(holder, signal.SIGKILL)
+            assert process.wait(timeout=600) == 0
+        finally:
+            process.kill()
+    assert {card.read_text() for card in (tmp_path / "seen").iterdir()} == {"0"}
+    assert json.loads((out / victim.folder / "run.json").read_text())["attempts"] == 2
+    monkeypatch.setattr(heads, "COMMON_UPDATES", 5)
+    assert run.run_grid(grid, tmp_path / "here", pictures=False) == []
+    for cell in grid.cells:
+        assert outcome(out / cell.folder) == outcome(tmp_path / "here" / cell.folder)
+        there, here = (read_rows(folder / cell.folder / "visitation.csv") for folder in (out, tmp_path / "here"))
+        assert there == here and any(row["head"] == "common" for row in here)
+
+
+def open_files(pid: int) -> set[Path]:
+    return {link.resolve() for link in Path(f"/proc/{pid}/fd").iterdir()}
+
+
+def test_cluster_that_does_not_fit_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refused before anything is written: too few cores, and cards that nobody asks for."""
+    pytest.importorskip("ray")
+    grid, out = load_grid(write_grid(tmp_path)), tmp_path / "out"
+    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 2, "CPU": 2}')
+    for wanted, sentence in (
+        (dict(cpus_per_cell=999), "--cpus-per-cell is 999, but no machine of this Ray cluster has more than 2"),
+        (dict(), "--gpus-per-cell is not given, but a machine of this Ray cluster has 2: give the share of one"),
+    ):
+        with pytest.raises(GridError, match=sentence):
+            run.run_grid(grid, out, engine="ray", **wanted)
+    with pytest.raises(GridError, match="engine is 'rya', but it must be one of local, ray"):
+        run.run_grid(grid, out, engine="rya")
+    assert not out.exists()
+
+
+def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray keeps no account of what nobody asks for: a cell per core would compute on the first card."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    seen: list[str] = []
+    monkeypatch.setattr(run, "_run_and_tell", lambda *_: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]))
+    (cell,) = load_grid(write_grid(tmp_path)).cells
+    for has_gpu in (True, False):
+        run._run_on_worker(cell, (tmp_path, math.inf, False), has_gpu)
+    assert seen == ["0", ""]
