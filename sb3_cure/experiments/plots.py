@@ -1,10 +1,9 @@
 """Figures of the experiments, in one style. Each function takes numbers and writes one PNG of 256 colours."""
 
-import functools
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Literal, ParamSpec, TypeAlias
+from typing import IO, Literal, TypeAlias
 
 import numpy as np
 from matplotlib import style
@@ -30,21 +29,10 @@ _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
 #: above
 Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
 PathOrFile: TypeAlias = Path | IO[bytes]
-Arguments = ParamSpec("Arguments")
 
 
-def in_style(draw: Callable[Arguments, None]) -> Callable[Arguments, None]:
-    """
-    :param draw: What draws a figure
-    :return: The same in the style of all plots
-    """
-
-    @functools.wraps(draw)
-    def drawn(*args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
-        with style.context(STYLE):
-            draw(*args, **kwargs)
-
-    return drawn
+#: Decorates what draws
+in_style = style.context(STYLE)
 
 
 def save(figure: Figure, path: PathOrFile, dpi: int = 150) -> None:
@@ -110,28 +98,11 @@ def learning_curves(
     :param logarithmic: Whether the values have a logarithmic axis
     """
     of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
-    _draw_curves(path, of_task, colors, ylabel, logarithmic)
-
-
-def srl_error_curves(
-    path: PathOrFile,
-    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-) -> None:
-    """SRL error that policies meet, as ``learning_curves``: arms by colour, policies by line style.
-
-    :param path: File to write
-    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
-    :param colors: By arm
-    :param ylabel: What the values are
-    """
-    there = {actor for policies in curves.values() for _, actor in policies}
-    _draw_curves(path, curves, colors, ylabel, logarithmic=True, actors=[each for each in LINE_STYLES if each in there])
+    policy_curves(path, of_task, colors, ylabel, logarithmic)
 
 
 @in_style
-def _draw_curves(
+def policy_curves(
     path: PathOrFile,
     curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
     colors: Mapping[str, str],
@@ -139,7 +110,15 @@ def _draw_curves(
     logarithmic: bool,
     actors: Sequence[str] = (),
 ) -> None:
-    """One panel per task, lines by arm and policy; the legend names the arms and the policies asked for."""
+    """As ``learning_curves``, with arms by colour and policies by line style.
+
+    :param path: File to write
+    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    :param actors: Policies that the legend names
+    """
     figure, panels = _panels(len(curves), height=2.9)
     seeds: dict[str, set[int]] = {}
     for axes, (task, lines) in zip(panels, curves.items(), strict=True):
@@ -236,19 +215,11 @@ def srl_error_bars(path: Path, errors: Mapping[str, np.ndarray], title: str) -> 
     :param errors: Errors of all steps, by policy
     :param title: Title of the figure
     """
-    bars = {actor: (float(values.min()), float(values.mean()), float(values.max())) for actor, values in errors.items()}
-    visitation_bars(path, {title: [policy_bar(actor, *numbers) for actor, numbers in bars.items()]}, {})
-
-
-def policy_bar(actor: str, low: float, mean: float, high: float) -> Bar:
-    """
-    :param actor: A policy
-    :param low: Lowest of its values
-    :param mean: Their mean
-    :param high: Highest
-    :return: Its bar, which tells the numbers
-    """
-    return actor, actor, (low, high), np.array([mean]), f"mean {mean:.2g}\nmax {high:.2g}"
+    bars = [
+        (actor, actor, (values.min(), values.max()), values.mean(keepdims=True), f"mean {values.mean():.2g}")
+        for actor, values in errors.items()
+    ]
+    visitation_bars(path, {title: bars}, {})
 
 
 def visitation_bars(
@@ -296,8 +267,8 @@ def actor_bars(
                     axes.plot([position, position], [low, high], color=color, linewidth=1.2)
                     axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
                 axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
-                above = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7}
-                axes.annotate(text, (position, high), (0, 3), **above)
+                note = axes.annotate(text, (position, high), (0, 3), textcoords="offset points", fontsize=7)
+                note.set(ha="center", va="bottom")
                 position += 1
             position += 0.7
         axes.set_xticks(ticks, [_plain(arm) for arm in arms], rotation=15 if len(arms) > 3 else 0)
@@ -308,7 +279,8 @@ def actor_bars(
         if lines is not None and max(means) > 0:
             axes.set_yscale("log")
             # Of contrastive errors the lowest is often zero: keep the means in sight.
-            axes.set_ylim(bottom=max(axes.get_ylim()[0], min(mean for mean in means if mean > 0) / 30))
+            least = min(mean for mean in means if mean > 0)
+            axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
     _shared_legend(figure, places)

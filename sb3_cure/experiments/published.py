@@ -143,8 +143,10 @@ def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison
         if not cells or cells[0].config.get("pretrain") or not all(cell.sees_published_pixels for cell in cells):
             continue
         base, same_method = published_method(cells[0].config.get("arguments", {}))
+        if base is None:
+            continue
         steps, stacked = stack_curves(cells)
-        for at, table in RETURNS[base].items() if base and len(steps) > 1 else ():
+        for at, table in RETURNS[base].items() if len(steps) > 1 else ():
             # An agent step may be worth up to 8 environment steps, in several environments at once.
             if steps[-1] >= 0.99 * at:
                 values = np.array([np.interp(at, steps, curve) for curve in stacked])

@@ -8,6 +8,7 @@ Writes ``report.html`` (self-contained: pictures and videos are inside, no scrip
 
 import argparse
 import io
+import itertools
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +25,7 @@ import sb3_cure
 from sb3_cure.experiments import plots, published, statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
 from sb3_cure.experiments.tables import NONE, Table, interval_text, number_text, of_tasks, plural, ratio_text, words
-from sb3_cure.experiments.visit_statistics import HEADS, Measured, state_coverage, summarise_errors
+from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
 from sb3_cure.files import replacing
 
 THRESHOLDS = (250.0, 500.0, 750.0)
@@ -39,36 +40,28 @@ Curves: TypeAlias = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Figure:
-    """A plot.
+    """A plot, or a picture or video of a cell.
 
-    :param name: Name of its file, without extension
+    :param name: Name of its file
     :param caption: What it shows, also for those who cannot see it
-    :param png: The file
+    :param content: The file: PNG or MP4
     """
 
     name: str
     caption: str
-    png: bytes
+    content: bytes
 
     @property
-    def size(self) -> tuple[int, int]:
-        with Image.open(io.BytesIO(self.png)) as image:
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of a picture; None of a video."""
+        if self.name.endswith(".mp4"):
+            return None
+        with Image.open(io.BytesIO(self.content), formats=["PNG"]) as image:
+            image.verify()
             return image.size
 
 
-@dataclass(frozen=True)
-class Film:
-    """A video.
-
-    :param caption: What it shows
-    :param mp4: The file
-    """
-
-    caption: str
-    mp4: bytes
-
-
-Part: TypeAlias = Table | Figure | Film | str
+Part: TypeAlias = Table | Figure | str
 
 
 @dataclass(frozen=True)
@@ -94,20 +87,11 @@ class Section:
         more = len(self.headlines) - 1
         return (*self.headlines, NONE)[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
 
-    @property
-    def configurations(self) -> dict[str, dict[str, Any]]:
-        """One per task and arm: the seeds of an arm differ in nothing else."""
-        cells = {f"{cell.task}, {cell.method}": cell for cell in reversed(self.experiment.finished)}
-        configs = {name: {**cell.config} for name, cell in reversed(cells.items())}
-        for config in configs.values():
-            config.pop("seed", None)
-        return configs
-
 
 def _figure(name: str, caption: str, draw: Callable[..., None], *arguments: Any) -> Figure:
     file = io.BytesIO()
     draw(file, *arguments)
-    return Figure(name, caption, file.getvalue())
+    return Figure(f"{name}.png", caption, file.getvalue())
 
 
 # Sections
@@ -156,9 +140,11 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
             errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
     if errors:
-        caption = words("srl_error", list(errors), {actor for lines in errors.values() for _, actor in lines})
+        there = {actor for lines in errors.values() for _, actor in lines}
+        actors = [actor for actor in plots.LINE_STYLES if actor in there]
         label = "SRL error\n(deterministic actions)"
-        yield _figure("srl_error", caption, plots.srl_error_curves, errors, colors, label)
+        arguments = (plots.policy_curves, errors, colors, label, True, actors)
+        yield _figure("srl_error", words("srl_error", list(errors), actors), *arguments)
 
 
 def _stacked(experiment: Experiment, column: str) -> dict[str, dict[str, Curves]]:
@@ -176,26 +162,22 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
     coverage, errors = state_coverage(experiment), summarise_errors(experiment)
     parts: list[Part] = []
     if coverage:
-        bars = {task: [_bar(row) for row in coverage if row.task == task] for task in experiment.tasks}
         caption, label = words("coverage_bars"), "occupied cells of the true state"
-        parts.append(_figure("coverage", caption, plots.actor_bars, _drawn(bars), label))
+        parts.append(_figure("coverage", caption, plots.actor_bars, _bars(coverage), label))
         parts.append(tables.coverage_table(experiment, coverage))
     for head in HEADS:
-        bars = {
-            task: [_bar(row, (row.error_min, row.error_max)) for row in errors if (row.task, row.head) == (task, head)]
-            for task in experiment.tasks
-        }
-        if _drawn(bars):
-            lines: dict[str, dict[str, float]] = {task: {} for task in _drawn(bars)}
-            for task, values in lines.items():
-                for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
-                    means = [row.mean for row in errors if (row.task, row.head) == (task, other)]
-                    values |= {label: float(np.mean(means))} if means else {}
-                theirs = published.SRL_ERROR.get(published.task_key(task))
-                if theirs and experiment.sees_published_pixels:
-                    values["paper's cure"] = theirs["curious"].mean
+        bars = _bars([row for row in errors if row.head == head])
+        lines: dict[str, dict[str, float]] = {task: {} for task in bars}
+        for task, values in lines.items():
+            for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
+                means = [row.mean for row in errors if (row.task, row.head) == (task, other)]
+                values |= {label: float(np.mean(means))} if means else {}
+            theirs = published.SRL_ERROR.get(published.task_key(task))
+            if theirs and experiment.sees_published_pixels:
+                values["paper's cure"] = theirs["curious"].mean
+        if bars:
             caption = words("visitation_bars", head, {label for values in lines.values() for label in values})
-            parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, _drawn(bars), lines))
+            parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
     if errors:
         parts.append(tables.error_table(experiment, errors))
     measures: list[tuple[Measured, str]] = [(row, "as many cells of the true state space") for row in coverage]
@@ -203,37 +185,27 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
     return list(_visitation_headlines(experiment, measures)), parts
 
 
-def _drawn(bars: dict[str, list[plots.Bar]]) -> dict[str, list[plots.Bar]]:
-    return {task: rows for task, rows in bars.items() if rows}
-
-
-def _bar(row: Measured, ends: tuple[float, float] | None = None) -> plots.Bar:
-    text = f"{number_text(row.ratio.value, 2)}\N{MULTIPLICATION SIGN}" if math.isfinite(row.ratio.value) else ""
-    interval = "" if row.ratio.low is None else f"\n{interval_text(row.ratio, 1)}"
-    return row.method, row.actor, ends, row.values, text + interval
+def _bars(rows: Sequence[Measured]) -> dict[str, list[plots.Bar]]:
+    """By task."""
+    panels: dict[str, list[plots.Bar]] = {}
+    for row in rows:
+        text = f"{number_text(row.ratio.value, 2)}\N{MULTIPLICATION SIGN}" if math.isfinite(row.ratio.value) else ""
+        text += "" if row.ratio.low is None else f"\n{interval_text(row.ratio, 1)}"
+        ends = (row.error_min, row.error_max) if isinstance(row, ErrorSummary) else None
+        panels.setdefault(row.task, []).append((row.method, row.actor, ends, row.values, text))
+    return panels
 
 
 def _visitation_headlines(experiment: Experiment, measures: Sequence[tuple[Measured, str]]) -> Iterator[str]:
     """Of each arm with a curious policy a sentence against the random policy, and one against the task policy."""
-    for task in experiment.tasks:
-        for method in experiment.methods:
-            rows = [
-                each for each in measures if (each[0].task, each[0].method, each[0].actor) == (task, method, "curious")
-            ]
-            others = {"random policy": "ratio", f"task policy of {experiment.baseline_of(method)}": "task_ratio"}
-            for other, name in others.items():
-                ratios = [(getattr(row, name), what) for row, what in rows if math.isfinite(getattr(row, name).value)]
-                # Measures may rest on different seeds, such as those whose common heads are made.
-                counts = [plural(ratio.n, "seed") for ratio, _ in ratios]
-                alike = len(set(counts)) == 1
-                found = [
-                    f"{ratio_text(ratio)} times {what}{'' if alike else f' ({count})'}"
-                    for (ratio, what), count in zip(ratios, counts, strict=True)
-                ]
-                if found:
-                    seeds = f", {counts[0]}" if alike else ""
-                    compared = f"compared to the {other}, the curious one meets {', '.join(found)}"
-                    yield f"{method} on {task}{seeds}: {compared}."
+    arms = [(task, method) for task in experiment.tasks for method in experiment.methods]
+    for (task, method), other in itertools.product(arms, ("ratio", "task_ratio")):
+        rows = [(row, what) for row, what in measures if (row.task, row.method, row.actor) == (task, method, "curious")]
+        ratios = [(getattr(row, other), what) for row, what in rows]
+        found = [(ratio_text(ratio), what, ratio.n) for ratio, what in ratios if math.isfinite(ratio.value)]
+        if found:
+            policy = "random policy" if other == "ratio" else f"task policy of {experiment.baseline_of(method)}"
+            yield words("visits", method, task, policy, found)
 
 
 def _comparison(
@@ -266,10 +238,9 @@ def _comparison(
         finals = statistics.paired_differences(experiment, "finals")
         parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
     elif len(experiment.methods) > 1:
-        none = f"No arm shares a seed that has returns with the baseline {experiment.baseline}: nothing to compare."
-        headlines.append(none)
+        headlines.append(words("nothing_shared", experiment.baseline))
     else:
-        headlines.append("One arm: there is nothing to compare it with.")
+        headlines.append(words("one_arm"))
     pairs = list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []
     if pairs:
         note = "As above, over all tasks."
@@ -279,8 +250,7 @@ def _comparison(
     except ResultsError as error:
         return headlines, [*parts, f"No aggregates: {error}"]
     if found is None:
-        none = "No aggregates over tasks: they need two seeds or more that every arm has done."
-        return headlines, [*parts, none]
+        return headlines, [*parts, words("no_aggregates")]
     iqm = {method: (each.value, each.low or 0.0, each.high or 0.0) for method, each in found.iqm.items()}
     caption, drawn = words("aggregate_scores"), (iqm, found.taus, found.profiles)
     parts.append(_figure("aggregates", caption, plots.aggregate_scores, *drawn, colors))
@@ -302,7 +272,8 @@ def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, l
     :return: Cells with their pictures and videos
     """
     shown: set[tuple[str, str]] = set()
-    for cell in sorted(experiment.finished, key=lambda cell: (experiment.tasks.index(cell.task), cell.seed)):
+    order = [(task, method) for task in experiment.tasks for method in experiment.methods]
+    for cell in sorted(experiment.finished, key=lambda cell: (order.index((cell.task, cell.method)), cell.seed)):
         files = [cell.folder / name for name in MEDIA if (cell.folder / name).exists()]
         if files and which != "none" and (which == "all" or (cell.task, cell.method) not in shown):
             shown.add((cell.task, cell.method))
@@ -312,14 +283,10 @@ def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, l
 def _medium(path: Path) -> Part:
     """A picture or video of a cell, or a sentence about why it cannot be shown."""
     try:
-        content, caption = path.read_bytes(), words("media", path.name)
-        if path.suffix == ".png":
-            with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
-                image.verify()
-            return Figure(path.stem, caption, content)
-        if content[4:8] != b"ftyp":
+        figure = Figure(path.name, words("media", path.name), path.read_bytes())
+        if figure.size is None and figure.content[4:8] != b"ftyp":
             raise ValueError("it is no MP4.")
-        return Film(caption, content)
+        return figure
     except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow's word for a broken PNG
         return f"{path.name} cannot be shown: {error}"
 
@@ -342,25 +309,18 @@ def write_report(
     experiments = read_results(results)
     sections = [describe(experiment, thresholds, media) for experiment in experiments]
     compared = published.compare_with_published(experiments)
-    facts = {
-        "title": results.resolve().name,
-        "sections": sections,
-        "comparisons": tables.published_table(compared) if compared else None,
-        "media": media,
-        "version": sb3_cure.__version__,
-        "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-    }
-    texts = {
-        out: tables.render("report.html.j2", **facts),
-        results / "summary.md": tables.render("summary.md.j2", **facts),
-    }
+    table = tables.published_table(compared) if compared else None
+    facts = {"title": results.resolve().name, "sections": sections, "comparisons": table, "media": media}
+    facts |= {"version": sb3_cure.__version__, "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
+    pages = {out: "report.html.j2", results / "summary.md": "summary.md.j2"}
+    texts = {path: tables.render(template, **facts) for path, template in pages.items()}
     for section in sections:
         text = tables.render("experiment.md.j2", section=section, level=1, plots_beside=True)
         texts[section.experiment.folder / "table.md"] = text
     files = {path: text.encode() for path, text in texts.items()}
     for section in sections:
         figures = [part for part in section.parts if isinstance(part, Figure)]
-        files |= {section.experiment.folder / f"{figure.name}.png": figure.png for figure in figures}
+        files |= {section.experiment.folder / figure.name: figure.content for figure in figures}
     written: list[Path] = []
     failed: set[Path] = set()
     for path, content in files.items():
@@ -390,15 +350,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("results", type=Path, help="folder that `sb3-cure experiment` wrote, or one experiment in it")
     parser.add_argument("--out", type=Path, help="HTML file (default: report.html in the folder)")
-    parser.add_argument(
-        "--thresholds", type=returns, default=THRESHOLDS, help="returns whose steps are told (default: 250,500,750)"
-    )
-    parser.add_argument(
-        "--media",
-        choices=("first", "all", "none"),
-        default="first",
-        help="videos and pictures of which seeds (default: of each arm the first that has some)",
-    )
+    of_returns = "returns whose steps are told (default: 250,500,750)"
+    parser.add_argument("--thresholds", type=returns, default=THRESHOLDS, help=of_returns)
+    of_media = "videos and pictures of which seeds (default: of each arm the first that has some)"
+    parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=of_media)
     options = parser.parse_args(argv)
     out = options.out or options.results / "report.html"
     try:

@@ -97,25 +97,19 @@ class Experiment:
     :param name: Its folder below the one that was read (``"500k/curves"``), or its own name
     :param folder: Where it lies
     :param grid: ``grid.json``
+    :param kind: ``"curves"``, ``"visitation"`` or ``"pretraining"``
+    :param budget: Environment steps of each cell
+    :param baseline: The arm that the others are compared with
     :param cells: By (task, method, seed), in the grid's order; cells on disk that the grid does not name come last
     """
 
     name: str
     folder: Path
     grid: dict[str, Any]
+    kind: str
+    budget: int
+    baseline: str
     cells: dict[tuple[str, str, int], CellResult]
-
-    @property
-    def kind(self) -> str:
-        return str(self.grid["kind"])
-
-    @property
-    def budget(self) -> int:
-        return int(self.grid["budget"])
-
-    @property
-    def baseline(self) -> str:
-        return str(self.grid["baseline"])
 
     def baseline_of(self, method: str) -> str:
         """
@@ -195,7 +189,8 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     grid, root = _read_json(path, "remove it and run the grid again, which writes it"), path.parent
     try:
         tasks, methods, seeds = [short_name(str(task)) for task in grid["tasks"]], list(grid["methods"]), grid["seeds"]
-        budget, kind, own_name, _ = int(grid["budget"]), grid["kind"], grid["experiment"], grid["baseline"]
+        budget, own_name = int(grid["budget"]), str(grid["experiment"])
+        kind, baseline = str(grid["kind"]), str(grid["baseline"])
         seeds = list(range(seeds)) if isinstance(seeds, int) else list(map(int, seeds))
     except (KeyError, TypeError, ValueError) as error:
         raise ResultsError(f"{path} describes no grid ({error!r}): remove it and run the grid again.") from None
@@ -209,9 +204,8 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, budget, kind) for key in keys}
     _check_alike(cells.values())
     order = list(dict.fromkeys(task for task, _, _ in cells))
-    return Experiment(
-        name or own_name, root, grid, dict(sorted(cells.items(), key=lambda item: order.index(item[0][0])))
-    )
+    in_order = dict(sorted(cells.items(), key=lambda item: order.index(item[0][0])))
+    return Experiment(name or own_name, root, grid, kind, budget, baseline, in_order)
 
 
 def _check_alike(cells: Iterable[CellResult]) -> None:

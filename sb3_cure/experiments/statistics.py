@@ -340,33 +340,29 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
     :raises ResultsError: if there are returns that are no scores between 0 and 1
     """
     scores, tasks = score_matrices(experiment)
-    for index, task in enumerate(tasks):
-        for score in np.concatenate([values[:, index] for values in scores.values()]):
-            if not -1e-6 <= score <= 1 + 1e-6:
-                raise ResultsError(
-                    f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
-                    f"suite, but a return on {task} is {score * HIGHEST_RETURN:.6g}."
-                )
     if not scores:
         return None
+    for task, values in zip(tasks, np.concatenate(list(scores.values())).T, strict=True):
+        if len(wrong := values[(values < -1e-6) | (values > 1 + 1e-6)]):
+            raise ResultsError(
+                f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
+                f"suite, but a return on {task} is {wrong[0] * HIGHEST_RETURN:.6g}."
+            )
     n, taus = len(next(iter(scores.values()))), np.linspace(0, 1, 1001)
 
     def estimates(values: Mapping[str, Any], function: Any) -> dict[str, Estimate]:
         points, intervals = library.get_interval_estimates(
             values, lambda *x: np.array([function(*x)]), reps=RLIABLE_REPS
         )
-        return {name: Estimate(float(points[name][0]), *map(float, intervals[name][:, 0]), n) for name in values}
+        ends = {name: (float(low), float(high)) for name, ((low,), (high,)) in intervals.items()}
+        return {name: Estimate(float(points[name][0]), *ends[name], n) for name in values}
 
     state = np.random.get_state()  # rliable 1.2 draws from numpy's global generator, whatever it is given
     np.random.seed(0)
     try:
         iqm = estimates(scores, interquartile_mean)
-        baselines = {name: experiment.baseline_of(name) for name in scores}
-        pairs = {
-            name: (scores[name], scores[other])
-            for name, other in baselines.items()
-            if other in scores and other != name
-        }
+        others = {name: experiment.baseline_of(name) for name in scores}
+        pairs = {name: (scores[name], scores[other]) for name, other in others.items() if name != other in scores}
         improvement = estimates(pairs, probability_of_improvement)
         points, intervals = library.create_performance_profile(
             scores, taus, custom_profile_func=share_above, reps=RLIABLE_REPS

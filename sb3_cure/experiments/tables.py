@@ -38,8 +38,8 @@ class Table:
         return render("table.md.j2", table=self)
 
 
-def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], note: str = "") -> Table:
-    return Table(title, pd.DataFrame(list(rows), columns=list(columns), dtype=object), note)
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], note: str = "") -> Table:
+    return Table(title, pd.DataFrame(rows, columns=list(columns), dtype=object), note)
 
 
 # Templates
@@ -127,6 +127,10 @@ def interval_text(estimate: Estimate, digits: int = 0) -> str:
     if estimate.low is None or estimate.high is None:
         return "one seed: no interval" if estimate.n else NONE
     return f"[{number_text(estimate.low, digits)}, {number_text(estimate.high, digits)}]"
+
+
+def _value_and_interval(estimate: Estimate, digits: int) -> tuple[str, str]:
+    return number_text(estimate.value, digits), interval_text(estimate, digits)
 
 
 def ratio_text(estimate: Estimate) -> str:
@@ -235,24 +239,14 @@ def difference_table(
     :param compared: From which arm: by default the baseline; each row of another one names it
     :return: The differences with both intervals
     """
-    columns = [
-        "arm",
-        "task",
-        ">pairs",
-        ">same start",
-        ">difference",
-        ">95 % t",
-        ">95 % percentile",
-        ">above",
-        "verdict",
-    ]
+    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >95 % percentile; >above; verdict".split("; ")
     shown = []
     for row in rows:
         digits = difference_digits(row, experiment)
         label = difference_label(row, None if compared else experiment.baseline)
-        numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, digits)]
-        numbers += [interval_text(each, digits) for each in (row.t, row.percentile)]
-        shown.append([label, of_tasks(row), *numbers, str(row.wins), row.t.verdict])
+        numbers = [str(row.pairs), str(row.same_starts), *_value_and_interval(row.t, digits)]
+        numbers += [interval_text(row.percentile, digits), str(row.wins)]
+        shown.append([label, of_tasks(row), *numbers, row.t.verdict])
     title = f"Paired difference {compared or f'from {compared_with(rows, experiment)}'}: {measure}"
     return _table(title, columns, shown, words("differences") if note is None else note)
 
@@ -304,8 +298,7 @@ def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Tab
     better = {method: found.improvement.get(method, Estimate(math.nan)) for method in found.iqm}
     columns = ["arm", ">IQM", ">95 %", f">P(arm > {'its baseline' if varied else experiment.baseline})", ">95 %"]
     rows = [
-        [method, number_text(iqm.value, 3), interval_text(iqm, 3)]
-        + [number_text(better[method].value, 2), interval_text(better[method], 2)]
+        [method, *_value_and_interval(iqm, 3), *_value_and_interval(better[method], 2)]
         for method, iqm in found.iqm.items()
     ]
     note = words("aggregates", found, statistics.HIGHEST_RETURN, _baselines(experiment) if varied else "")
@@ -343,11 +336,11 @@ def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
     :return: Occupied cells and entropy
     """
     columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells", *_RATIOS, ">entropy, bits"]
-    shown = [
-        [row.task, row.method, row.actor, str(len(row.values)), number_text(row.steps), _mean_std(row.values)]
-        + [ratio_text(row.ratio), ratio_text(row.task_ratio), number_text(float(row.entropy.mean()), 2)]
-        for row in rows
-    ]
+    shown = []
+    for row in rows:
+        numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), ratio_text(row.ratio)]
+        numbers += [ratio_text(row.task_ratio), number_text(float(row.entropy.mean()), 2)]
+        shown.append([row.task, row.method, row.actor, *numbers])
     dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
     note = words("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
     return _table("Coverage of the true state space", columns, shown, note)
@@ -405,27 +398,24 @@ def conditions_table(experiment: Experiment) -> Table:
     for cell in experiment.finished:
         packages = ", ".join(f"{name} {number}" for name, number in (cell.run.get("versions") or {}).items())
         letter = letters.setdefault(packages, chr(ord("A") + len(letters))) if packages else NONE
-        machine = [str(cell.run.get(key) or NONE) for key in ("device", "precision", "machine")]
-        steps, _ = cell.curve("environment_steps")
-        phase = cell.config.get("pretrain")
-        pretraining = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
-        row = [
-            cell.task,
-            cell.method,
-            str(cell.seed),
-            number_text(float(steps[-1])) if len(steps) else NONE,
-            pretraining,
-        ]
-        row += [_duration(cell.run.get("seconds")), *machine, letter]
-        rows.append([*row, _commits(cell), str(cell.run.get("attempts") or NONE)])
-    columns = ["task", "arm", "seeds", ">environment steps", ">pretraining steps", ">wall-clock", "device", "precision"]
-    frame = pd.DataFrame(rows, columns=[*columns, "machine", "versions", "commit", ">attempts"], dtype=object)
+        steps, phase = cell.curve("environment_steps")[0], cell.config.get("pretrain")
+        trained = number_text(float(steps[-1])) if len(steps) else NONE
+        pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
+        seconds, machine = cell.run.get("seconds"), [_told(cell, key) for key in ("device", "precision", "machine")]
+        row = [cell.task, cell.method, str(cell.seed), trained, pretrained, _duration(seconds), *machine, letter]
+        rows.append([*row, _commits(cell), _told(cell, "attempts")])
+    columns = "task; arm; seeds; >environment steps; >pretraining steps; >wall-clock; device; precision; machine"
+    frame = _table("", [*columns.split("; "), "versions", "commit", ">attempts"], rows).rows
     commits = frame.groupby(["task", "seeds"], sort=False).commit.nunique()
     mixed = sorted(f"{task} seed {seed}" for (task, seed), count in commits.items() if count > 1)
     own = ["seeds", ">wall-clock"]
     alike = frame.groupby([name for name in frame if name not in own], sort=False)
     merged = alike[own].agg(", ".join).reset_index()[list(frame)]
     return Table("Run conditions", merged, words("conditions", letters, mixed))
+
+
+def _told(cell: CellResult, key: str) -> str:
+    return str(cell.run.get(key) or NONE)
 
 
 def _commits(cell: CellResult) -> str:

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,8 @@ HEADS = ("own", "common")
 #: Of the range of the random policy, or of the whole circle, along each of two coordinates
 GRID_INTERVALS = 10
 _ACTORS = ("random", "task", "curious")
+#: Arm, actor and seed
+_Key: TypeAlias = tuple[str, str, int]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +73,7 @@ class Coverage(Measured):
     dimensions: int
 
 
-def _compare(experiment: Experiment, task: str, numbers: Mapping[tuple[str, str, int], float]) -> Iterator[dict[str, Any]]:
+def _compare(experiment: Experiment, task: str, numbers: Mapping[_Key, float]) -> Iterator[dict[str, Any]]:
     """What all ``Measured`` have, of numbers by (method, actor, seed), in the order of tables."""
     by_policy: dict[tuple[str, str], dict[int, float]] = {}
     for (method, actor, seed), value in numbers.items():
@@ -171,9 +173,9 @@ def entropy_bits(counts: np.ndarray) -> float:
     return float(-(shares * np.log2(shares)).sum()) + 0.0
 
 
-def _visits(experiment: Experiment, task: str) -> tuple[dict[tuple[str, str, int], np.ndarray], tuple[str, ...]]:
+def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], tuple[str, ...]]:
     """True states by arm, actor and seed, and the units of their coordinates."""
-    visits: dict[tuple[str, str, int], np.ndarray] = {}
+    visits: dict[_Key, np.ndarray] = {}
     kinds: dict[tuple[str, ...], str] = {}
     for method in experiment.methods:
         for seed, cell in experiment.done(task, method).items():
@@ -186,9 +188,7 @@ def _visits(experiment: Experiment, task: str) -> tuple[dict[tuple[str, str, int
     return visits, next(iter(kinds), ())
 
 
-def _grid_of_random(
-    visits: Mapping[tuple[str, str, int], np.ndarray], units: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray]:
+def _grid_of_random(visits: Mapping[_Key, np.ndarray], units: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Where the grid begins and how wide its cells are: by the random policy's episodes, those of each seed once.
 
     (All arms of a seed have the same ones.)
