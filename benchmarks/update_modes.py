@@ -1,6 +1,6 @@
 """Sequential against joint updates on cartpole-swingup from pixels: paired seeds, SRL loss and return.
 
-    python -m sb3_cure.experiments.update_modes --out results/update_modes
+    python -m benchmarks.update_modes --out results/update_modes
 
 Both arms of a seed start from the same weights and the same random warm-up. Each cell (head, mode, seed) is one CSV
 file; a cell whose file exists is not run again, so that several processes can share the work (``--srl``, ``--seeds``).
@@ -16,13 +16,15 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.evaluation import run_episodes
-from sb3_cure.experiments import plots
 from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve
 from sb3_cure.experiments.files import describe_run, write_csv
+from sb3_cure.experiments.plots import in_style, save
 
 MODES = ("sequential", "joint")
 HEADS: dict[str, dict[str, Any]] = {
@@ -31,6 +33,7 @@ HEADS: dict[str, dict[str, Any]] = {
     "rae": dict(srl="rae", srl_kwargs={}, warmup_updates=None),
 }
 EVALUATIONS = 10
+EPISODES = 3
 #: The numbers of one arm: column of the CSV, its name, decimals
 MEASURES = {
     "task_return": ("return", 0),
@@ -60,7 +63,7 @@ class RecordUpdates(RecordCurve):
 
     def evaluate(self) -> dict[str, float]:
         row = super().evaluate()
-        episodes = run_episodes(self.model, self.eval_env, 3, "random", seed=50_000)  # type: ignore[arg-type]
+        episodes = run_episodes(self.model, self.eval_env, EPISODES, "random", seed=50_000)  # type: ignore[arg-type]
         self.rows[-1]["srl_loss"] = float(th.stack(self._losses).mean()) if self._losses else float("nan")
         self.rows[-1]["random_srl_error"] = float(np.concatenate([episode.srl_errors for episode in episodes]).mean())
         self._losses.clear()
@@ -96,7 +99,7 @@ def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
     curve = RecordUpdates(
         make_dmc_env(DOMAIN, TASK, **ENV_KWARGS),
         max(steps // EVALUATIONS, 1),
-        n_episodes=3,
+        n_episodes=EPISODES,
         seed=10_000,
         action_repeat=env.get_wrapper_attr("action_repeat"),
     )
@@ -167,6 +170,38 @@ def compare_policies(cells: Mapping[tuple[str, str], Mapping[int, Rows]]) -> lis
     return lines
 
 
+@in_style
+def draw_curves(
+    path: Path,
+    cells: Mapping[tuple[str, str], Mapping[int, Sequence[Mapping[str, float]]]],
+    measures: Mapping[str, str],
+) -> None:
+    """Curves of both update modes: one row per head, one column per measure; thin lines are seeds, thick ones means.
+
+    :param path: File to write
+    :param cells: Rows by (head, mode), by seed
+    :param measures: Column of the rows -> label of the axis
+    """
+    heads = list(dict.fromkeys(head for head, _ in cells))
+    size = (4 * len(measures), 3.2 * len(heads))
+    figure = Figure(figsize=size)
+    grid = figure.subplots(len(heads), len(measures), squeeze=False)
+    colors = {"sequential": "#1f77b4", "joint": "#ff7f0e"}
+    for (head, mode), seeds in cells.items():
+        for axes, (column, label) in zip(grid[heads.index(head)], measures.items(), strict=True):
+            for rows in seeds.values():
+                steps = [row["environment_steps"] for row in rows]
+                axes.plot(steps, [row[column] for row in rows], color=colors[mode], alpha=0.3, linewidth=0.8)
+            mean = np.mean([[row[column] for row in rows] for rows in seeds.values()], axis=0)
+            axes.plot(steps, mean, color=colors[mode], linewidth=2, label=f"{mode} (n={len(seeds)})")
+            axes.set(xlabel="environment steps", ylabel=label, title=head)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in grid.flat:
+        axes.set_ylim(0, None)  # last: it stops the upper limit from following the curves
+    grid[0, 0].legend()
+    save(figure, path, 120)
+
+
 def _late_mean(rows: Rows, column: str) -> float:
     return float(np.mean([row[column] for row in rows[-max(len(rows) // 3, 1) :]]))
 
@@ -207,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     print(f"{srl}, {mode}, seed {seed}: {options.steps} agent steps", flush=True)
                     run_cell(path, srl, mode, seed, options.steps)
     cells = read_cells(options.out)
-    plots.update_modes(options.out / "curves.png", cells, {column: name for column, (name, _) in MEASURES.items()})
+    draw_curves(options.out / "curves.png", cells, {column: name for column, (name, _) in MEASURES.items()})
     table = [*summarise(cells), "", *compare_policies(cells)]
     (options.out / "table.md").write_text("\n".join(table) + "\n")
     print("\n".join(table))

@@ -1,11 +1,12 @@
 """What the paper's table of SRL error can mean: beside it, decoders that have learned nothing or little.
 
-    python -m sb3_cure.experiments.yardsticks --out results/yardsticks
+    python -m benchmarks.yardsticks --out results/yardsticks
 
 On random episodes of the paper's six tasks, in its pixels: the error of predicting zero (the middle grey) and the mean
 image, of autoencoders that are untrained, and of the same ones while they are trained on other random episodes. Writes
 ``errors.csv`` and ``table.md``, which also says after how many updates an autoencoder errs less than the paper reports
-for its curious policy, and what predicting zero errs in an older MuJoCo's pictures (benchmarks/zero_decoder.py).
+for its curious policy, and what other decoders err that learn nothing of the state, also in an older MuJoCo's pictures
+(``zero_decoder.py``).
 """
 
 import argparse
@@ -14,18 +15,22 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas as pd
 
+from benchmarks import zero_decoder
 from sb3_cure import CuReSAC
 from sb3_cure.evaluation import run_episodes, srl_errors
 from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import short_name
 from sb3_cure.experiments.heads import fit_head, observation_batch
 from sb3_cure.experiments.published import SRL_ERROR, task_key
+from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.experiments.visitation import constant_errors, mean_target
 
 TASKS = ("cartpole-swingup", "finger-spin", "finger-turn_easy", "ball_in_cup-catch", "reacher-easy", "reacher-hard")
 #: Numbers of updates after which the autoencoder is measured
 UPDATES = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
+_PAPER = {"random": "random", "cure": "curious"}
 COLUMNS = ("task", "predictor", "updates", "seed", "error_min", "error_mean", "error_max")
 
 
@@ -67,33 +72,44 @@ def measure_task(
     return rows
 
 
-def table(rows: Sequence[Row], elsewhere: Sequence[Row] = ()) -> list[str]:
+def table(errors: pd.DataFrame, elsewhere: pd.DataFrame) -> Table:
+    """Means over seeds with the lowest and the highest error of all frames, a column per task.
+
+    :param errors: ``errors.csv``
+    :param elsewhere: ``zero_decoder.csv``: what decoders err that learn nothing of the state, by version of MuJoCo
+    :return: These beside the paper's numbers
     """
-    :param rows: Rows of ``errors.csv``
-    :param elsewhere: Rows of ``zero_decoder.csv``: zero's error in the pictures of other versions of MuJoCo
-    :return: Lines of a Markdown table: means over seeds beside the paper's
-    """
-    others = [{**row, "predictor": f"zero, MuJoCo {row['mujoco']}", "updates": 0} for row in elsewhere]
-    predictors = [*dict.fromkeys(row["predictor"] for row in others), "zero", "mean_image", "autoencoder"]
-    columns = ["task", "paper: random", "paper: cure", *predictors[:-2], "mean image", "untrained autoencoder"]
-    columns += ["updates until the error is below the paper's cure", "error at the end (updates)"]
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for task in dict.fromkeys(row["task"] for row in rows):
-        own = [row for row in (*rows, *others) if row["task"] == task]
-        constant = [_mean(own, name, 0) for name in predictors]
-        published = SRL_ERROR[task_key(task)]
-        measured = sorted({row["updates"] for row in own})
-        below = [number for number in measured if _mean(own, "autoencoder", number) < published["curious"].mean]
-        crossing = str(below[0]) if below else f"more than {measured[-1]}"
-        last = f"{_mean(own, 'autoencoder', measured[-1]):.4f} ({measured[-1]})"
-        shown = (published["random"].mean, published["curious"].mean, *constant)
-        lines.append(f"| {task} | " + " | ".join([*(f"{value:.4f}" for value in shown), crossing, last]) + " |")
-    return lines
+    tasks = [task for task in TASKS if task in set(errors.task)]
+    papers = {task: SRL_ERROR[task_key(task)] for task in tasks}
+    rows = {f"paper: {name}": [_text(*papers[task][actor]) for task in tasks] for name, actor in _PAPER.items()}
+    for (mujoco, predictor), own in elsewhere.groupby(["mujoco", "predictor"], sort=False):
+        means = own.groupby("task").error_mean.mean()
+        rows[f"{predictor}, MuJoCo {mujoco}"] = _texts(own, tasks)
+        rows[f"paper's cure / {predictor}, MuJoCo {mujoco}"] = [
+            f"{papers[task]['curious'].mean / means[task]:.3g}" if task in means else NONE for task in tasks
+        ]
+    autoencoder = errors[errors.predictor == "autoencoder"]
+    last = autoencoder.updates.max()
+    rows["mean image"] = _texts(errors[errors.predictor == "mean_image"], tasks)
+    rows["untrained autoencoder"] = _texts(autoencoder[autoencoder.updates == 0], tasks)
+    rows[f"autoencoder after {last} updates"] = _texts(autoencoder[autoencoder.updates == last], tasks)
+    rows["updates until its error is below the paper's cure"] = []
+    for task in tasks:
+        curve = autoencoder[autoencoder.task == task].groupby("updates").error_mean.mean()
+        below = curve.index[curve < papers[task]["curious"].mean]
+        rows["updates until its error is below the paper's cure"].append(f"{below[0]}" if len(below) else f"> {last}")
+    lines = [[name, *texts] for name, texts in rows.items()]
+    frame = pd.DataFrame(lines, columns=["mean (min to max)", *(f">{task}" for task in tasks)])
+    return Table("SRL error: the paper's beside decoders that have learned nothing or little", frame)
 
 
-def _mean(rows: Sequence[Row], predictor: str, updates: int) -> float:
-    chosen = [row["error_mean"] for row in rows if (row["predictor"], row["updates"]) == (predictor, updates)]
-    return float(np.mean(chosen))
+def _texts(rows: pd.DataFrame, tasks: Sequence[str]) -> list[str]:
+    found = rows.groupby("task").agg({"error_min": "min", "error_mean": "mean", "error_max": "max"})
+    return [_text(*found.loc[task]) if task in found.index else NONE for task in tasks]
+
+
+def _text(low: float, mean: float, high: float) -> str:
+    return f"{mean:.4f} ({low:.4f} to {high:.4f})"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,9 +131,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_csv(path, COLUMNS, rows)
             write_json(options.out / "run.json", describe_run())
     elsewhere = options.out / "zero_decoder.csv"
-    lines = table(rows, read_rows(elsewhere) if elsewhere.exists() else ())
-    write_text(options.out / "table.md", "\n".join(lines) + "\n")
-    print("\n".join(lines))
+    others = pd.read_csv(elsewhere) if elsewhere.exists() else pd.DataFrame(columns=zero_decoder.COLUMNS)
+    text = table(pd.read_csv(path), others).markdown()
+    write_text(options.out / "table.md", text)
+    print(text)
     return 0
 
 

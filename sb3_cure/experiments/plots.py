@@ -313,11 +313,15 @@ def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
 # Images
 
 
+def _picture(image: np.ndarray) -> np.ndarray:
+    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
+    return image[..., 0] if image.shape[-1] == 1 else image
+
+
 def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
     """Images [C, H, W] of one or three channels, side by side."""
     strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
-    picture = strip[..., 0] if strip.shape[-1] == 1 else strip
-    axes.imshow(picture, cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    axes.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
     axes.set(xticks=[], yticks=[])
     axes.grid(False)
     axes.spines[:].set_visible(False)

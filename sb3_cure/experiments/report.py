@@ -133,8 +133,8 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
     ):
         curves = _stacked(experiment, column)
         if curves:
-            arguments = (plots.learning_curves, curves, colors, label, logarithmic)
-            yield _figure(name, words(name, list(curves)), *arguments)
+            caption = words(name, list(curves))
+            yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
     errors: dict[str, dict[tuple[str, str], Curves]] = {}
     for actor in ("task", "curious"):
         for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
@@ -143,8 +143,8 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         there = {actor for lines in errors.values() for _, actor in lines}
         actors = [actor for actor in plots.LINE_STYLES if actor in there]
         label = "SRL error\n(deterministic actions)"
-        arguments = (plots.policy_curves, errors, colors, label, True, actors)
-        yield _figure("srl_error", words("srl_error", list(errors), actors), *arguments)
+        caption = words("srl_error", list(errors), actors)
+        yield _figure("srl_error", caption, plots.policy_curves, errors, colors, label, True, actors)
 
 
 def _stacked(experiment: Experiment, column: str) -> dict[str, dict[str, Curves]]:

@@ -1,21 +1,20 @@
 """Reads the folders that experiments wrote, and refuses what would make a wrong number."""
 
-import io
+import csv
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import comparable, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
 _AGAIN = "remove the cell's folder and run the grid again"
-
-Content = TypeVar("Content")
 
 
 class ResultsError(ValueError):
@@ -274,15 +273,11 @@ def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, config: dic
     raise ResultsError(f"{path} {reason}: {_AGAIN}.")
 
 
-def _read(path: Path, parse: Callable[[str], Content], fix: str) -> Content:
-    try:
-        return parse(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:  # ValueError: what json, pandas and text that is no UTF-8 raise
-        raise ResultsError(f"{path} cannot be read ({' '.join(str(error).split())}): {fix}.") from None
-
-
 def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
-    content = _read(path, json.loads, fix)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:  # ValueError: also of text that is no UTF-8
+        raise ResultsError(f"{path} cannot be read ({error}): {fix}.") from None
     if not isinstance(content, dict):
         raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: {fix}.")
     return content
@@ -290,13 +285,14 @@ def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
 
 def _read_table(path: Path, *numbers: str, text: tuple[str, ...] = ()) -> pd.DataFrame:
     """A CSV file with at least these columns; an empty table if there is none."""
-
-    def parse(content: str) -> pd.DataFrame:
-        if content and not content.endswith("\n"):
-            raise ValueError("it ends within a line, whose last number may have lost digits")
-        table = pd.read_csv(io.StringIO(content), index_col=False, float_precision="round_trip")
-        if missing := [name for name in (*numbers, *text) if name not in table]:
-            raise ValueError(f"it has no column {missing[0]!r}")
+    if not path.exists():
+        return pd.DataFrame(columns=[*numbers, *text])
+    try:
+        rows = [
+            {name: np.nan if value == "" else value for name, value in row.items()}
+            for row in read_rows(path, (*numbers, *text))
+        ]
+        table = pd.DataFrame(rows or {name: [] for name in (*numbers, *text)})
         return table.astype({name: float for name in table if name not in text})
-
-    return _read(path, parse, _AGAIN) if path.exists() else pd.DataFrame(columns=[*numbers, *text])
+    except (OSError, ValueError, csv.Error) as error:
+        raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None

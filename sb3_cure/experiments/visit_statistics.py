@@ -184,7 +184,7 @@ def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], 
             if states:
                 kinds.setdefault(units, f"{cell.folder} has states with the units {', '.join(units)}")
     if len(kinds) > 1:
-        raise ResultsError(f"{', but '.join(kinds.values())}: they are of two tasks; put back what does not belong.")
+        raise ResultsError(f"{', but '.join(kinds.values())}: they are of two tasks; put one of them elsewhere.")
     return visits, next(iter(kinds), ())
 
 

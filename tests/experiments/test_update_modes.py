@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from sb3_cure.experiments import update_modes
+from benchmarks import update_modes
 
 
 def write_cell(folder: Path, srl: str, mode: str, seed: int, value: float) -> None:
@@ -20,7 +20,7 @@ def write_cell(folder: Path, srl: str, mode: str, seed: int, value: float) -> No
         csv.writer(file).writerows([columns, *rows])
 
 
-def test_table_pairs_the_arms_seed_by_seed(tmp_path: Path) -> None:
+def test_table_pairs_arms_by_seed(tmp_path: Path) -> None:
     """Means of the last third, arm beside arm; a seed of which one arm is missing does not count."""
     write_cell(tmp_path, "curl", "sequential", 0, 10)
     write_cell(tmp_path, "curl", "joint", 0, 20)
@@ -32,7 +32,7 @@ def test_table_pairs_the_arms_seed_by_seed(tmp_path: Path) -> None:
     assert numbers == {"0": [10, 20] * 3, "3": [30, 60] * 3, "mean": [20, 40] * 3}
 
 
-def test_policies_are_compared_by_the_error_they_meet(tmp_path: Path) -> None:
+def test_policies_compare_by_error_they_meet(tmp_path: Path) -> None:
     """Errors over the random policy's, counted over all evaluations, and the time at the end of each run."""
     for seed in (0, 1):
         write_cell(tmp_path, "rae", "joint", seed, 20)
@@ -40,7 +40,7 @@ def test_policies_are_compared_by_the_error_they_meet(tmp_path: Path) -> None:
     assert line == "| rae | joint | 2.00 | 0.50 | 18 of 18 | 8 |"
 
 
-def test_cells_are_run_once_and_only_with_their_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_run_once_with_same_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What exists is kept, what is missing is run, and other settings are refused before anything is run."""
     ran = []
 
@@ -61,11 +61,12 @@ def test_cells_are_run_once_and_only_with_their_settings(tmp_path: Path, monkeyp
     assert Image.open(tmp_path / "curves.png").width > 500
 
 
-def test_a_cell_trains_on_real_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cell_trains_on_real_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows of an actual run: returns of both policies, the training loss of the head and its measured error."""
     quick = dict(learning_starts=10, warmup_updates=0, batch_size=8)
     monkeypatch.setattr(update_modes, "SETTINGS", {**update_modes.SETTINGS, **quick})
     monkeypatch.setattr(update_modes, "EVALUATIONS", 1)
+    monkeypatch.setattr(update_modes, "EPISODES", 1)
     update_modes.run_cell(tmp_path / "seed0.csv", "rae", "joint", 0, 20)
     with (tmp_path / "seed0.csv").open(newline="") as file:
         (row,) = csv.DictReader(file)
