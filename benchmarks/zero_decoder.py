@@ -6,9 +6,10 @@
 
 Three of them: one that always draws the middle grey (zero, which is what an untrained autoencoder draws), one that
 always draws the best constant colour (its output bias has learned, and nothing else), and one that draws some frame of
-the episode, but another than the one that it sees. MuJoCo 3.12 changed how floors are drawn, so that numbers published before
-belong to other pictures of the same tasks. This file needs dm-control and NumPy alone and runs where MuJoCo is older
-than sb3_cure takes. It adds its rows to ``zero_decoder.csv``; ``python -m benchmarks.yardsticks`` then shows them.
+the episode, but another than the one that it sees. MuJoCo 3.12 changed how floors are drawn, so that numbers published
+before belong to other pictures of the same tasks. This file needs dm-control and NumPy alone and runs where MuJoCo is
+older than sb3_cure takes. It adds its rows to ``zero_decoder.csv``; ``python -m benchmarks.yardsticks`` then shows
+them.
 """
 
 import argparse
@@ -70,7 +71,7 @@ def constant_errors(drawn: np.ndarray) -> dict[str, np.ndarray]:
     return {
         "zero": np.square(drawn).mean(axis=(1, 2, 3)),
         "constant colour": squares,
-        "any frame": pairs[~np.eye(len(drawn), dtype=bool)],
+        "another frame": pairs[~np.eye(len(drawn), dtype=bool)],
     }
 
 
