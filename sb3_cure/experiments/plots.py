@@ -1,25 +1,69 @@
-"""Figures of the experiments. Each function takes numbers and writes one picture."""
+"""Figures of the experiments, in one style. Each function takes numbers and writes one PNG of 256 colours."""
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, TypeAlias
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
+from PIL import Image
 
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
 from sb3_cure.evaluation import Uncomfortable, binned_errors
 
+STYLE = Path(__file__).parent / "templates" / "plots.mplstyle"
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
 #: Where colours are taken by arms
 LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
+_ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
+_ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
+
+#: Arm, actor, ends of the error bar (None: none), the values whose mean is shown (one per seed), and what is written
+#: above
+Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
+PathOrFile: TypeAlias = Path | IO[bytes]
+
+
+#: Decorates what draws
+in_style = style.context(STYLE)
+
+
+def save(figure: Figure, path: PathOrFile, dpi: int = 150) -> None:
+    """
+    :param figure: A figure
+    :param path: File to write: 256 colours take a quarter of the room
+    :param dpi: Pixels per inch
+    """
+    file = io.BytesIO()
+    figure.savefig(file, dpi=dpi)
+    with Image.open(file) as image:
+        few = image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+        few.save(path, "PNG", optimize=True)
+
+
+def _plain(text: str) -> str:
+    """Names are no formulas: matplotlib reads between dollar signs, and hides what begins with an underscore."""
+    return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+# Curves
+
+
+def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
+    """
+    :param methods: Arms of an experiment
+    :param baseline: The one that the others are compared with: grey
+    :return: A colour for each; after thirteen of them they repeat
+    """
+    names = [method for method in methods if method != baseline]
+    return {baseline: "#555555", **{name: _ARM_COLORS[index % 13] for index, name in enumerate(names)}}
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
@@ -30,36 +74,257 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     :param random_return: Mean return of uniformly random actions
     :param title: Title of the figure
     """
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    steps = [row["environment_steps"] for row in rows]
-    for actor in ("task", "curious"):
-        axes.plot(steps, [row[f"{actor}_return"] for row in rows], "o-", color=COLORS[actor], label=f"{actor} policy")
-    axes.axhline(random_return, color=COLORS["random"], linestyle="--", label="random policy")
-    axes.set(xlabel="environment steps", ylabel="return of an episode (deterministic actions)")
-    axes.set(title=title, ylim=(0, None))
-    axes.grid(alpha=0.3)
-    axes.legend()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    steps = np.array([row["environment_steps"] for row in rows])
+    returns = {actor: np.array([[row[f"{actor}_return"] for row in rows]]) for actor in ("task", "curious")}
+    returns["random"] = np.full((1, len(rows)), random_return)
+    curves = {f"{actor} policy": (steps, values) for actor, values in returns.items()}
+    colors = {f"{actor} policy": COLORS[actor] for actor in returns}
+    learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
+
+
+def learning_curves(
+    path: PathOrFile,
+    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool = False,
+) -> None:
+    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
+
+    :param path: File to write
+    :param curves: By task and arm: environment steps [n] and values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    """
+    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
+    policy_curves(path, of_task, colors, ylabel, logarithmic)
+
+
+@in_style
+def policy_curves(
+    path: PathOrFile,
+    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool,
+    actors: Sequence[str] = (),
+) -> None:
+    """As ``learning_curves``, with arms by colour and policies by line style.
+
+    :param path: File to write
+    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    :param actors: Policies that the legend names
+    """
+    figure, panels = _panels(len(curves), height=2.9)
+    seeds: dict[str, set[int]] = {}
+    for axes, (task, lines) in zip(panels, curves.items(), strict=True):
+        for (arm, actor), (steps, values) in lines.items():
+            seeds.setdefault(arm, set()).add(len(values))
+            mean = values.mean(axis=0)
+            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor])
+            if len(values) > 1:
+                std = values.std(axis=0, ddof=1)
+                low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
+                axes.fill_between(steps, low, mean + std, color=colors[arm], alpha=0.18, linewidth=0)
+        axes.set(title=_plain(task), xlabel="environment steps", ylabel=ylabel)
+        axes.set_yscale("log" if logarithmic else "linear")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    handles = {}
+    for arm, counts in seeds.items():
+        n = " to ".join(map(str, sorted({min(counts), max(counts)})))
+        handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], color=colors[arm])
+    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
+    _legend(figure, handles)
+    save(figure, path)
+
+
+@in_style
+def paired_differences(
+    path: PathOrFile,
+    rows: Sequence[tuple[str, str, np.ndarray, tuple[float, float | None, float | None]]],
+    colors: Mapping[str, str],
+    xlabel: str,
+) -> None:
+    """Differences from the baseline: one line each, with every pair of seeds as a dot.
+
+    :param path: File to write
+    :param rows: Arm, label of the line, differences by pair, and their mean with its interval
+    :param colors: By arm
+    :param xlabel: What the differences are of
+    """
+    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(rows)))
+    axes = figure.subplots()
+    axes.axvline(0, color="#333333", linewidth=1)
+    for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
+        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5, markersize=3.5)
+        if low is not None and high is not None:
+            axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
+        axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
+    axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
+    axes.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
+    # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
+    reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
+    axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
+    save(figure, path)
+
+
+@in_style
+def aggregate_scores(
+    path: PathOrFile,
+    iqm: Mapping[str, tuple[float, float, float]],
+    taus: np.ndarray,
+    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    colors: Mapping[str, str],
+) -> None:
+    """Interquartile means (left) and performance profiles (right) with their intervals.
+
+    :param path: File to write
+    :param iqm: By arm: value, low, high
+    :param taus: Scores at which the profiles are read, [n]
+    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
+    :param colors: By arm
+    """
+    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))))
+    left, right = figure.subplots(1, 2)
+    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
+        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
+        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
+    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
+    left.invert_yaxis()
+    ends = [end for _, *ends in iqm.values() for end in ends]
+    pad = 0.06 * (max(ends) - min(ends)) or 0.05
+    left.set(xlabel="interquartile mean of the final score", title="IQM", xlim=(min(ends) - pad, max(ends) + pad))
+    for arm, (share, lower, upper) in profiles.items():
+        right.step(taus, share, where="post", color=colors[arm], label=_plain(arm))
+        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
+    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
+    save(figure, path)
+
+
+# Bars
 
 
 def srl_error_bars(path: Path, errors: Mapping[str, np.ndarray], title: str) -> None:
-    """SRL error per step met by different policies: mean, with minimum and maximum as error bars (paper, Figure 2).
+    """SRL error per step met by different policies: mean, with minimum and maximum (paper, Figure 2).
 
     :param path: File to write
     :param errors: Errors of all steps, by policy
     :param title: Title of the figure
     """
-    figure, axes = plt.subplots(figsize=(4.5, 4), layout="constrained")
-    for position, (actor, values) in enumerate(errors.items()):
-        mean = values.mean()
-        spread = [[mean - values.min()], [values.max() - mean]]
-        axes.bar(position, mean, 0.6, yerr=spread, capsize=6, color=COLORS[actor], label=actor)
-    axes.set_xticks(range(len(errors)), list(errors))
-    axes.set(ylabel="SRL error per step (mean, min, max)", title=title, ylim=(0, None))
-    axes.grid(axis="y", alpha=0.3)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    bars = [
+        (actor, actor, (values.min(), values.max()), values.mean(keepdims=True), f"mean {values.mean():.2g}")
+        for actor, values in errors.items()
+    ]
+    visitation_bars(path, {title: bars}, {})
+
+
+def visitation_bars(
+    path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
+) -> None:
+    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
+
+    :param path: File to write
+    :param panels: By title: its bars
+    :param lines: By title: values to compare with, by name
+    """
+    actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
+
+
+@in_style
+def actor_bars(
+    path: PathOrFile,
+    panels: Mapping[str, Sequence[Bar]],
+    ylabel: str,
+    lines: Mapping[str, Mapping[str, float]] | None = None,
+) -> None:
+    """Policies in groups of arms, coloured by actor.
+
+    A bar is as high as the mean; with lines across to compare with the axis is logarithmic, where bars have no foot, so
+    that a mark shows the mean.
+
+    :param path: File to write
+    :param panels: By title: its bars
+    :param ylabel: What is measured
+    :param lines: By title: values to compare with, by name; None: none, and a linear axis
+    """
+    figure, places = _panels(len(panels), height=3.3)
+    for axes, (title, rows) in zip(places, panels.items(), strict=True):
+        arms = list(dict.fromkeys(arm for arm, *_ in rows))
+        ticks, position = [], 0.0
+        for arm in arms:
+            group = [row for row in rows if row[0] == arm]
+            ticks.append(position + (len(group) - 1) / 2)
+            for _, actor, ends, values, text in group:
+                color, mean = COLORS.get(actor, "#2ca02c"), float(values.mean())
+                low, high = ends or (mean, float(values.max()))
+                if lines is None:
+                    axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=_plain(actor))
+                else:
+                    axes.plot([position, position], [low, high], color=color, linewidth=1.2)
+                    axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
+                axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
+                note = axes.annotate(text, (position, high), (0, 3), textcoords="offset points", fontsize=7)
+                note.set(ha="center", va="bottom")
+                position += 1
+            position += 0.7
+        axes.set_xticks(ticks, [_plain(arm) for arm in arms], rotation=15 if len(arms) > 3 else 0)
+        axes.set(title=_plain(title), ylabel=ylabel, xlim=(-0.7, position - 1))
+        for (label, value), dashes in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
+            axes.axhline(value, color="#333333", linewidth=1, linestyle=dashes, label=_plain(label))
+        means = [float(values.mean()) for *_, values, _ in rows]
+        if lines is not None and max(means) > 0:
+            axes.set_yscale("log")
+            # Of contrastive errors the lowest is often zero: keep the means in sight.
+            least = min(mean for mean in means if mean > 0)
+            axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
+        (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
+        axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
+    _shared_legend(figure, places)
+    save(figure, path)
+
+
+def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with so many axes, at most three in a row, as wide as a page."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=({1: 6.5, 2: 9.0, 3: 11.0}[columns], height * rows + 0.5))
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, grid[:count]
+
+
+def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """What any panel shows, once, below all of them."""
+    shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    _legend(figure, shown)
+
+
+def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
+    columns = max(1, min(len(handles), int(figure.get_figwidth() // 2.4)))
+    figure.set_figheight(figure.get_figheight() + 0.21 * max(-(-len(handles) // columns) - 2, 0))  # two have room
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
+# Images
+
+
+def _picture(image: np.ndarray) -> np.ndarray:
+    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
+    return image[..., 0] if image.shape[-1] == 1 else image
+
+
+def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
+    """Images [C, H, W] of one or three channels, side by side."""
+    strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
+    axes.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
 
 
 def reconstruction_grid(path: Path, strip: np.ndarray, title: str) -> None:
@@ -69,15 +334,8 @@ def reconstruction_grid(path: Path, strip: np.ndarray, title: str) -> None:
     :param strip: uint8 image (C, 2 * H, columns * W) as of ``sb3_cure.metrics.reconstruction_strip``
     :param title: Title of the figure
     """
-    image = strip.transpose(1, 2, 0)
-    height, width = image.shape[:2]
-    figure, axes = plt.subplots(figsize=(10, 10 * height / width + 0.8), layout="constrained")
-    axes.imshow(image.squeeze(), cmap="gray" if image.shape[2] == 1 else None, interpolation="nearest")
-    axes.set_yticks([height * 0.25, height * 0.75], ["observed", "reconstructed"], rotation=90, va="center")
-    axes.set_xticks([])
-    axes.set_title(title)
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    rows = np.split(strip, 2, axis=1)
+    _draw_rows(path, dict(zip(("observed", "reconstructed"), rows, strict=True)), title)
 
 
 def reconstructions_over_training(
@@ -90,24 +348,27 @@ def reconstructions_over_training(
     :param rows: Agent steps of training, and what is drawn then of the same shape
     :param title: Title of the figure
     """
-    errors = [np.square((drawn.astype(np.float32) - observed) / 255).mean() for _, drawn in rows]
-    labels = ["observed"]
-    labels += [f"{steps:,} agent steps\nMSE {error:.2g}" for (steps, _), error in zip(rows, errors, strict=True)]
-    pictures = [observed, *(drawn for _, drawn in rows)]
-    n_rows, columns = len(pictures), len(observed)
-    height = 1.1 * n_rows * observed.shape[2] / observed.shape[3]
-    dense = ConstrainedLayoutEngine(h_pad=0.02, hspace=0)
-    figure = Figure(figsize=(1.1 * columns + 1.2, height + 0.5), layout=dense)
-    axes = figure.subplots(n_rows, 1, squeeze=False)[:, 0]
-    for place, label, images in zip(axes, labels, pictures, strict=True):
-        strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
-        place.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-        place.set_xticks([])
-        place.set_yticks([strip.shape[0] / 2], [label])
-    axes[0].set_title(title)
-    figure.savefig(path, dpi=120, bbox_inches="tight")
+    strips = {"observed": observed}
+    for steps, drawn in rows:
+        error = np.square((drawn.astype(np.float32) - observed) / 255).mean()
+        strips[f"{steps:,} agent steps\nMSE {error:.2g}"] = drawn
+    _draw_rows(path, {label: np.concatenate(list(images), axis=-1) for label, images in strips.items()}, title)
 
 
+@in_style
+def _draw_rows(path: Path, strips: Mapping[str, np.ndarray], title: str) -> None:
+    """Pictures [C, H, W] of the same size below each other, each with its label."""
+    first, width = next(iter(strips.values())), 10.0
+    figure = Figure(figsize=(width, 0.4 + len(strips) * (width - 1.2) * first.shape[1] / first.shape[2]))
+    figure.get_layout_engine().set(h_pad=0.02, hspace=0)  # type: ignore[union-attr, call-arg]
+    for axes, (label, strip) in zip(np.atleast_1d(figure.subplots(len(strips))), strips.items(), strict=True):
+        _show(axes, [strip])
+        axes.set_yticks([strip.shape[1] / 2], [label])
+    figure.suptitle(title)
+    save(figure, path, 120)
+
+
+@in_style
 def uncomfortable_frames(
     path: Path, found: Uncomfortable, frame_stack: int, title: str, drawn: np.ndarray | None = None
 ) -> None:
@@ -127,25 +388,24 @@ def uncomfortable_frames(
             "each frame takes 3, or 1 if it is grey: give the environment's frame_stack."
         )
     pairs = [found.observations] if drawn is None else [found.observations, drawn]
-    n_frames = len(found.errors)
-    columns = min(n_frames, 8 if drawn is None else 4)
-    n_rows = -(-n_frames // columns)
-    figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5), layout="constrained")
+    columns = min(len(found.errors), 8 if drawn is None else 4)
+    n_rows = -(-len(found.errors) // columns)
+    figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5))
     grid = figure.subplots(n_rows, columns, squeeze=False).flat
     for place in grid:
         place.set_axis_off()
+    gap = np.full((channels, found.observations.shape[2], 1), 255, np.uint8)
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
-        first, *second = (np.moveaxis(images[index, -channels:], 0, -1) for images in pairs)
-        gap = np.full((len(first), 1, channels), 255, np.uint8)
-        image = np.concatenate([first, *(part for each in second for part in (gap, each))], axis=1)
-        grid[index].imshow(_picture(image), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+        frames = [images[index, -channels:] for images in pairs]
+        _show(grid[index], [frames[0], *(part for each in frames[1:] for part in (gap, each))])
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
     note += f", and how many times the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
     figure.suptitle(f"{title}\n{note}", fontsize=10, wrap=True)
-    figure.savefig(path, dpi=120)
+    save(figure, path, 120)
 
 
+@in_style
 def curiosity_map(
     path: Path,
     visits: Mapping[str, tuple[np.ndarray, np.ndarray]],
@@ -185,7 +445,7 @@ def curiosity_map(
     norms: list[Normalize] = [LogNorm(1, most)]
     if len(means):
         norms.append(PowerNorm(0.5, means.min(), means.max()))  # most errors are far below the highest
-    figure = Figure(figsize=(4.6 * len(kinds), 3.6 * len(visits) + 0.4), layout="constrained")
+    figure = Figure(figsize=(4.6 * len(kinds), 3.6 * len(visits) + 0.4))
     grid = figure.subplots(len(visits), len(kinds), squeeze=False, sharex=True, sharey=True)
     meshes = []
     for row, (actor, (counts, mean)) in zip(grid, binned.items(), strict=True):
@@ -194,26 +454,17 @@ def curiosity_map(
             meshes.append(place.pcolormesh(*edges, shown, norm=norm, cmap=map_name))
             place.set_facecolor("0.92")
             place.set_title(f"{actor} policy", color=COLORS[actor])
+            place.grid(False)
             _name_axes(place, coordinates, both, edges)
     for kind, column, mesh in zip(kinds, grid.T, meshes, strict=False):  # the meshes of the first row
         bar = figure.colorbar(mesh, ax=list(column), label=kind, aspect=20 * len(column), pad=0.02)
         if kind == kinds[0]:
-            ticks = _counts_up_to(most)
+            ticks = [count * 10**power for power in range(9) for count in (1, 2, 5) if count * 10**power <= most]
             bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
             bar.ax.minorticks_off()
     n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
-    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", fontsize=11, wrap=True)
-    figure.savefig(path, dpi=120)
-
-
-def _picture(image: np.ndarray) -> np.ndarray:
-    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
-    return image[..., 0] if image.shape[-1] == 1 else image
-
-
-def _counts_up_to(highest: float) -> list[int]:
-    """1, 2, 5, 10, 20, ... for the colours of counts."""
-    return [count * 10**power for power in range(9) for count in (1, 2, 5) if count * 10**power <= highest]
+    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", wrap=True)
+    save(figure, path, 120)
 
 
 def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
@@ -234,307 +485,3 @@ def _name_axes(
         axis.set_tick_params(labelbottom=True, labelleft=True)
         if ends[-1] == np.pi:
             axis.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], ["-π", "-π/2", "0", "π/2", "π"])
-
-
-def update_modes(
-    path: Path,
-    cells: Mapping[tuple[str, str], Mapping[int, Sequence[Mapping[str, float]]]],
-    measures: Mapping[str, str],
-) -> None:
-    """Curves of both update modes: one row per head, one column per measure; thin lines are seeds, thick ones means.
-
-    :param path: File to write
-    :param cells: Rows by (head, mode), by seed
-    :param measures: Column of the rows -> label of the axis
-    """
-    heads = list(dict.fromkeys(head for head, _ in cells))
-    size = (4 * len(measures), 3.2 * len(heads))
-    figure, grid = plt.subplots(len(heads), len(measures), figsize=size, layout="constrained", squeeze=False)
-    colors = {"sequential": "#1f77b4", "joint": "#ff7f0e"}
-    for (head, mode), seeds in cells.items():
-        for axes, (column, label) in zip(grid[heads.index(head)], measures.items(), strict=True):
-            for rows in seeds.values():
-                steps = [row["environment_steps"] for row in rows]
-                axes.plot(steps, [row[column] for row in rows], color=colors[mode], alpha=0.3, linewidth=0.8)
-            mean = np.mean([[row[column] for row in rows] for rows in seeds.values()], axis=0)
-            axes.plot(steps, mean, color=colors[mode], linewidth=2, label=f"{mode} (n={len(seeds)})")
-            axes.set(xlabel="environment steps", ylabel=label, title=head)
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.grid(alpha=0.3)
-    for axes in grid.flat:
-        axes.set_ylim(0, None)  # last: it stops the upper limit from following the curves
-    grid[0, 0].legend()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-# Figures of reports
-
-
-def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
-    """
-    :param methods: Arms of an experiment
-    :param baseline: The one that the others are compared with: grey
-    :return: A colour for each; after thirteen of them they repeat
-    """
-    others = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
-    others += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
-    names = [method for method in methods if method != baseline]
-    return {baseline: "#555555", **{name: others[index % len(others)] for index, name in enumerate(names)}}
-
-
-def learning_curves(
-    path: Path | IO[bytes],
-    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-    logarithmic: bool = False,
-) -> None:
-    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
-
-    :param path: File to write
-    :param curves: By task and arm: environment steps [n] and values [seeds, n]
-    :param colors: By arm
-    :param ylabel: What the values are
-    :param logarithmic: Whether the values have a logarithmic axis
-    """
-    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
-    _draw_curves(path, of_task, colors, ylabel, logarithmic)
-
-
-def srl_error_curves(
-    path: Path | IO[bytes],
-    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-) -> None:
-    """SRL error that policies meet, as ``learning_curves``: arms by colour, policies by line style.
-
-    :param path: File to write
-    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
-    :param colors: By arm
-    :param ylabel: What the values are
-    """
-    there = {actor for policies in curves.values() for _, actor in policies}
-    _draw_curves(path, curves, colors, ylabel, logarithmic=True, actors=[each for each in LINE_STYLES if each in there])
-
-
-def _draw_curves(
-    path: Path | IO[bytes],
-    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-    logarithmic: bool,
-    actors: Sequence[str] = (),
-) -> None:
-    """One panel per task, lines by arm and policy; the legend names the arms and the policies asked for."""
-    figure, panels = _panels(len(curves), height=2.9)
-    for axes, (task, lines) in zip(panels, curves.items(), strict=True):
-        for (arm, actor), (steps, values) in lines.items():
-            mean = values.mean(axis=0)
-            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor], linewidth=1.8)
-            if len(values) > 1:
-                std = values.std(axis=0, ddof=1)
-                low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
-                axes.fill_between(steps, low, mean + std, color=colors[arm], alpha=0.18, linewidth=0)
-        axes.set(title=_plain(task), xlabel="environment steps", ylabel=ylabel)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        if logarithmic:
-            axes.set_yscale("log")
-        _tidy(axes)
-    seeds: dict[str, set[int]] = {}
-    for lines in curves.values():
-        for (arm, _), (_, values) in lines.items():
-            seeds.setdefault(arm, set()).add(len(values))
-    labels = {arm: " to ".join(map(str, sorted({min(each), max(each)}))) for arm, each in seeds.items()}
-    handles = {
-        f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})": Line2D([], [], color=colors[arm], linewidth=1.8)
-        for arm, n in labels.items()
-    }
-    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
-    _legend(figure, handles)
-    figure.savefig(path, dpi=150)
-
-
-def paired_differences(
-    path: Path | IO[bytes],
-    rows: Sequence[tuple[str, str, np.ndarray, tuple[float, float | None, float | None]]],
-    colors: Mapping[str, str],
-    xlabel: str,
-) -> None:
-    """Differences from the baseline: one line each, with every pair of seeds as a dot.
-
-    :param path: File to write
-    :param rows: Arm, label of the line, differences by pair, and their mean with its interval
-    :param colors: By arm
-    :param xlabel: What the differences are of
-    """
-    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(rows)), layout="constrained")
-    axes = figure.subplots()
-    axes.axvline(0, color="#333333", linewidth=1)
-    for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
-        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5, markersize=3.5)
-        if low is not None and high is not None:
-            axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
-        axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
-    axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_xlabel(xlabel)
-    _tidy(axes)
-    # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
-    reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
-    left, right = axes.get_xlim()
-    axes.set_xlim(max(left, -reach), min(right, reach))
-    figure.savefig(path, dpi=150)
-
-
-def aggregate_scores(
-    path: Path | IO[bytes],
-    iqm: Mapping[str, tuple[float, float, float]],
-    taus: np.ndarray,
-    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
-    colors: Mapping[str, str],
-) -> None:
-    """Interquartile means (left) and performance profiles (right) with their intervals.
-
-    :param path: File to write
-    :param iqm: By arm: value, low, high
-    :param taus: Scores at which the profiles are read, [n]
-    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
-    :param colors: By arm
-    """
-    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
-        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
-        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
-    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
-    left.invert_yaxis()
-    ends = [end for _, *ends in iqm.values() for end in ends]
-    pad = 0.06 * (max(ends) - min(ends)) or 0.05
-    left.set_xlim(min(ends) - pad, max(ends) + pad)
-    left.set(xlabel="interquartile mean of the final score", title="IQM")
-    for arm, (share, lower, upper) in profiles.items():
-        right.step(taus, share, where="post", color=colors[arm], linewidth=1.8, label=_plain(arm))
-        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
-    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
-    for axes in (left, right):
-        _tidy(axes)
-    figure.savefig(path, dpi=150)
-
-
-def visitation_bars(
-    path: Path | IO[bytes],
-    panels: Mapping[str, Sequence[tuple[str, str, tuple[float, float], np.ndarray, str]]],
-    lines: Mapping[str, Mapping[str, float]],
-) -> None:
-    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
-
-    :param path: File to write
-    :param panels: By title: arm, actor, minimum and maximum, the values whose mean is shown (one per seed), and what is
-        written above, of each policy
-    :param lines: By title: values to compare with, by name
-    """
-    _actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
-
-
-def coverage_bars(
-    path: Path | IO[bytes], panels: Mapping[str, Sequence[tuple[str, str, np.ndarray, str]]], ylabel: str
-) -> None:
-    """How much of the true state space each policy visits: mean over seeds, and each seed as a dot.
-
-    :param path: File to write
-    :param panels: By title: arm, actor, the measure by seed, and what is written above, of each bar
-    :param ylabel: What is measured
-    """
-    bars = {
-        title: [(arm, actor, None, values, text) for arm, actor, values, text in rows] for title, rows in panels.items()
-    }
-    _actor_bars(path, bars, ylabel)
-
-
-def _actor_bars(
-    path: Path | IO[bytes],
-    panels: Mapping[str, Sequence[tuple[str, str, tuple[float, float] | None, np.ndarray, str]]],
-    ylabel: str,
-    lines: Mapping[str, Mapping[str, float]] | None = None,
-) -> None:
-    """Policies in groups of arms, coloured by actor: arm, actor, ends of the error bar, values by seed, text above.
-
-    A bar is as high as the mean; with lines across to compare with the axis is logarithmic, where bars have no foot, so
-    that a mark shows the mean.
-    """
-    figure, places = _panels(len(panels), height=3.3)
-    for axes, (title, rows) in zip(places, panels.items(), strict=True):
-        arms = list(dict.fromkeys(arm for arm, *_ in rows))
-        ticks, position = [], 0.0
-        for arm in arms:
-            group = [row for row in rows if row[0] == arm]
-            ticks.append(position + (len(group) - 1) / 2)
-            for _, actor, ends, values, text in group:
-                color, mean = COLORS.get(actor, "#2ca02c"), float(values.mean())
-                low, high = ends or (mean, float(values.max()))
-                if lines is None:
-                    axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=_plain(actor))
-                else:
-                    axes.plot([position, position], [low, high], color=color, linewidth=1.2)
-                    axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
-                axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
-                axes.annotate(
-                    text, (position, high), (0, 3), textcoords="offset points", ha="center", va="bottom", fontsize=6.5
-                )
-                position += 1
-            position += 0.7
-        axes.set_xlim(-0.7, position - 1)
-        axes.set_xticks(ticks, [_plain(arm) for arm in arms], fontsize=8.5)
-        if len(arms) > 2:
-            axes.tick_params(axis="x", rotation=15)
-        axes.set(title=_plain(title), ylabel=ylabel)
-        for (label, value), style in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
-            axes.axhline(value, color="#333333", linewidth=1, linestyle=style, label=_plain(label))
-        if lines is not None and any((values > 0).any() for *_, values, _ in rows):
-            axes.set_yscale("log")
-        bottom, top = axes.get_ylim()  # room for the texts
-        axes.set_ylim(
-            top=top * (top / bottom) ** 0.15 if axes.get_yscale() == "log" else bottom + 1.15 * (top - bottom)
-        )
-        _tidy(axes)
-    _shared_legend(figure, places)
-    figure.savefig(path, dpi=150)
-
-
-def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with so many axes, at most three in a row, as wide as a page."""
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    width = {1: 6.5, 2: 9.0, 3: 11.0}[columns]
-    figure = Figure(figsize=(width, height * rows + 0.5), layout="constrained")
-    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes in grid[count:]:
-        axes.set_axis_off()
-    return figure, grid[:count]
-
-
-def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """What any panel shows, once, below all of them."""
-    shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    _legend(figure, shown)
-
-
-def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
-    if handles:
-        columns = min(len(handles), int(figure.get_figwidth() // 2.4))
-        rows = -(-len(handles) // columns)
-        figure.set_figheight(figure.get_figheight() + 0.21 * max(rows - 2, 0))  # `_panels` leaves room for two
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, frameon=False)
-
-
-def _tidy(axes: Axes) -> None:
-    axes.grid(alpha=0.25)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _plain(text: str) -> str:
-    """Names are no formulas: matplotlib reads between dollar signs, and hides what begins with an underscore."""
-    return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")

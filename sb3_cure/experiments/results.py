@@ -1,15 +1,16 @@
-"""Reads the folders that experiments wrote, and checks what is in them."""
+"""Reads the folders that experiments wrote, and refuses what would make a wrong number."""
 
 import csv
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from sb3_cure.experiments.files import Row, read_rows
+from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import comparable, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
@@ -18,19 +19,6 @@ _AGAIN = "remove the cell's folder and run the grid again"
 
 class ResultsError(ValueError):
     """Results that cannot be read; the message is one sentence that names the file."""
-
-
-@dataclass(frozen=True)
-class Visit:
-    """SRL error of one episode under one head (a row of ``visitation.csv``)."""
-
-    actor: str
-    head: str
-    episode: int
-    error_min: float
-    error_mean: float
-    error_max: float
-    total_reward: float
 
 
 @dataclass(frozen=True)
@@ -45,8 +33,8 @@ class CellResult:
         only cells that are done have what follows, and enter statistics
     :param config: ``config.json``
     :param run: ``run.json``
-    :param evaluations: Columns of ``eval.csv`` (missing values are nan); empty if there is none
-    :param visitation: Rows of ``visitation.csv``
+    :param evaluations: ``eval.csv`` (missing values are nan)
+    :param visitation: ``visitation.csv``
     """
 
     task: str
@@ -56,8 +44,8 @@ class CellResult:
     status: str
     config: dict[str, Any] = field(default_factory=dict)
     run: dict[str, Any] = field(default_factory=dict)
-    evaluations: dict[str, np.ndarray] = field(default_factory=dict)
-    visitation: tuple[Visit, ...] = ()
+    evaluations: pd.DataFrame = field(default_factory=pd.DataFrame)
+    visitation: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @property
     def done(self) -> bool:
@@ -69,7 +57,7 @@ class CellResult:
         arguments = self.config.get("arguments", {})
         if not str(self.config.get("task", "")).startswith("dmc_pixels/"):
             return False
-        crops = arguments.get("srl_kwargs", {}).get("augmentation") == "crop"
+        crops = "crop" in (arguments.get("augmentation"), arguments.get("srl_kwargs", {}).get("augmentation"))
         usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
         return {**usual, **self.config.get("env_kwargs", {})} == usual
 
@@ -78,10 +66,10 @@ class CellResult:
         :param column: A column of ``eval.csv``
         :return: Environment steps and values where there are any, [n] each
         """
-        steps = self.evaluations.get("environment_steps", np.zeros(0))
-        values = self.evaluations.get(column, np.full(len(steps), np.nan))
-        there = np.isfinite(values)
-        return steps[there], values[there]
+        if column not in self.evaluations:
+            return np.zeros(0), np.zeros(0)
+        known = self.evaluations[np.isfinite(self.evaluations[column])]
+        return known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
 
     def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         """
@@ -96,14 +84,9 @@ class CellResult:
             with np.load(path, allow_pickle=False) as file:
                 names = [name for name in file.files if name.endswith("_states")]
                 found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
-                units = tuple(map(str, file["state_units"])) if found else ()
+                return found, tuple(map(str, file["state_units"])) if found else ()
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
             raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
-        for actor, states in found.items():
-            if states.ndim != 2 or not np.isfinite(states).all() or states.shape[1] != len(units):
-                shape = f"{actor}_states of shape {states.shape}, and units {units}"
-                raise ResultsError(f"{path} has {shape}, but finite [n, d] and d units are needed: {_AGAIN}.")
-        return found, units
 
 
 @dataclass(frozen=True)
@@ -113,25 +96,19 @@ class Experiment:
     :param name: Its folder below the one that was read (``"500k/curves"``), or its own name
     :param folder: Where it lies
     :param grid: ``grid.json``
+    :param kind: ``"curves"``, ``"visitation"`` or ``"pretraining"``
+    :param budget: Environment steps of each cell
+    :param baseline: The arm that the others are compared with
     :param cells: By (task, method, seed), in the grid's order; cells on disk that the grid does not name come last
     """
 
     name: str
     folder: Path
     grid: dict[str, Any]
+    kind: str
+    budget: int
+    baseline: str
     cells: dict[tuple[str, str, int], CellResult]
-
-    @property
-    def kind(self) -> str:
-        return str(self.grid["kind"])
-
-    @property
-    def budget(self) -> int:
-        return int(self.grid["budget"])
-
-    @property
-    def baseline(self) -> str:
-        return str(self.grid["baseline"])
 
     def baseline_of(self, method: str) -> str:
         """
@@ -154,21 +131,25 @@ class Experiment:
     def seeds(self) -> list[int]:
         return sorted({seed for _, _, seed in self.cells})
 
+    @property
+    def finished(self) -> list[CellResult]:
+        return [cell for cell in self.cells.values() if cell.done]
+
+    def of_arm(self, task: str, method: str) -> dict[int, CellResult]:
+        """
+        :return: The cells of an arm on a task, by seed
+        """
+        found = {seed: cell for (at, arm, seed), cell in self.cells.items() if (at, arm) == (task, method)}
+        return dict(sorted(found.items()))
+
     def done(self, task: str, method: str) -> dict[int, CellResult]:
         """
         :return: The finished cells of an arm on a task, by seed
         """
-        return {
-            seed: cell
-            for (at, arm, seed), cell in sorted(self.cells.items(), key=lambda item: item[0][2])
-            if (at, arm) == (task, method) and cell.done
-        }
+        return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}
 
     def has_unlike_heads(self, task: str) -> bool:
-        """Whether common heads of a task were not all made of the same cells: some are out of date.
-
-        :raises ResultsError: if a head's file cannot be read
-        """
+        """Whether common heads of a task were not all made of the same cells: some are out of date."""
         paths = sorted((self.folder / task / "common_heads").glob("*/common_head.json"))
         made_of = [_read_json(path, f"remove {path.parent} and run the grid again").get("cells") for path in paths]
         return any(cells != made_of[0] for cells in made_of)
@@ -176,17 +157,7 @@ class Experiment:
     @property
     def sees_published_pixels(self) -> bool:
         """Whether all of its finished cells do, see ``CellResult``."""
-        return all(cell.sees_published_pixels for cell in self.cells.values() if cell.done)
-
-    def state(self, task: str, method: str) -> dict[str, list[int]]:
-        """
-        :return: Seeds of an arm on a task by the status of their cells; those of the grid are "not run" at least
-        """
-        seeds: dict[str, list[int]] = {}
-        for (at, arm, seed), cell in sorted(self.cells.items(), key=lambda item: item[0][2]):
-            if (at, arm) == (task, method):
-                seeds.setdefault(cell.status, []).append(seed)
-        return seeds
+        return all(cell.sees_published_pixels for cell in self.finished)
 
 
 def read_results(folder: str | Path) -> list[Experiment]:
@@ -214,41 +185,32 @@ def read_results(folder: str | Path) -> list[Experiment]:
 
 
 def _read_experiment(path: Path, name: str | None = None) -> Experiment:
-    grid = _read_json(path, "remove it and run the grid again, which writes it")
-    for key, kind in (("experiment", str), ("kind", str), ("budget", int), ("baseline", str), ("tasks", list)):
-        if not isinstance(grid.get(key), kind) or isinstance(grid.get(key), bool):
-            raise ResultsError(f"{path} has {key} {grid.get(key)!r}, but it must be a {kind.__name__}: correct it.")
-    methods, seeds = grid.get("methods"), grid.get("seeds")
-    if not isinstance(methods, dict | list) or not methods:
-        raise ResultsError(f"{path} has methods {methods!r}, but they must be a mapping of arms: correct it.")
-    if isinstance(seeds, int):
-        seeds = list(range(seeds))
-    if not isinstance(seeds, list) or not all(isinstance(seed, int) for seed in seeds):
-        raise ResultsError(f"{path} has seeds {grid.get('seeds')!r}, but they must be a list of numbers: correct it.")
-    tasks = [short_name(str(task)) for task in grid["tasks"]]
+    grid, root = _read_json(path, "remove it and run the grid again, which writes it"), path.parent
+    try:
+        tasks, methods, seeds = [short_name(str(task)) for task in grid["tasks"]], list(grid["methods"]), grid["seeds"]
+        budget, own_name = int(grid["budget"]), str(grid["experiment"])
+        kind, baseline = str(grid["kind"]), str(grid["baseline"])
+        seeds = list(range(seeds)) if isinstance(seeds, int) else list(map(int, seeds))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"{path} describes no grid ({error!r}): remove it and run the grid again.") from None
     for part in (*tasks, *methods):
-        if part in ("", ".", "..") or any(mark in part for mark in "/\\\0"):
+        if Path(part).name != part:
             raise ResultsError(f"{path} names {part!r}, which cannot be the name of a folder: correct it.")
-    root = path.parent
     keys = [(task, method, seed) for task in tasks for method in methods for seed in seeds]
     for found in sorted(root.glob("*/*/seed*")):
         if (seed := seed_of(found)) is not None:
             keys.append((found.parent.parent.name, found.parent.name, seed))
-    cells = {
-        key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid["budget"], grid["kind"]) for key in keys
-    }
+    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, budget, kind) for key in keys}
     _check_alike(cells.values())
-    order = {task: index for index, task in reversed(list(enumerate(task for task, _, _ in cells)))}
-    in_order = dict(sorted(cells.items(), key=lambda item: order[item[0][0]]))
-    return Experiment(name or grid["experiment"], root, grid, in_order)
+    order = list(dict.fromkeys(task for task, _, _ in cells))
+    in_order = dict(sorted(cells.items(), key=lambda item: order.index(item[0][0])))
+    return Experiment(name or own_name, root, grid, kind, budget, baseline, in_order)
 
 
 def _check_alike(cells: Iterable[CellResult]) -> None:
     """Whether the seeds of an arm were run with the same settings, and all arms of a task evaluated alike."""
     first: dict[tuple[str, ...], CellResult] = {}
-    for cell in cells:
-        if not cell.done:
-            continue
+    for cell in (cell for cell in cells if cell.done):
         keys = (cell.config.keys() | {"arguments"}) - {"seed", "method"}
         for arm, compared in (((cell.task, cell.method), keys), ((cell.task,), {"eval_every", "eval_episodes"})):
             other = first.setdefault(arm, cell)
@@ -276,34 +238,32 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
     own_budget = config.get("budget", budget)
     if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
         return CellResult(task, method, seed, folder, f"other budget: {own_budget} steps", config, run)
-    if kind == "visitation":
-        needed = ["visitation.csv", "visits.npz"]
-    else:
-        needed = ["eval.csv"] if own_budget > 0 else []
+    needed = ["visitation.csv", "visits.npz"] if kind == "visitation" else ["eval.csv"] if own_budget > 0 else []
     for name in needed:
         if not (folder / name).exists():
             raise ResultsError(f"{folder} is marked as DONE, but has no {name}: {_AGAIN}.")
-    evaluations = _read_evaluations(folder / "eval.csv") if (folder / "eval.csv").exists() else {}
-    if "eval.csv" in needed or (own_budget > 0 and evaluations and len(evaluations["environment_steps"])):
+    evaluations = _read_table(folder / "eval.csv", "environment_steps", "return_mean")
+    if "eval.csv" in needed or (own_budget > 0 and len(evaluations)):
         _check_whole(folder / "eval.csv", evaluations, own_budget, config)
-    visits = _read_visitation(folder / "visitation.csv") if (folder / "visitation.csv").exists() else ()
+    visits = _read_table(folder / "visitation.csv", "error_min", "error_mean", "error_max", text=("actor", "head"))
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
 
 
-def _check_whole(path: Path, evaluations: dict[str, np.ndarray], budget: int, config: dict[str, Any]) -> None:
+def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, config: dict[str, Any]) -> None:
     """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return (but those of a
     curious agent alone)."""
-    steps, returns = evaluations["environment_steps"], evaluations["return_mean"]
+    steps, known = evaluations["environment_steps"].to_numpy(), np.isfinite(evaluations["return_mean"].to_numpy())
     # Evaluations are due at multiples of `eval_every`, and are made before the next rollout.
     every, train_freq = config.get("eval_every", np.inf), config.get("arguments", {}).get("train_freq", 1)
     rollout = (
         config.get("action_repeat", 1) * config.get("n_envs", 1) * train_freq if isinstance(train_freq, int) else np.inf
     )
     gaps = np.flatnonzero(np.diff(steps // every) > max(1, np.ceil(rollout / every)))
-    known = np.isfinite(returns)
     if not len(steps) or steps[0] > 0 or steps[-1] < budget:
         found = f"from {steps[0]:.0f} to {steps[-1]:.0f}" if len(steps) else "no"
         reason = f"has evaluations of {found} environment steps, but the cell was trained for {budget}"
+    elif not (np.diff(steps) > 0).all():
+        reason = "has environment_steps that do not grow from row to row"
     elif len(gaps):
         reason = f"has no evaluation between {steps[gaps[0]]:.0f} and {steps[gaps[0] + 1]:.0f} environment steps"
     elif not known.all() and (known.any() or config.get("arguments", {}).get("task", True)):
@@ -316,53 +276,23 @@ def _check_whole(path: Path, evaluations: dict[str, np.ndarray], budget: int, co
 def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ResultsError(f"{path} cannot be read ({error.strerror}): {fix}.") from None
-    except ValueError as error:
-        raise ResultsError(f"{path} is no JSON ({error}): {fix}.") from None
+    except (OSError, ValueError) as error:  # ValueError: also of text that is no UTF-8
+        raise ResultsError(f"{path} cannot be read ({error}): {fix}.") from None
     if not isinstance(content, dict):
-        raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: correct it.")
+        raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: {fix}.")
     return content
 
 
-def _read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
+def _read_table(path: Path, *numbers: str, text: tuple[str, ...] = ()) -> pd.DataFrame:
+    """A CSV file with at least these columns; an empty table if there is none."""
+    if not path.exists():
+        return pd.DataFrame(columns=[*numbers, *text])
     try:
-        return read_rows(path, needed)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = [
+            {name: np.nan if value == "" else value for name, value in row.items()}
+            for row in read_rows(path, (*numbers, *text))
+        ]
+        table = pd.DataFrame(rows or {name: [] for name in (*numbers, *text)})
+        return table.astype({name: float for name in table if name not in text})
+    except (OSError, ValueError, csv.Error) as error:
         raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
-    except ValueError as error:
-        raise ResultsError(f"{path} {error}: {_AGAIN}.") from None
-
-
-def _number(path: Path, line: int, column: str, value: Any) -> float:
-    if value == "":
-        return float("nan")
-    if isinstance(value, str):
-        raise ResultsError(f"{path} has {value!r} as {column} in line {line}, which is no number: correct it.")
-    return float(value)
-
-
-def _read_evaluations(path: Path) -> dict[str, np.ndarray]:
-    rows = _read_rows(path, ("environment_steps", "return_mean"))
-    columns = {
-        name: np.array([_number(path, line, name, row[name]) for line, row in enumerate(rows, 2)])
-        for name in (rows[0] if rows else ("environment_steps", "return_mean"))
-    }
-    steps = columns["environment_steps"]
-    if not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
-        raise ResultsError(f"{path} has environment_steps that do not grow from row to row: {_AGAIN}.")
-    return columns
-
-
-def _read_visitation(path: Path) -> tuple[Visit, ...]:
-    names = ("error_min", "error_mean", "error_max", "return")
-    rows = _read_rows(path, ("actor", "head", "episode", *names))
-    return tuple(
-        Visit(
-            row["actor"],
-            row["head"],
-            int(_number(path, line, "episode", row["episode"] or 0)),
-            *(_number(path, line, name, row[name]) for name in names),
-        )
-        for line, row in enumerate(rows, 2)
-    )

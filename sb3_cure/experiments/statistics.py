@@ -9,12 +9,13 @@ Intervals are 95 %. Two kinds are used, and named wherever they are shown:
   that were run, so that with 2-5 of them it covers the truth in about 50-85 % of cases instead of 95.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from rliable import library
 from scipy import integrate, stats
 
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError
@@ -164,25 +165,20 @@ def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
     :param draws: How many, with more than one group
     :return: The estimate; without an interval if every group has a single value
     """
-    groups = [np.sort(group) for group in groups if len(group)]  # sorted: sums do not depend on the seeds' order
-    if not groups:
-        return Estimate(float("nan"))
-    judged = [group for group in groups if len(group) > 1] or groups
-    means = np.array([group.mean() for group in judged])
-    value, n = float(means.mean()), sum(len(group) for group in judged)
-    if len(judged[0]) < 2:
-        return Estimate(value, n=n)
+    judged, estimate = _judged(groups)
+    if estimate.n == len(judged):  # one value each
+        return estimate
     errors = np.array([group.std(ddof=1) / np.sqrt(len(group)) for group in judged])
     if len(judged) == 1:
         reach = float(stats.t.ppf(0.975, len(judged[0]) - 1) * errors[0])
-        return Estimate(value, value - reach, value + reach, n)
-    rng = np.random.default_rng(0)
-    drawn = sum(
-        error * rng.standard_t(len(group) - 1, draws) for error, group in zip(errors, judged, strict=True)
-    ) / len(judged)
-    # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
-    reach = float(np.percentile(np.abs(drawn), 95))
-    return Estimate(value, value - reach, value + reach, n)
+    else:
+        rng = np.random.default_rng(0)
+        drawn = sum(
+            error * rng.standard_t(len(group) - 1, draws) for error, group in zip(errors, judged, strict=True)
+        ) / len(judged)
+        # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
+        reach = float(np.percentile(np.abs(drawn), 95))
+    return replace(estimate, low=estimate.value - reach, high=estimate.value + reach)
 
 
 def percentile_interval(groups: Sequence[np.ndarray], draws: int = 20_000) -> Estimate:
@@ -192,17 +188,34 @@ def percentile_interval(groups: Sequence[np.ndarray], draws: int = 20_000) -> Es
     :param draws: How many
     :return: The estimate
     """
-    groups = [np.sort(group) for group in groups if len(group)]
-    judged = [group for group in groups if len(group) > 1] or groups
-    if not judged:
-        return Estimate(float("nan"))
-    value, n = float(np.mean([group.mean() for group in judged])), sum(len(group) for group in judged)
-    if len(judged[0]) < 2:
-        return Estimate(value, n=n)
+    judged, estimate = _judged(groups)
+    if estimate.n == len(judged):
+        return estimate
     rng = np.random.default_rng(0)
     means = [group[rng.integers(len(group), size=(draws, len(group)))].mean(axis=1) for group in judged]
     low, high = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
-    return Estimate(value, float(low), float(high), n)
+    return replace(estimate, low=float(low), high=float(high))
+
+
+def _judged(groups: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Estimate]:
+    """The groups that count, and the mean of their means."""
+    groups = [np.sort(group) for group in groups if len(group)]  # sorted: sums do not depend on the seeds' order
+    judged = [group for group in groups if len(group) > 1] or groups
+    value = float(np.mean([group.mean() for group in judged])) if judged else float("nan")
+    return judged, Estimate(value, n=sum(len(group) for group in judged))
+
+
+def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Estimate:
+    """
+    :param ours: A positive number by seed
+    :param theirs: Another
+    :return: Geometric mean of ours / theirs over the seeds that have both, with the t interval of the logarithms; nan
+        without such a seed
+    """
+    ratios = [ours[seed] / theirs[seed] for seed in ours if ours[seed] > 0 and theirs.get(seed, 0) > 0]
+    found = t_interval([np.log(ratios)])
+    low, high = (None if end is None else float(np.exp(end)) for end in (found.low, found.high))
+    return Estimate(float(np.exp(found.value)), low, high, found.n)
 
 
 @dataclass(frozen=True)
@@ -256,33 +269,23 @@ def paired_differences(
     found = []
     for method in experiment.methods:
         other = experiment.baseline_of(method) if baseline is None else baseline
-        if method == other:
-            continue
         by_task, same = {}, {}
-        for task in experiment.tasks:
-            arm, base = arms[task, method], arms.get((task, other))
-            shared = [seed for seed in arm.seeds if base is not None and seed in base.seeds]
-            if base is not None and shared:
-                by_task[task], starts = (
-                    np.array([_by_seed(arm, name)[seed] - _by_seed(base, name)[seed] for seed in shared])
-                    for name in (measure, "starts")
-                )
-                same[task] = int((starts == 0).sum())
+        for task in experiment.tasks if (experiment.tasks[0], other) in arms and method != other else ():
+            ours, theirs = arms[task, method], arms[task, other]
+            _, mine, its = np.intersect1d(ours.seeds, theirs.seeds, assume_unique=True, return_indices=True)
+            if len(mine):
+                by_task[task] = getattr(ours, measure)[mine] - getattr(theirs, measure)[its]
+                same[task] = int((ours.starts[mine] == theirs.starts[its]).sum())
         rows = [{task: values} for task, values in by_task.items()]
         # As t_interval does, so that what is counted is what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
         for row in [judged, *rows] if len(rows) > 1 else rows:
-            groups = list(row.values())
-            name = None if row is judged else next(iter(row))
+            groups, name = list(row.values()), None if row is judged else next(iter(row))
             left_out = tuple(task for task in by_task if name is None and task not in judged)
             starts_alike = sum(same[task] for task in row)
             intervals = t_interval(groups), percentile_interval(groups)
             found.append(PairedDifference(method, other, name, row, *intervals, starts_alike, left_out))
     return found
-
-
-def _by_seed(arm: ArmSummary, measure: str) -> dict[int, float]:
-    return dict(zip(arm.seeds, getattr(arm, measure), strict=True))
 
 
 # Aggregates over tasks, by rliable
@@ -314,70 +317,58 @@ def score_matrices(experiment: Experiment) -> tuple[dict[str, np.ndarray], tuple
     :param experiment: An experiment
     :return: Scores [seeds, tasks] by arm, and the tasks; both empty if no task has two seeds of every arm
     """
-    arms = {
-        (task, method): dict(zip(arm.seeds, arm.finals, strict=True))
-        for task in experiment.tasks
-        for method in experiment.methods
-        if (arm := summarise_arm(experiment, task, method)).seeds
-    }
-    methods = [method for method in experiment.methods if any(key[1] == method for key in arms)]
-    shared = {
-        task: sorted(set.intersection(*(set(arms.get((task, method), ())) for method in methods)))
-        for task in experiment.tasks
-        if methods
-    }
-    tasks = tuple(task for task, seeds in shared.items() if len(seeds) > 1)
+    cells = [(cell.task, cell.method, cell.seed, cell.curve()[1]) for cell in experiment.finished]
+    finals = [(*key, values[-1] / HIGHEST_RETURN) for *key, values in cells if len(values) > 1]
+    table = pd.DataFrame(finals, columns=["task", "method", "seed", "score"])
+    shared = table.pivot(index=["task", "seed"], columns="method", values="score").dropna()
+    counts = shared.groupby("task").size()
+    tasks = tuple(task for task in experiment.tasks if counts.get(task, 0) > 1)
     if not tasks:
         return {}, ()
-    n = min(len(shared[task]) for task in tasks)
-    scores = {
-        method: np.array([[arms[task, method][seed] / HIGHEST_RETURN for seed in shared[task][:n]] for task in tasks]).T
-        for method in methods
-    }
-    return scores, tasks
+    first = shared.groupby("task").head(min(counts[task] for task in tasks))
+    return {
+        method: np.stack([first.loc[task, method].to_numpy() for task in tasks], axis=1)
+        for method in experiment.methods
+        if method in first
+    }, tasks
 
 
 def aggregate(experiment: Experiment) -> Aggregates | None:
     """
     :param experiment: An experiment
     :return: rliable's aggregates, None if no task has two seeds of every arm
-    :raises ResultsError: if there are returns that are no scores between 0 and 1, or rliable cannot be imported
+    :raises ResultsError: if there are returns that are no scores between 0 and 1
     """
     scores, tasks = score_matrices(experiment)
     if not scores:
         return None
-    for index, task in enumerate(tasks):
-        for score in np.concatenate([values[:, index] for values in scores.values()]):
-            if not -1e-6 <= score <= 1 + 1e-6:
-                raise ResultsError(
-                    f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
-                    f"suite, but a return on {task} is {score * HIGHEST_RETURN:.6g}."
-                )
-    library = _import_rliable()
-    n = len(next(iter(scores.values())))
-    taus = np.linspace(0, 1, 1001)
+    for task, values in zip(tasks, np.concatenate(list(scores.values())).T, strict=True):
+        if len(wrong := values[(values < -1e-6) | (values > 1 + 1e-6)]):
+            raise ResultsError(
+                f"scores are returns divided by {HIGHEST_RETURN:.0f}, the highest one of the DeepMind Control "
+                f"suite, but a return on {task} is {wrong[0] * HIGHEST_RETURN:.6g}."
+            )
+    n, taus = len(next(iter(scores.values()))), np.linspace(0, 1, 1001)
 
     def estimates(values: Mapping[str, Any], function: Any) -> dict[str, Estimate]:
         points, intervals = library.get_interval_estimates(
             values, lambda *x: np.array([function(*x)]), reps=RLIABLE_REPS
         )
-        return {
-            name: Estimate(float(points[name][0]), float(intervals[name][0, 0]), float(intervals[name][1, 0]), n)
-            for name in values
-        }
+        ends = {name: (float(low), float(high)) for name, ((low,), (high,)) in intervals.items()}
+        return {name: Estimate(float(points[name][0]), *ends[name], n) for name in values}
 
-    with _fixed_numpy_seed():
+    state = np.random.get_state()  # rliable 1.2 draws from numpy's global generator, whatever it is given
+    np.random.seed(0)
+    try:
         iqm = estimates(scores, interquartile_mean)
-        baselines = {name: experiment.baseline_of(name) for name in scores}
-        pairs = {
-            name: (scores[name], scores[other])
-            for name, other in baselines.items()
-            if other in scores and other != name
-        }
+        others = {name: experiment.baseline_of(name) for name in scores}
+        pairs = {name: (scores[name], scores[other]) for name, other in others.items() if name != other in scores}
         improvement = estimates(pairs, probability_of_improvement)
         points, intervals = library.create_performance_profile(
             scores, taus, custom_profile_func=share_above, reps=RLIABLE_REPS
         )
+    finally:
+        np.random.set_state(state)
     profiles = {name: (points[name], intervals[name][0], intervals[name][1]) for name in scores}
     return Aggregates(tasks, n, iqm, improvement, taus, profiles)
 
@@ -410,25 +401,3 @@ def share_above(scores: np.ndarray, taus: np.ndarray) -> np.ndarray:
     :return: Share of the scores above each: the performance profile, [n]
     """
     return (scores.reshape(-1, 1) > taus).mean(axis=0)
-
-
-def _import_rliable() -> Any:
-    try:
-        from rliable import library
-    except (ImportError, AttributeError) as error:  # AttributeError: how it fails with pandas 3
-        raise ResultsError(
-            f"rliable cannot be imported ({error}): install the extra, pip install 'sb3-cure[experiments]' "
-            "(rliable 1.2 needs pandas < 3)."
-        ) from None
-    return library
-
-
-@contextmanager
-def _fixed_numpy_seed() -> Iterator[None]:
-    """rliable 1.2 draws from numpy's global generator, whatever random_state it is given."""
-    state = np.random.get_state()
-    np.random.seed(0)
-    try:
-        yield
-    finally:
-        np.random.set_state(state)
