@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.policies import CuRePolicy
 from sb3_cure.srl import SRLHead, get_srl_class
 
 Rate = Annotated[float, Field(ge=0, le=1)]
@@ -91,6 +92,11 @@ def _check_combinations(model: Any) -> None:
         raise ValueError(
             f"n_steps={model.n_steps} sums the task's rewards over steps, but the intrinsic reward is one of single "
             "steps: set n_steps=1, or curiosity=None."
+        )
+    if not model.everything_off and not issubclass(model.policy_class, CuRePolicy):
+        raise ValueError(
+            f"the policy is {model.policy_class.__name__}, but SRL and curiosity need a kind of CuRePolicy: use 'CnnPolicy' "
+            "or 'MlpPolicy', or set srl=None and curiosity=None, which is the base class."
         )
     if model.use_sde and not model.everything_off:
         raise ValueError("use_sde=True explores by noise of one actor's own features: it needs srl=curiosity=None.")

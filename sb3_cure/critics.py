@@ -53,10 +53,10 @@ class LatentCritic(nn.Module):
         """
         inputs = th.cat([latents, actions], dim=1)
         values = []
-        for *hidden, last in self.q_networks:  # type: ignore[misc]
-            values.append(first_in_fp32(hidden, inputs))
-            with full_precision(inputs):
-                values[-1] = last(values[-1].float())
+        for network in self.q_networks:
+            hidden = first_in_fp32(list(network.children())[:-1], inputs)
+            with full_precision(inputs):  # values need more digits than bf16 has
+                values.append(network[-1](hidden.float()))  # type: ignore[index]
         return th.stack(values, dim=1)
 
 

@@ -30,7 +30,8 @@ class DeterministicActor(nn.Module):
         actor = trained[0] if actor is None else actor
         if actor not in trained:
             raise ValueError(f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}.")
-        self.actor: Any = model.policy.curious.actor if actor == "curious" else model.policy.actor
+        policy: Any = model.policy
+        self.actor: Any = policy.curious.actor if actor == "curious" else policy.actor
         # In a tuple, so that critics and decoder are no part of what is exported
         self._policy: Any = (model.policy,)
         self.trunk = model.policy.encoder.trunk if isinstance(model.policy, CuRePolicy) else None

@@ -152,7 +152,7 @@ class EncoderUpdate:
             self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
             size = (self.mean_squares[source] / self.weights[source]).sqrt().clamp(min=1e-30)
             gradients = [(latents, gradient / size) for latents, gradient in gradients]
-        self._pulls[source] = gradients
+        self._pulls[source] = list(gradients)
 
     def step(self, optimize: Optimize) -> None:
         """Move the encoder along the gradients that were given since the last step; without any, do nothing.

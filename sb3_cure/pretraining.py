@@ -1,5 +1,6 @@
 """Pretraining of the representation without task reward (paper, "Effect of Pretraining"), and what it undoes."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -14,6 +15,8 @@ class Pretraining(CuRe):
 
     #: What ``task`` and ``curiosity`` were before the pretraining that is under way; None: there is none
     _before_pretraining: dict[str, Any] | None = None
+    #: Of ``Persistence``: whether a script that is run again has nothing to do in this call
+    _was_over: Callable[[str], bool]
     #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
     _is_pretrained = False
 

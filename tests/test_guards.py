@@ -41,8 +41,6 @@ class Steep(Poisonous):
         return SRLOutput(loss.detach() * 0 + steep + 0 * self.weight, error)
 
 
-
-
 def trained(**kwargs: Any) -> CuReSAC:
     return tiny_model("CnnPolicy", PixelBox(), **kwargs).learn(14)
 

@@ -689,7 +689,10 @@ def test_metrics_of_models_that_share_a_logger() -> None:
         model.set_logger(logger)
         recorded = []
         record = model._metrics.record
-        model._metrics.record = lambda values, *rest, all=recorded, record=record: (all.append(values), record(values, *rest))
+        model._metrics.record = lambda values, *rest, all=recorded, record=record: (
+            all.append(values),
+            record(values, *rest),
+        )
         model.learn(35, log_interval=1)  # the last 15 updates are not written
     losses = [float(values["srl_loss"].detach()) for values in recorded if "srl_loss" in values]
     assert len(dumps.dumps) == 2

@@ -9,13 +9,17 @@ from collections import defaultdict
 from collections.abc import Sequence
 from importlib import metadata
 
+import numpy as np
 import torch as th
+from gymnasium import spaces
 from torch.utils import collect_env
 
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
 from sb3_cure.precision import resolve_compile, resolve_precision
 
 PACKAGE = "sb3-cure"
+#: What networks compute in bf16 where they can
+IMAGES = spaces.Box(0, 255, (3, 84, 84), np.uint8)
 #: Extras that users may want, and for what; the remaining ones are for developing sb3_cure
 EXTRAS = {
     "demo": "plots, videos, TensorBoard, progress bars",
@@ -83,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     device = th.device("cuda" if th.cuda.is_available() else "cpu")
     gpus = find_gpus()
     print(f"\nGPUs: {', '.join(gpus) or 'none'}; torch computes on {device} with {th.get_num_threads()} threads")
-    print(f'precision="auto": {resolve_precision("auto", device)}')
+    print(f'precision="auto": {resolve_precision("auto", device, IMAGES)}')
     print(f'compile="auto": {resolve_compile("auto", device)[1]}')
     if device.type == "cpu" and any(gpu.startswith("NVIDIA") for gpu in gpus):
         warnings.append("torch cannot use the GPU: install its CUDA build, see https://pytorch.org/get-started")

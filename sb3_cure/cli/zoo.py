@@ -30,9 +30,7 @@ from sb3_cure.envs.rendering import is_headless
 
 DEFAULT_ALGORITHM = "cure_sac"
 #: Algorithms by the names that ``--algo`` knows them by
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {DEFAULT_ALGORITHM: sb3_cure.CuReSAC}
-if hasattr(sb3_cure, "CuReTQC"):
-    ALGORITHMS["cure_tqc"] = sb3_cure.CuReTQC
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"cure_sac": sb3_cure.CuReSAC, "cure_tqc": sb3_cure.CuReTQC}
 #: Arguments of the algorithms that take a class of the user's own, which settings name as ``my_module.MyClass``
 OWN = ("srl", "intrinsic")
 #: Settings of a run by which replaying it imports and calls what they name, or unpickles

@@ -24,9 +24,9 @@ from stable_baselines3.common.logger import (
 )
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 from sb3_cure.persistence.archive import Stateful
 from sb3_cure.persistence.encoding import encode, write_tensors
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 
 
 class Run:

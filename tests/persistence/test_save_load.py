@@ -51,7 +51,7 @@ IMAGES = np.random.default_rng(0).integers(0, 256, (5, 6, 36, 36), dtype=np.uint
 def predictions(model: CuReSAC, observations: np.ndarray = IMAGES) -> list[np.ndarray]:
     """Deterministic actions of the task policy and, if there is one, of the curious one."""
     actions = [model.predict(observations, deterministic=True)[0]]
-    if model.policy.curious_actor is not None:
+    if model.policy.curious is not None:
         actions.append(model.predict_curious(observations, deterministic=True)[0])
     return actions
 
@@ -244,7 +244,7 @@ def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     loaded = CuReSAC.load(tmp_path / "model", env=PixelBox(), curiosity_prob=1.0, learning_rate=0.0)
     before = {name: value.clone() for name, value in loaded.policy.named_parameters()}
     asked = []
-    loaded.policy.curious_actor.register_forward_hook(lambda *_: asked.append(1))
+    loaded.policy.curious.actor.register_forward_hook(lambda *_: asked.append(1))
     loaded.learn(6, reset_num_timesteps=False)
     assert len(asked) == 6
     # A learning rate of zero moves nothing but the targets, towards the networks.
@@ -361,10 +361,10 @@ def test_checkpoint_while_pretraining(collector: str, curiosity: str | None, upd
     loaded = CuReSAC.load(tmp_path / "rl_model_16_steps", env=PixelBox())
     loaded.load_replay_buffer(tmp_path / "rl_model_replay_buffer_16_steps.pkl")
     assert differences(states[15], state_of(loaded)) == []
-    assert (loaded.policy.curious_actor is not None) == ("curious" in (collector, "curious" if curiosity else ""))
+    assert (loaded.policy.curious is not None) == ("curious" in (collector, "curious" if curiosity else ""))
     loaded.learn(14)
     assert (loaded.num_timesteps, loaded._n_updates, loaded.replay_buffer.size()) == (14, 4, 14)
-    assert (loaded.policy.curious_actor is not None) == (curiosity == "separate")
+    assert (loaded.policy.curious is not None) == (curiosity == "separate")
     # Encoder and head are the pretrained ones, trained on: their optimisers have seen all updates.
     assert state_of(loaded)["policy.srl.optimizer"]["state"][0]["step"] == 5 + 4
 
