@@ -16,7 +16,7 @@ class Pretraining(CuRe):
     #: What ``task`` and ``curiosity`` were before the pretraining that is under way; None: there is none
     _before_pretraining: dict[str, Any] | None = None
     #: Of ``Persistence``: whether a script that is run again has nothing to do in this call
-    _was_over: Callable[[str], bool]
+    _was_over: Callable[[str, bool], bool]
     #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
     _is_pretrained = False
 
@@ -52,7 +52,7 @@ class Pretraining(CuRe):
             raise ValueError("pretrain trains the representation alone, but srl is None: choose a head.")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector is {collector!r}: choose 'curious' or 'random'.")
-        if self._was_over("pretrain"):
+        if self._was_over("pretrain", reset_num_timesteps):
             return self
         self._begin_pretraining(collector)
         self._call_name = "pretrain"
@@ -81,7 +81,7 @@ class Pretraining(CuRe):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
-        if self._was_over("learn"):
+        if self._was_over("learn", reset_num_timesteps):
             return self
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
         if self._is_pretrained:

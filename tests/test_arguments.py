@@ -18,7 +18,7 @@ BAD: dict[str, list[Any]] = {
     "srl_schedule": ["in turn"],
     "srl_period": [0, 2.5],
     "intrinsic": ["novelty", 1],
-    "intrinsic_kwargs": [0],
+    "intrinsic_kwargs": [1],
     "curiosity": ["always", True],
     "curiosity_prob": [-0.1, 1.1, "often"],
     "curiosity_bout": [0.5, "forever"],

@@ -314,8 +314,8 @@ def test_state_dict_gives_the_same_next_updates(mode: str) -> None:
         first, second = whole(restored, step), whole(update, step)
         assert th.equal(values(copied), values(encoder))
         assert first.keys() == second.keys() and all(th.equal(first[name], second[name]) for name in first)
-        measured.append(bool(shares(first)))
-    assert measured == [False, True, False]
+        measured.append(tuple(shares(first).values()))
+    assert measured[0] != measured[1] == measured[2]
     untrained = make(mode)[1]
     untrained.load_state_dict(state)
     assert str(untrained.state_dict()) == str(state)
@@ -369,25 +369,8 @@ def test_gradient_norms_are_of_the_last_update(mode: str) -> None:
     expected = float(gradient("srl", update.run().latents).norm())
     give(update, "srl")
     update.step(optimize)
-    assert {name: float(norm) for name, norm in update.end().items()} == {"latent_grad_norm_srl": expected}
-
-
-def test_shares_of_sequential_steps_are_distances_moved() -> None:
-    """Each source's distance in parameter space over the sum of all; measured at once, then every so many updates."""
-    encoder, update = make("sequential")
-    measured = []
-    for step in range(SHARE_INTERVAL + 1):
-        distances = {}
-        update.begin(inputs(step), inputs(step))
-        for source in SOURCES:
-            before = values(encoder)
-            give(update, source)
-            distances[source] = float((values(encoder) - before).norm())
-        found = shares(update.end())
-        if found:
-            measured.append(step)
-            assert found == pytest.approx({s: d / sum(distances.values()) for s, d in distances.items()}, rel=1e-3)
-    assert measured == [0, SHARE_INTERVAL]
+    logged = {name: float(norm) for name, norm in update.end().items() if name.startswith("latent_grad_norm")}
+    assert logged == {"latent_grad_norm_srl": expected}
 
 
 def test_shares_of_joint_steps_are_measured_at_the_parameters() -> None:
@@ -432,21 +415,6 @@ def test_shares_show_a_spike() -> None:
     found = shares(whole(update, SHARE_INTERVAL, scales={"task": 1e4}))
     assert found["task"] > 0.6
     assert sum(found.values()) == pytest.approx(1)
-
-
-@MODES
-@pytest.mark.parametrize("scale", [1e4, 1e-4])
-def test_no_source_drowns_another(mode: str, scale: float) -> None:
-    """However much stronger one source is, the other keeps its share: Adam's, or the running size, divides it out."""
-    found = {}
-    for factor in (1.0, scale):
-        _, update = make(mode, ("srl", "task"))
-        for step in range(SHARE_INTERVAL + 1):
-            logged = whole(update, step, scales={"task": factor})
-        found[factor] = shares(logged)
-        assert sum(found[factor].values()) == pytest.approx(1)
-        assert min(found[factor].values()) > 0.1
-    assert found[scale] == pytest.approx(found[1.0], abs=0.05)
 
 
 @given(st.lists(st.floats(1e-12, 1e12), min_size=1, max_size=4), st.integers(1, 3))

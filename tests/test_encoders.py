@@ -274,7 +274,7 @@ def test_bf16_stays_within_the_hidden_layers() -> None:
     zeros = th.zeros(4, 1)
     batch = Samples(observations, th.zeros(4, 2), observations, zeros, zeros, views=observations)
     hidden: list[th.dtype] = []
-    for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[0]):
+    for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[2]):
         layer.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     for q_net in policy.critic.q_networks:
         q_net[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))

@@ -251,17 +251,6 @@ class FaintRAE(RAE):
         return SRLOutput(1e-3 * output.loss, output.error)
 
 
-@UPDATES
-def test_drowned_head_shows_in_its_share(update: str) -> None:
-    """Under plain gradient descent its share is next to nothing, and logged so; by default it keeps its share."""
-    plain = filled_model(srl=FaintRAE, update="sequential")
-    assert train_once(plain, actors=False)["encoder_share_srl"] < 1e-2
-    default = filled_model(srl=FaintRAE, update=update, policy_kwargs={"optimizer_class": th.optim.Adam})
-    faint = train_once(default, actors=False)
-    assert faint["latent_grad_norm_srl"] < 1e-2 * faint["latent_grad_norm_task"]
-    assert faint["encoder_share_srl"] > 0.15
-
-
 def test_keys_of_curl_get_no_gradient() -> None:
     """CURL's W and anchors are trained as if the keys were constants; the momentum encoder is not trained."""
     model = filled_model(pixels=True, srl="curl")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from agents_for_tests import actor_critic, q_values
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, samples_of, tiny_model
 
 from sb3_cure import CuReSAC
 
@@ -90,7 +90,7 @@ def test_actions_reach_the_critics_first_layer(model: CuReSAC, name: str) -> Non
 def test_decoder_of_vectors_draws_in_fp32() -> None:
     """Targets of vectors are no bytes: a decoder in bf16 could not draw them to better than 0.4 %."""
     model = vector_model(learning_starts=40).learn(40)
-    batch = model.replay_buffer.sample(32)
+    batch = samples_of(model, 32)
     with th.no_grad():
         latents = model.policy.encode(batch.observations)
         exact = model.policy.srl.loss(batch, latents).error

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch as th
 from agents_for_tests import one_update
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, samples_of, tiny_model
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
@@ -30,8 +30,8 @@ def curl() -> tuple[CURL, ReplayBufferSamples, th.Tensor]:
     """CURL with keys that are known exactly, a batch and anchors."""
     model = tiny_model("CnnPolicy", PixelBox(), srl="curl", learning_starts=40, precision="bf16").learn(40)
     head = model.policy.srl
-    head.bind_target_encoder(FixedKeys())
-    batch = model.replay_buffer.sample(8)
+    head.bind(FixedKeys(), model.policy.augmentation)
+    batch = samples_of(model, 8)
     anchors = th.rand((8, 50), generator=th.Generator().manual_seed(0)) * 4 - 2
     return head, batch, anchors
 

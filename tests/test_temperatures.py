@@ -26,7 +26,7 @@ def test_temperature_changes_only_its_own_losses(hotter: str, other: str, update
     for temperature in (0.1, 3.0):
         actor_critic(model, hotter).set_temperature(temperature)
         actor_critic(model, other).set_temperature(0.5)
-        model._n_updates = 0  # an update of the actors, too
+        model._n_rl_batches = 0  # an update of the actors, too
         losses.append(one_update(model))
     for name in ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef"):
         assert losses[0][prefix[hotter] + name] != losses[1][prefix[hotter] + name], name

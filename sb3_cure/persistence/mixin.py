@@ -81,22 +81,26 @@ class Persistence(SavesModels, SavesReplayBuffers):
             print(f"Resumed from {generation.folder}, after {model.num_timesteps} agent steps")
         return model
 
-    def learn(self: Self, *args: Any, **kwargs: Any) -> Self:
-        """
-        :param args: As of SB3's ``learn``
-        :param kwargs: The same
-        :return: self
-        """
-        if self._was_over(self._call_name):
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As in SB3; after ``resume``, what was left of the interrupted call."""
+        if self._was_over(self._call_name, reset_num_timesteps):
             return self
         with self._run.calling(self._call_name):
-            super().learn(*args, **kwargs)
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
             self._restore_rest()  # where nothing was left to do
         return self
 
-    def _was_over(self, call: str) -> bool:
+    def _was_over(self, call: str, counts_anew: bool) -> bool:
         """Whether the checkpoint that was resumed from was taken after this call of a script that is run again."""
-        return self._run.skips(call)
+        return self._run.skips(call, counts_anew)
 
     def _setup_learn(
         self,

@@ -50,12 +50,14 @@ class Run:
         #: Whether the script has made one of those again, so that its next call is the interrupted one
         self.replays = False
 
-    def skips(self, call: str) -> bool:
+    def skips(self, call: str, counts_anew: bool) -> bool:
         """
         :param call: ``"learn"`` or ``"pretrain"``, which is being called
+        :param counts_anew: Its ``reset_num_timesteps``: the first call of a script that is run again counts anew, while
+            one that does not asks for more steps
         :return: Whether the checkpoint that was resumed from was taken after it
         """
-        if self.resumed is not None and self.done[:1] == [call]:
+        if self.resumed is not None and (counts_anew or self.replays) and self.done[:1] == [call]:
             self.done.pop(0)
             self.replays = True
             print(f"{call} number {len(self.calls) - len(self.done)} of this training was over: skipped")
