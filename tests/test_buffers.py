@@ -545,11 +545,13 @@ def test_saved_and_loaded_through_sb3(tmp_path: Path, n_steps: int) -> None:
 
 
 def test_saved_buffer_is_as_large_as_its_contents(tmp_path: Path) -> None:
-    buffer = FrameStackReplayBuffer(10_000, image_space(3, 3, 84, 84), ACTIONS, "cpu", frame_stack=3)
+    buffer = FrameStackReplayBuffer(50_000, image_space(3, 3, 84, 84), ACTIONS, "cpu", frame_stack=3)
     obs = np.ones((1, 9, 84, 84), np.uint8)
     buffer.add(obs, obs, np.zeros((1, 2)), np.zeros(1), np.zeros(1), [{}])
+    buffer.sample(2)
     save_to_pkl(tmp_path / "buffer.pkl", buffer)
     assert (tmp_path / "buffer.pkl").stat().st_size < 1e6  # most of it the bounds of the observation space
+    assert load_from_pkl(tmp_path / "buffer.pkl").last_sampled is None
 
 
 def test_frames_on_disk_are_the_same_frames(tmp_path: Path) -> None:
