@@ -35,16 +35,17 @@ PathOrFile: TypeAlias = Path | IO[bytes]
 in_style = style.context(STYLE)
 
 
-def save(figure: Figure, path: PathOrFile, dpi: int = 150) -> None:
+def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) -> None:
     """
     :param figure: A figure
     :param path: File to write: 256 colours take a quarter of the room
     :param dpi: Pixels per inch
+    :param tight: Whether to fit the paper to what is drawn
     """
     file = io.BytesIO()
-    figure.savefig(file, dpi=dpi)
+    figure.savefig(file, dpi=dpi, bbox_inches="tight" if tight else None)
     with Image.open(file) as image:
-        few = image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE)
+        few = image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
         few.save(path, "PNG", optimize=True)
 
 
@@ -322,7 +323,7 @@ def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
     """Images [C, H, W] of one or three channels, side by side."""
     strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
     axes.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-    axes.set(xticks=[], yticks=[])
+    axes.tick_params(bottom=False, labelbottom=False)
     axes.grid(False)
     axes.spines[:].set_visible(False)
 
@@ -365,7 +366,7 @@ def _draw_rows(path: Path, strips: Mapping[str, np.ndarray], title: str) -> None
         _show(axes, [strip])
         axes.set_yticks([strip.shape[1] / 2], [label])
     figure.suptitle(title)
-    save(figure, path, 120)
+    save(figure, path, 120, tight=True)
 
 
 @in_style
