@@ -1325,12 +1325,6 @@ USES: dict[str, tuple[Callable[[], Any], str]] = {
         "cartpole-swingup, cartpole-swingup_sparse, acrobot-swingup (sb3_cure.envs.DMC_TASKS "
         "has all).",
     ),
-    "make_dmc_env: domain of another type": (
-        lambda: cartpole(domain=["cartpole"]),
-        "'['cartpole']-swingup' is not a task of the DeepMind Control suite; the closest are "
-        "cartpole-swingup, cartpole-swingup_sparse, acrobot-swingup (sb3_cure.envs.DMC_TASKS "
-        "has all).",
-    ),
     "make_dmc_env: task": (
         lambda: cartpole(task=None),
         "'cartpole-None' is not a task of the DeepMind Control suite; the closest are "

@@ -380,7 +380,7 @@ def test_no_curious_policy_without_curiosity() -> None:
 def test_environment_by_name(extras: dict[str, Any]) -> None:
     """A Gymnasium id is made, monitored and vectorised."""
     model = tiny_model("MlpPolicy", "Pendulum-v1", **extras)
-    assert isinstance(model.env, DummyVecEnv) and model.env.env_is_wrapped(Monitor) == [True]
+    assert isinstance(model.get_env(), DummyVecEnv) and model.env.env_is_wrapped(Monitor) == [True]
     model.learn(12)
     assert np.abs(model.predict(model.observation_space.sample())[0]) <= 2
     assert (model._n_updates, model.replay_buffer.size()) == (2, 12)
