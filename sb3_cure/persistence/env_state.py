@@ -35,6 +35,8 @@ _PASSED_OVER = (
     *("results_writer", "t_start", "episode_start_time", "episode_times", "time_queue", "_sb3_cure_call"),
 )
 _SPACES = ("action_space", "observation_space")
+# Stands among attributes for what a layer tells of itself
+_OWN = "state_dict()"
 # What renderers draw into, unless it is plain
 _RENDERERS = ("clock", "screen", "surf", "viewer", "window")
 _COLLECTIONS: dict[str, type] = {"tuple": tuple, "set": set, "frozenset": frozenset}
@@ -216,17 +218,16 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
         raise _NotPlain(f"{name} has no state_dict() and load_state_dict(state)")
     memo: dict[int, int] = {}
     encoded = {}
-    for key, value in {"own": own, **{space: getattr(layer, space) for space in _SPACES}, **attributes}.items():
+    for key, value in {_OWN: own, **{space: getattr(layer, space) for space in _SPACES}, **attributes}.items():
         if key in _PASSED_OVER or any(value is other for other in layers) or (key in _RENDERERS and value is None):
             continue
         try:
-            encoded[key] = _encoded(value, memo, as_built=key != "own")
+            encoded[key] = _encoded(value, memo, as_built=key != _OWN)
         except _NotPlain as error:
             if key not in _RENDERERS:
-                where = "has in its state_dict()" if key == "own" else f"keeps in {key}"
                 raise _NotPlain(
-                    f"{name} {where} a {error}, which cannot be saved (give it state_dict() and load_state_dict(state) "
-                    "of plain data)"
+                    f"{name} keeps in {key} a {error}, which cannot be saved (give it state_dict() and "
+                    "load_state_dict(state) of plain data)"
                 ) from None
     return {"layer": name, "built": _how_built(layer), "attributes": encoded}
 
@@ -236,7 +237,7 @@ def _load_layer(layer: Any, state: dict[str, Any]) -> None:
     for key, saved in state["attributes"].items():
         if key in _SPACES:
             _decoded(saved, getattr(layer, key), memo)
-        elif key != "own":
+        elif key != _OWN:
             vars(layer)[key] = _decoded(saved, vars(layer).get(key), memo)
         elif _has_state_dict(layer):
             layer.load_state_dict(_decoded(saved, None, memo))

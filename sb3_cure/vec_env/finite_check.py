@@ -1,5 +1,6 @@
 """One look at all that environments return, and at the actions that they are sent."""
 
+import inspect
 import warnings
 from typing import Any
 
@@ -173,6 +174,13 @@ class FiniteCheck(VecEnvWrapper):
                 stacklevel=2,
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies of models: what SB3's wrapper keeps of its class cannot be copied."""
+        return {name: value for name, value in vars(self).items() if name != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, class_attributes=dict(inspect.getmembers(type(self))))
+
     def state_dict(self) -> dict[str, Any]:
         """For exact resume.
 
@@ -184,7 +192,6 @@ class FiniteCheck(VecEnvWrapper):
             "warned": sorted(self._warned),
             "stand_ins": self._stand_ins.tolist(),
             "seen": self._seen if self.skip else None,
-            "steps_in_the_dark": self._steps_in_the_dark,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -194,7 +201,6 @@ class FiniteCheck(VecEnvWrapper):
         self.n_bad, self.n_steps = state["n_bad"], state["n_steps"]
         self._warned = set(state["warned"])
         self._stand_ins, self._seen = np.array(state["stand_ins"], dtype=bool), state["seen"]
-        self._steps_in_the_dark = state["steps_in_the_dark"]
 
 
 def _is_finite(numbers: np.ndarray) -> npt.NDArray[np.bool_]:

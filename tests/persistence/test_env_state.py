@@ -226,7 +226,7 @@ def test_worker_processes_go_on() -> None:
         assert sum(bool(dones[1]) for _, _, dones, _, _ in expected) == 3
         assert np.array_equal(venv.action_space.sample(), fresh.action_space.sample())
 
-        state["envs"][1][-1]["attributes"]["own"] = {"dict": []}
+        state["envs"][1][-1]["attributes"]["state_dict()"] = {"dict": []}
         with pytest.raises(ValueError, match=r"build them as they were built .* environment 1 .* KeyError: 'position'"):
             load_vec_env_state(venv, state)
         venv.step_async(actions(venv, 1)[0])  # the worker lives
@@ -398,7 +398,7 @@ class Locked(gym.Wrapper):
 
 def test_what_cannot_be_saved_is_named() -> None:
     refused: dict[str, Callable[[], VecEnv]] = {
-        "Connected has in its state_dict() a builtin_function_or_method, ": lambda: DummyVecEnv([Dot, Connected]),
+        "Connected keeps in state_dict() a builtin_function_or_method, ": lambda: DummyVecEnv([Dot, Connected]),
         "Locked keeps in locks a lock, ": lambda: DummyVecEnv([Dot, lambda: Monitor(Locked(Dot()))]),
     }
     for name, build in refused.items():

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any
@@ -334,6 +335,17 @@ def test_restored_check_goes_on_identically(flaws: list[Any], before: int, kind:
             seen = [copy.deepcopy(each.step(np.full((2, 2), 0.1, np.float32))) for _ in range(5)]
         told.append([seen, each.state_dict(), [str(warning.message) for warning in caught]])
     assert differences(told[0], told[1]) == []
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda venv: pickle.loads(pickle.dumps(venv))])
+def test_copied_check_goes_on_identically(copied: Any) -> None:
+    """As with a copy of a model."""
+    venv = FiniteCheck(DummyVecEnv([VectorBox]), "skip")
+    venv.reset()
+    other = copied(venv)
+    assert other.envs is not venv.envs and other.get_attr("n_steps") == [0]
+    action = np.ones((1, 2), np.float32)
+    assert differences(list(venv.step(action)), list(other.step(action))) == []
 
 
 def test_reset_after_restoring_knows_no_stand_ins() -> None:

@@ -527,7 +527,7 @@ def test_attributes_that_cannot_be_saved_are_named() -> None:
     env.set_attr("tool", partial(print))
     env.reset()
     assert vec_env_state(env) is None
-    assert "FaultTolerantSubprocVecEnv has in its state_dict() a partial" in str(why_not_restorable(env))
+    assert "FaultTolerantSubprocVecEnv keeps in state_dict() a partial" in str(why_not_restorable(env))
     env.close()
 
 
