@@ -30,7 +30,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_cure
 from benchmarks import zero_decoder
-from sb3_cure import CuReSAC, files, generations
+from sb3_cure import CuReSAC
 from sb3_cure.experiments import cells, heads, media, plots, probe, run, visitation, yardsticks
 from sb3_cure.experiments import files as experiment_files
 from sb3_cure.experiments.cells import run_cell
@@ -53,8 +53,8 @@ DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale":
 def _pixel_box(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The tiny task under an id: 20 steps per episode, an action repeat of 4. Checkpoints do not wait for the disk."""
     gym.register(TASK, PixelBox)
-    for module in (files, generations):
-        monkeypatch.setattr(module, "flush_to_disk", lambda path: None)
+    for module in ("files", "generations", "checkpoints"):
+        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
     yield
     del gym.registry[TASK]
 
