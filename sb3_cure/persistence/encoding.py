@@ -21,8 +21,8 @@ import torch as th
 from gymnasium import spaces
 from safetensors import safe_open
 from safetensors.torch import load as load_tensors
-from stable_baselines3.common import buffers as sb3_buffers
 from stable_baselines3.common import torch_layers
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
@@ -73,13 +73,7 @@ def refusing(name: str) -> Iterator[None]:
 # ---------------------------------------------------------------------- names
 
 #: Replay buffers that are written without pickle
-BUFFERS: tuple[type[sb3_buffers.ReplayBuffer], ...] = (
-    FrameStackReplayBuffer,
-    SkippingReplayBuffer,
-    sb3_buffers.ReplayBuffer,
-    sb3_buffers.DictReplayBuffer,
-    sb3_buffers.NStepReplayBuffer,
-)
+BUFFERS = (FrameStackReplayBuffer, SkippingReplayBuffer, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
 #: Types of the numbers in arrays
 NUMBERS: tuple[type[np.generic], ...] = (
     *(np.bool_, np.float16, np.float32, np.float64),
@@ -237,12 +231,12 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "bytes": (bytes, lambda value: np.frombuffer(value, np.uint8), lambda array: array.tobytes()),
     "Path": (type(Path()), str, Path),
     "TrainFreq": (TrainFreq, list, lambda parts: TrainFreq(*parts)),
-    "Box": (spaces.Box, partial(_arguments, "low high shape"), lambda arguments: spaces.Box(**arguments)),
-    "Discrete": (spaces.Discrete, partial(_arguments, "n start"), lambda arguments: spaces.Discrete(**arguments)),
+    "Box": (spaces.Box, partial(_arguments, "low high shape"), lambda given: spaces.Box(**given)),
+    "Discrete": (spaces.Discrete, partial(_arguments, "n start"), lambda given: spaces.Discrete(**given)),
     "MultiDiscrete": (
         spaces.MultiDiscrete,
         partial(_arguments, "nvec start"),
-        lambda arguments: spaces.MultiDiscrete(**arguments),
+        lambda given: spaces.MultiDiscrete(**given),
     ),
     "MultiBinary": (spaces.MultiBinary, lambda space: space.n, spaces.MultiBinary),
     # Its items in this order, where a dict would be sorted
