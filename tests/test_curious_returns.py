@@ -93,7 +93,9 @@ def test_terminations_count_for_the_task_alone(update: str) -> None:
     """By default; with ``curiosity_episodic=True`` for both agents."""
     losses: dict[tuple[bool, int], dict[str, float]] = {}
     for episodic in (True, False):
-        model = tiny_model("MlpPolicy", VectorBox(), learning_starts=40, learning_rate=0.0, update=update).learn(40)
+        model = tiny_model(
+            "MlpPolicy", VectorBox(), learning_starts=40, learning_rate=0.0, update=update, curiosity_episodic=episodic
+        ).learn(40)
         model.replay_buffer.timeouts[:] = 0
         for done in (0, 1):
             model.replay_buffer.dones[:] = done
