@@ -83,7 +83,7 @@ class Cliff(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed)
-        self.position = float(self.np_random.uniform(-0.9, 0.9))
+        self.position = float(self.np_random.uniform(-0.95, 0.05))
         self.n_steps = 0
         return np.array([self.position, 1, 0], np.float32), {}
 

@@ -39,11 +39,11 @@ class FallingError(SRLHead):
 
 def curious_on_the_cliff(curiosity_gamma: float, ent_coef: float, updates: int, **kwargs: Any) -> CuReSAC:
     """A curious agent, trained on random transitions of the cliff."""
-    arguments: dict[str, Any] = dict(srl=ResetsAreNovel, task=False, learning_starts=500, learning_rate=1e-3)
+    arguments: dict[str, Any] = dict(srl=ResetsAreNovel, task=False, learning_starts=1000, learning_rate=1e-3)
     arguments |= dict(buffer_size=1000, target_update_interval=1, tau=0.02, encoder_tau=0.05, batch_size=32)
     arguments |= dict(curiosity_gamma=curiosity_gamma, ent_coef=ent_coef, policy_kwargs={"net_arch": [16, 16]})
-    model = tiny_model("MlpPolicy", Cliff(), **{**arguments, **kwargs}).learn(500)
-    assert 10 < model.replay_buffer.dones[:500].sum() < 200
+    model = tiny_model("MlpPolicy", Cliff(), **{**arguments, **kwargs}).learn(1000)
+    assert 10 < model.replay_buffer.dones[:1000].sum() < 200
     model.train(updates, batch_size=model.batch_size)
     return model
 
@@ -68,17 +68,17 @@ def deaths(model: CuReSAC) -> float:
 def test_dying_is_not_preferred_by_default(arguments: dict[str, Any], dies: bool) -> None:
     """Nearly all rewards are below the mean: ending them pays if the return ends with the episode, and only then."""
     share = deaths(curious_on_the_cliff(0.9, 0.02, 1000, learning_rate=3e-3, **arguments))
-    assert share > 0.6 if dies else share < 0.2
+    assert share > 0.5 if dies else share < 0.2
 
 
 def test_curious_values_of_terminal_states_stay_bounded() -> None:
     """No sample starts from them, so that no update corrects what is bootstrapped from: over 20 000 updates they stay
     beside the values of the states that are learned, far from the limit of 500 that rewards of 5 would allow."""
     model = curious_on_the_cliff(0.99, 0.02, 0, learning_rate=3e-3, batch_size=16)
-    ended = model.replay_buffer.dones[:500, 0] == 1
-    ends = th.as_tensor(model.replay_buffer.next_observations[:500, 0][ended])
-    starts = th.as_tensor(model.replay_buffer.observations[:500, 0])
-    actions = th.linspace(-1, 1, 500)[:, None]
+    ended = model.replay_buffer.dones[:1000, 0] == 1
+    ends = th.as_tensor(model.replay_buffer.next_observations[:1000, 0][ended])
+    starts = th.as_tensor(model.replay_buffer.observations[:1000, 0])
+    actions = th.linspace(-1, 1, 1000)[:, None]
     for _ in range(4):
         model.train(5_000, batch_size=16)
         with th.no_grad():
@@ -93,7 +93,9 @@ def test_terminations_count_for_the_task_alone(update: str) -> None:
     """By default; with ``curiosity_episodic=True`` for both agents."""
     losses: dict[tuple[bool, int], dict[str, float]] = {}
     for episodic in (True, False):
-        model = tiny_model("MlpPolicy", VectorBox(), learning_starts=40, learning_rate=0.0, update=update).learn(40)
+        model = tiny_model(
+            "MlpPolicy", VectorBox(), learning_starts=40, learning_rate=0.0, update=update, curiosity_episodic=episodic
+        ).learn(40)
         model.replay_buffer.timeouts[:] = 0
         for done in (0, 1):
             model.replay_buffer.dones[:] = done
