@@ -194,6 +194,22 @@ def test_whole_update_equals_straight_line_code(
         assert float((actual - wanted).norm()) < 2e-3 * distance + 1e-6 * float(old.norm())
 
 
+@pytest.mark.parametrize("update, expected", [("joint", {"now": 1, "next": 1}), ("sequential", {"now": 4, "next": 2})])
+def test_encoder_runs_no_more_often_than_it_moves(update: str, expected: dict[str, int]) -> None:
+    """Joint: one run for all losses and actors, one for next observations. Sequential: one more after each step.
+
+    The task's actor and the curious critic, between which the encoder stands still, share theirs.
+    """
+    model = filled_model(update=update)
+    batch = sampled(model)
+    seen: list[th.Tensor] = []
+    model.policy.encoder.trunk.register_forward_hook(lambda module, args, out: seen.append(args[0]))
+    train_once(model)
+    inputs = {"now": batch.observations, "next": batch.next_observations}
+    assert {name: sum(th.equal(each, value) for each in seen) for name, value in inputs.items()} == expected
+    assert len(seen) == sum(expected.values())
+
+
 def test_dropped_quantiles_are_read_from_the_model_at_use() -> None:
     """The more are dropped, the lower the target: it shows in the very next update."""
     losses = []
