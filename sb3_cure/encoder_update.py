@@ -154,7 +154,7 @@ class EncoderUpdate:
         if not self._pulls:
             return
         losses: dict[str, th.Tensor] = {}
-        trained = [parameter for parameter in self.encoder.parameters() if parameter.requires_grad]
+        trained: list[th.Tensor] = [each for each in self.encoder.parameters() if each.requires_grad]
         measures = self._n_updates % SHARE_INTERVAL == 0 and bool(trained)
         for source, pulls in self._pulls.items():
             for latents, gradient in pulls:  # the gradient of (latents * g).sum() at the latents is g
