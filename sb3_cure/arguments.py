@@ -95,8 +95,8 @@ def _check_combinations(model: Any) -> None:
         )
     if not model.everything_off and not issubclass(model.policy_class, CuRePolicy):
         raise ValueError(
-            f"the policy is {model.policy_class.__name__}, but SRL and curiosity need a kind of CuRePolicy: use 'CnnPolicy' "
-            "or 'MlpPolicy', or set srl=None and curiosity=None, which is the base class."
+            f"the policy is {model.policy_class.__name__}, but SRL and curiosity need a kind of CuRePolicy: use "
+            "'CnnPolicy' or 'MlpPolicy', or set srl=None and curiosity=None, which is the base class."
         )
     if model.use_sde and not model.everything_off:
         raise ValueError("use_sde=True explores by noise of one actor's own features: it needs srl=curiosity=None.")

@@ -197,10 +197,13 @@ class StraightLine:
         curious = ((errors - errors.mean()) / errors.std(unbiased=False)).clamp(-5, 5) * self.model.curiosity_beta
         ends = batch.dones[:, 0]
         curious_ends = ends if self.model.curiosity_episodic else th.zeros_like(ends)
-        self.learn_agent("task", batch, batch.rewards[:, 0], self.model.gamma * (1 - ends), next_latents, learn, found)
-        self.learn_agent(
-            "curious", batch, curious, self.model.curiosity_gamma * (1 - curious_ends), next_latents, learn, found
-        )
+        rewards = batch.rewards[:, 0]
+        if self.model.curiosity == "bonus":  # scaled, not centred
+            rewards = rewards + self.model.curiosity_beta * errors / errors.square().mean().sqrt()
+        self.learn_agent("task", batch, rewards, self.model.gamma * (1 - ends), next_latents, learn, found)
+        if self.model.curiosity == "separate":
+            discounts = self.model.curiosity_gamma * (1 - curious_ends)
+            self.learn_agent("curious", batch, curious, discounts, next_latents, learn, found)
         if not sequential:
             direction = th.autograd.grad(shared, list(self.encoder.parameters()), sum(pulls))
             with th.no_grad():

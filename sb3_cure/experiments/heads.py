@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
+from sb3_cure.buffers import Samples
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.evaluation import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_progress
@@ -196,10 +196,12 @@ def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator
     random = np.random.default_rng(model.seed)
     for number in range(1, updates + 1):
         policy.set_training_mode(True)
-        batch = observation_batch(observations[random.integers(len(observations), size=128)], model.device)
+        images = th.as_tensor(observations[random.integers(len(observations), size=128)], device=model.device)
+        views = policy.augmentation(images)
         with model._autocast():
-            latents = policy.encoder(policy.augment(batch.observations))
-            loss = head.loss(batch, latents).loss
+            # Without anything but observations, which are all that an autoencoder reads
+            batch = Samples(images, None, None, None, None, views=views)  # type: ignore[arg-type]
+            loss = head.loss(batch, policy.encoder(policy.preprocess(views)).float()).loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -212,14 +214,3 @@ def _rows(judge: CuReSAC, cell: Cell, results: Path) -> Iterator[Row]:
         for number, episode in enumerate(episodes):
             errors = srl_errors(judge, observation_batch(episode.observations, judge.device))
             yield visit_row(actor, "common", number, errors, episode)
-
-
-def observation_batch(observations: np.ndarray, device: th.device) -> ReplayBufferSamples:
-    """
-    :param observations: Images in 0-255, [n, *shape]
-    :param device: Where the batch is to be
-    :return: A batch with observations alone, which are all that an autoencoder reads
-    """
-    images = th.as_tensor(observations, device=device)
-    nothing = th.zeros((len(images), 1), device=device)
-    return ReplayBufferSamples(images, nothing, images, nothing, nothing)

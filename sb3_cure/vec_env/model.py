@@ -49,8 +49,8 @@ class ModelEnvironments(OffPolicyAlgorithm):
         may_be_marked = self.on_bad_transition == "skip" or restarts_workers(self.env)
         if may_be_marked and not isinstance(self.replay_buffer, SkipsMarked):
             raise ValueError(
-                f"faulty transitions must never be sampled, which a {type(self.replay_buffer).__name__} cannot promise: "
-                "use a SkippingReplayBuffer or a FrameStackReplayBuffer, or on_bad_transition='raise' and "
+                f"a {type(self.replay_buffer).__name__} cannot promise that faulty transitions are never sampled: use "
+                "a SkippingReplayBuffer or a FrameStackReplayBuffer, or on_bad_transition='raise' and "
                 "on_env_fault='raise'."
             )
         return super()._setup_learn(*args, **kwargs)

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch as th
 from envs_for_tests import VectorBox, tiny_model
+from stable_baselines3.common.torch_layers import NatureCNN
 from torch import nn
 from updates_for_tests import equal, filled_model, groups, moved, train_once
 
@@ -98,11 +99,16 @@ def test_reward_learns_in_rl_updates_only() -> None:
 
 
 @UPDATES
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("precision, extractor", [("fp32", None), ("bf16", None), ("bf16", NatureCNN)])
 @pytest.mark.parametrize("augmentation", [None, "shift"])
-def test_latents_are_of_centred_views_in_fp32(augmentation: str | None, precision: str, update: str) -> None:
+def test_latents_are_of_centred_views_in_fp32(
+    augmentation: str | None, precision: str, extractor: Any, update: str
+) -> None:
     """The online encoder's, as it is by then, of both observations; without a gradient to the encoder."""
     arguments: dict[str, Any] = dict(augmentation=augmentation, precision=precision, update=update)
+    if extractor is not None:
+        kwargs = {"features_extractor_class": extractor, "features_extractor_kwargs": {"features_dim": 8}}
+        arguments["policy_kwargs"] = kwargs
     model = filled_model(pixels=True, intrinsic=LatentStep, learning_rate=0.0, **arguments)
     train_once(model)
     reward: Any = model.policy.intrinsic

@@ -256,11 +256,11 @@ def test_vector_autoencoder_trains_in_the_agent() -> None:
 
 @pytest.fixture(scope="module")
 def frames() -> th.Tensor:
-    """Single frames of finger-spin under random actions, [400, 3, 36, 36]: 20 short episodes, one after the other."""
+    """Single frames of finger-spin under random actions, [240, 3, 36, 36]: 12 short episodes, one after the other."""
     env = make_dmc_env("finger", "spin", image_size=36, frame_stack=1, seed=0)
     env.action_space.seed(0)
     collected = [env.reset()[0]]
-    while len(collected) < 400:
+    while len(collected) < 240:
         episode_ends = len(collected) % 20 == 0
         collected.append(env.reset()[0] if episode_ends else env.step(env.action_space.sample())[0])
     env.close()
@@ -273,7 +273,7 @@ def test_rae_learns_to_draw_real_frames(frames: th.Tensor) -> None:
     A decoder that draws the same background whatever the latents cannot pass: not even if its picture is the mean of
     the very frames on which it is judged.
     """
-    train, held_out = frames[:300], frames[300:]
+    train, held_out = frames[:180], frames[180:]
     model = tiny_model(
         "CnnPolicy",
         PixelBox(frame_stack=1),
@@ -311,5 +311,5 @@ def test_rae_learns_to_draw_real_frames(frames: th.Tensor) -> None:
 
     assert not any(well_below_the_mean_image(value) for value in errors.values())
     assert not well_below_the_mean_image(error())
-    model.train(600, batch_size=16)
+    model.train(300, batch_size=16)  # of two updates each
     assert well_below_the_mean_image(error())

@@ -195,7 +195,7 @@ def test_error_may_have_double_precision() -> None:
 
 
 def test_error_of_few_digits_is_refused() -> None:
-    with pytest.raises(ValueError, match="in torch.bfloat16"):
+    with pytest.raises(ValueError, match=r"in torch\.bfloat16"):
         train_once(filled_model(srl=returns(lambda error: error.detach().to(th.bfloat16))))
 
 
