@@ -18,7 +18,6 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
 from sb3_cure.callbacks import untouched_randomness
-from sb3_cure.cure import CuRe
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.cure_tqc import CuReTQC
 from sb3_cure.envs.rendering import GLUnavailableError
@@ -26,7 +25,7 @@ from sb3_cure.envs.rendering import GLUnavailableError
 #: The file that tells that a cell is finished
 DONE = "DONE"
 #: What methods train, by the name of rl-zoo's ``--algo``
-ALGOS: dict[str, type[CuRe]] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
+ALGOS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
 # What a string with a dot names: a class of one's own.
 _CLASSES = ("srl", "intrinsic", "replay_buffer_class")
 

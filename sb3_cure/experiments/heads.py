@@ -196,16 +196,24 @@ def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator
     random = np.random.default_rng(model.seed)
     for number in range(1, updates + 1):
         policy.set_training_mode(True)
-        images = th.as_tensor(observations[random.integers(len(observations), size=128)], device=model.device)
-        views = policy.augmentation(images)
+        batch = observation_batch(observations[random.integers(len(observations), size=128)], model.device)
+        views = policy.augmentation(batch.observations)
         with model._autocast():
-            # Without anything but observations, which are all that an autoencoder reads
-            batch = Samples(images, None, None, None, None, views=views)  # type: ignore[arg-type]
-            loss = head.loss(batch, policy.encoder(policy.preprocess(views)).float()).loss
+            latents = policy.encoder(policy.preprocess(views)).float()
+            loss = head.loss(batch._replace(views=views), latents).loss
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         yield number
+
+
+def observation_batch(observations: np.ndarray, device: th.device) -> Samples:
+    """
+    :param observations: Images in 0-255, [n, *shape]
+    :param device: Where the batch is to be
+    :return: Samples with observations alone, which are all that an autoencoder reads
+    """
+    return Samples(th.as_tensor(observations, device=device), None, None, None, None)  # type: ignore[arg-type]
 
 
 def _rows(judge: CuReSAC, cell: Cell, results: Path) -> Iterator[Row]:
