@@ -224,7 +224,7 @@ def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding |
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
     :return: None without curiosity, without entropy term, or before the first update
     """
-    latest = model._metrics.latest if getattr(model, "_uses_curious_reward", False) else {}
+    latest = model._metrics.latest if getattr(model.policy, "intrinsic", None) is not None else {}
     deviation = float(latest.get("train/curious_reward_std", np.nan))
     if np.isnan(deviation) or not temperatures or temperatures[-1].value == 0:
         return None

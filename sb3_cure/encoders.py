@@ -5,7 +5,7 @@ Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), whic
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
@@ -110,7 +110,8 @@ class ExtractorEncoder(Encoder):
 
     def __init__(self, extractor: BaseFeaturesExtractor):
         super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
-        self.trunk = extractor
+        is_image = is_image_space(extractor._observation_space)
+        self.trunk = extractor if is_image else FullPrecision(extractor)
         self.projection = nn.Identity()
 
 

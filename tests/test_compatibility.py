@@ -170,19 +170,18 @@ def test_normalised_rewards_are_the_tasks_alone(update: str, monkeypatch: pytest
     env = VecNormalize(DummyVecEnv([PixelBox]), norm_obs=False, norm_reward=True)
     model = tiny_model("CnnPolicy", env, update=update).learn(20)
     seen: dict[str, Any] = {}
-    update_actor_critic, curious_reward = CuReSAC._update_actor_critic, CuReSAC._curious_reward
+    update_actor_critic, update_intrinsic = CuReSAC._update_actor_critic, CuReSAC._update_intrinsic
 
-    def watch_update(self: CuReSAC, agent: Any, encoded: Any, latents: Any, batch: Any, rewards: Any) -> None:
-        seen[agent.name] = rewards.clone()
-        seen["batch"] = batch.rewards.clone()
-        update_actor_critic(self, agent, encoded, latents, batch, rewards)
+    def watch_update(self: CuReSAC, name: str, batch: Any, rewards: Any, *rest: Any) -> None:
+        seen[name] = rewards.clone()
+        update_actor_critic(self, name, batch, rewards, *rest)
 
-    def watch_reward(self: CuReSAC, error: th.Tensor) -> th.Tensor:
-        seen["reward"] = curious_reward(self, error)
+    def watch_reward(self: CuReSAC, *arguments: Any) -> th.Tensor:
+        seen["reward"] = update_intrinsic(self, *arguments)
         return seen["reward"]
 
     monkeypatch.setattr(CuReSAC, "_update_actor_critic", watch_update)
-    monkeypatch.setattr(CuReSAC, "_curious_reward", watch_reward)
+    monkeypatch.setattr(CuReSAC, "_update_intrinsic", watch_reward)
     np.random.seed(5)
     raw = model.replay_buffer.sample(8).rewards
     np.random.seed(5)
@@ -243,9 +242,7 @@ def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
 @pytest.mark.parametrize("buffer", [None, HerReplayBuffer])
 def test_dictionaries_with_extras_are_refused(kwargs: dict[str, Any], buffer: Any) -> None:
     """At once, whatever the replay buffer: nothing is half done."""
-    with pytest.raises(
-        ValueError, match=r"observations are Dict\(.*shared encoder reads one image or one vector: keep"
-    ):
+    with pytest.raises(ValueError, match="need a kind of CuRePolicy"):
         CuReSAC("MultiInputPolicy", Goal(), replay_buffer_class=buffer, **kwargs)
 
 
@@ -392,7 +389,7 @@ def test_custom_objects(agent: str, tmp_path: Path) -> None:
     loaded.learn(20)
     # Targets move towards networks that stay, and running statistics run.
     moving = [
-        name for name in differences(before, state_of(loaded)["policy"]) if not ("target" in name or "iosity" in name)
+        name for name in differences(before, state_of(loaded)["policy"]) if not ("target" in name or ".scale." in name)
     ]
     assert moving == []
 
@@ -412,15 +409,6 @@ def test_devices(agent: str, tmp_path: Path) -> None:
         assert loaded.device.type == "cpu"
         np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], action)
         loaded.learn(15)
-
-
-@OURS
-def test_a_device_without_data_is_refused(agent: str, tmp_path: Path) -> None:
-    agent_of(agent, vectors()).save(tmp_path / "model")
-    with pytest.raises(
-        ValueError, match="device is 'meta', which PyTorch cannot use here: use 'auto', 'cpu', or 'cuda'"
-    ):
-        CuReSAC.load(tmp_path / "model", device="meta")
 
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")

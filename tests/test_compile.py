@@ -185,9 +185,3 @@ def test_plain_sac_is_never_compiled(capsys: pytest.CaptureFixture[str]) -> None
     model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None, compile=True, verbose=1).learn(12)
     assert not any(module._compiled_call_impl for module in model.policy.modules())
     assert "compile" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("value", ["yes", None, 2, "True"])
-def test_unknown_values_are_refused(value: object) -> None:
-    with pytest.raises(ValueError, match=r"compile is .*, but it must be one of 'auto', True, False: choose one"):
-        tiny_model("CnnPolicy", PixelBox(), compile=value)

@@ -99,7 +99,7 @@ def test_terminations_count_for_the_task_alone(update: str) -> None:
         model.replay_buffer.timeouts[:] = 0
         for done in (0, 1):
             model.replay_buffer.dones[:] = done
-            model._n_updates = 0  # the noise of the same draws
+            model._n_rl_batches = 0  # the noise of the same draws
             losses[episodic, done] = one_update(model)
     for episodic in (True, False):
         assert losses[episodic, 0]["critic_loss"] != losses[episodic, 1]["critic_loss"]

@@ -72,9 +72,3 @@ def test_scaled_images_are_refused() -> None:
     module = DeterministicActor(tiny_model("CnnPolicy", PixelBox()))
     with pytest.raises(ValueError, match=r"observations are torch.float32, but images must be uint8"):
         module(th.rand(1, 6, 36, 36))
-
-
-def test_actors_are_not_asked_as_sb3s_are() -> None:
-    model = tiny_model("CnnPolicy", PixelBox())
-    with pytest.raises(ValueError, match="it reads the shared encoder's features: call the policy, or"):
-        model.actor(th.zeros(1, 6, 36, 36, dtype=th.uint8), deterministic=True)

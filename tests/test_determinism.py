@@ -117,7 +117,7 @@ def test_another_seed_is_another_run(twice: tuple[Path, Path], tmp_path: Path) -
     make_run(tmp_path, name, seed=1)
     assert rows_of(tmp_path) != rows_of(twice[0] / name)
     found = differences(*(th.load(folder / "final.pt", weights_only=False) for folder in (tmp_path, twice[0] / name)))
-    assert {".buffer.frames", ".buffer.actions", ".state.policy.actor.mu.weight"} <= set(found)
+    assert {".buffer.frames", ".buffer.actions", ".state.policy.task.actor.mu.weight"} <= set(found)
 
 
 def test_a_seed_that_is_set_later_holds_for_the_mixer_too() -> None:
@@ -126,5 +126,5 @@ def test_a_seed_that_is_set_later_holds_for_the_mixer_too() -> None:
     for _ in range(2):
         model = tiny_model("MlpPolicy", VectorBox(), seed=None, curiosity_prob=0.5)
         model.set_random_seed(5)
-        shares.append([model._mixer.choose(4, 1.0).tolist() for _ in range(20)])
+        shares.append([model._mixer.choose(4, 0.5, 1, 1.0).tolist() for _ in range(20)])
     assert shares[0] == shares[1]

@@ -12,10 +12,9 @@ from PIL import Image
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, Samples
 from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import even_negatives, evenly_measured, most_uncomfortable, run_episodes
 from sb3_cure.experiments import plots
@@ -220,7 +219,8 @@ def test_most_uncomfortable_equals_brute_force(n_envs: int, kwargs: dict[str, An
         np.testing.assert_allclose(found.errors, [error for _, _, error in chosen], rtol=1e-4)
         assert found.ages.tolist() == [age * n_envs for age, _, _ in chosen]
         assert found.observations.dtype == np.uint8
-        batch = ReplayBufferSamples(th.as_tensor(found.observations), *[None] * 4)
+        images = th.as_tensor(found.observations)
+        batch = Samples(images, *[None] * 4, views=images)
         with th.no_grad():
             errors = model.policy.srl.error(batch, model.policy.encode(batch.observations))
         np.testing.assert_allclose(errors, found.errors, rtol=1e-4)
@@ -271,7 +271,7 @@ def test_observations_are_normalised_as_in_training() -> None:
     (episode,) = run_episodes(model, VectorBox(), 1, seed=5)
     seen = venv.normalize_obs(episode.observations)
     assert np.abs(seen - episode.observations).max() > 0.1
-    batch = ReplayBufferSamples(th.as_tensor(seen), *[None] * 4)
+    batch = Samples(th.as_tensor(seen), *[None] * 4, views=th.as_tensor(seen))
     with th.no_grad():
         errors = model.policy.srl.error(batch, model.policy.encode(batch.observations))
     np.testing.assert_allclose(episode.srl_errors, errors, rtol=1e-4)

@@ -11,7 +11,7 @@ from envs_for_tests import PixelBox, differences, state_of, tiny_model
 from stable_baselines3.common.logger import configure
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import Samples
+from sb3_cure.buffers import Samples, transitions
 from sb3_cure.guards import LARGEST_NORM, Guard, NonFiniteError
 from sb3_cure.srl import SRLHead, SRLOutput
 
@@ -85,8 +85,8 @@ def test_crash_report_holds_the_batch(tmp_path: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     assert report["source"] == "task critic" and report["agent_steps"] == 14
     batch = np.load(folder / "batch.npz")
-    stacks, _ = model.replay_buffer.stacks(np.array(report["rows"]), np.array(report["environments"]))
-    np.testing.assert_array_equal(batch["observations"], stacks)
+    stored = transitions(model.replay_buffer, np.array(report["rows"]), np.array(report["environments"]))
+    np.testing.assert_array_equal(batch["observations"], stored.observations)
     assert np.isinf(batch["rewards"]).all()
 
 

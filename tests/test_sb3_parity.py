@@ -670,7 +670,7 @@ def test_save_to_memory_exclude_and_include(extras: dict[str, Any], tmp_path: Pa
         warnings.simplefilter("error")
         partial = CuReSAC.load(tmp_path / "model.zip")
     assert partial.learning_starts == 1000  # the constructor's default
-    with pytest.raises(ValueError, match="policy_kwargs"):
+    with pytest.raises(ValueError, match=r"policy.kwargs"):
         CuReSAC.load(tmp_path / "model.zip", policy_kwargs=dict(net_arch=[3]))
 
 
