@@ -12,6 +12,7 @@ import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
+from sb3_contrib import TQC
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import (
@@ -33,7 +34,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac import policies as sb3_policies
 from torch import nn
 
-from sb3_cure import CuReSAC
+from sb3_cure import CuReSAC, CuReTQC
 
 OFF: dict[str, Any] = dict(srl=None, curiosity=None)
 ON: dict[str, Any] = dict(srl="rae", curiosity="separate")
@@ -44,8 +45,15 @@ def vec_env(n_envs: int, make: Callable[[], gym.Env] = VectorBox) -> DummyVecEnv
     return DummyVecEnv([lambda: Monitor(make())] * n_envs)
 
 
-def pair(policy: str, make_env: Callable[[], Any], total_timesteps: int, ours: dict[str, Any] | None = None, **kwargs):
-    """SB3's SAC and CuReSAC with equal settings, after learning on environments of their own.
+def pair(
+    policy: str,
+    make_env: Callable[[], Any],
+    total_timesteps: int,
+    ours: dict[str, Any] | None = None,
+    classes: tuple[type, type] = (SAC, CuReSAC),
+    **kwargs: Any,
+):
+    """A base class (SB3's SAC) and ours with equal settings, after learning on environments of their own.
 
     Two constructor defaults differ (the paper's, not SB3's), so the settings that have such defaults are all given.
     """
@@ -55,7 +63,7 @@ def pair(policy: str, make_env: Callable[[], Any], total_timesteps: int, ours: d
     )  # fmt: skip
     settings.update(kwargs)
     models = []
-    for cls, extra in ((SAC, {}), (CuReSAC, {**OFF, **(ours or {})})):
+    for cls, extra in zip(classes, ({}, {**OFF, **(ours or {})}), strict=True):
         action_noise = settings.get("action_noise")
         noise = {} if action_noise is None else {"action_noise": action_noise()}
         model = cls(policy, make_env(), **{**settings, **noise, **extra})
@@ -89,6 +97,19 @@ def test_500_updates_on_pixels_equal_sb3() -> None:
     sb3, ours = pair("CnnPolicy", lambda: PixelBox(frame_stack=1), 520, policy_kwargs=small_cnn())
     assert isinstance(ours.actor.features_extractor, NatureCNN)
     assert_same_run(sb3, ours, 500)
+
+
+def test_updates_of_tqc_equal_sb3_contrib() -> None:
+    """Pendulum, with quantiles dropped: every parameter and optimiser state has the bits of sb3-contrib's TQC."""
+    settings = dict(policy_kwargs=dict(net_arch=[32, 32], n_quantiles=9), top_quantiles_to_drop_per_net=3)
+    tqc, ours = pair("MlpPolicy", lambda: gym.make("Pendulum-v1"), 170, classes=(TQC, CuReTQC), **settings)
+    assert type(ours.policy) is type(tqc.policy)
+    assert_same_run(tqc, ours, 150)
+
+
+def test_pixel_updates_of_tqc_equal_sb3_contrib() -> None:
+    tqc, ours = pair("CnnPolicy", PixelBox, 120, classes=(TQC, CuReTQC), policy_kwargs=small_cnn())
+    assert_same_run(tqc, ours, 100)
 
 
 class BatchNorm(BaseFeaturesExtractor):

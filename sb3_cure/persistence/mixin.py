@@ -1,5 +1,6 @@
 """Saving, loading and exact resume for any of SB3's off-policy algorithms."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,13 +24,13 @@ class Persistence(SavesModels, SavesReplayBuffers):
     nothing that it names. With ``ExactCheckpoint`` as a callback, ``resume`` goes on with a training that was killed.
     """
 
-    _run: Run
     #: What the running ``learn`` is to checkpoints: a call of this name
     _call_name = "learn"
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        self._run = Run()
-        super().__init__(*args, **kwargs)
+    @cached_property
+    def _run(self) -> Run:
+        """What the model knows of the training that it is in, beside what it saves."""
+        return Run()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_run", "_call_name"]
