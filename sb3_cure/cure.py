@@ -5,7 +5,6 @@ which each update of Algorithm 1 is a method. What differs between SAC and TQC i
 encoder they share, in ``encoder_update.py``.
 """
 
-from collections.abc import Iterable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -29,7 +28,7 @@ from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.metrics import Metrics
 from sb3_cure.mixers import CuriousMixer
 from sb3_cure.policies import ActorCritic, CuRePolicy
-from sb3_cure.precision import autocast_context, resolve_compile, resolve_precision
+from sb3_cure.precision import resolve_compile, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 
 #: Latents with their graph, and the copy of them that a loss reads: its gradient stops there
@@ -247,7 +246,8 @@ class CuRe(OffPolicyAlgorithm):
         self.policy_kwargs = user_kwargs
         self._critics = self.critics(self)
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
-        self.policy.encoder_update.autocast = partial(autocast_context, self._computed_precision, self.device)
+        enabled = self._computed_precision == "bf16"
+        self.policy.encoder_update.autocast = partial(th.autocast, self.device.type, th.bfloat16, enabled=enabled)
         self._compiles, sentence = resolve_compile(self.compile, self.device)
         if self._compiles:
             self.policy.compile_networks()
@@ -609,24 +609,20 @@ class CuRe(OffPolicyAlgorithm):
         self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, source: str, read: list[Read]
     ) -> None:
         """A loss steps its own parameters and gives the encoder its gradient, along which a sequential update steps."""
-        self._optimize(name, loss, optimizer, [latents for _, latents in read if latents.requires_grad])
-        gradients = [(graph, latents.grad) for graph, latents in read if latents.grad is not None]
-        if gradients:
-            self.policy.encoder_update.backward(source, gradients)
-            if self.update == "sequential":
-                self.policy.encoder_update.step(self._optimize)
+        self._optimize(name, loss, optimizer, *(latents for _, latents in read if latents.requires_grad))
+        self.policy.encoder_update.backward(source, read)
+        if self.update == "sequential":
+            self.policy.encoder_update.step(self._optimize)
 
-    def _optimize(
-        self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, also: Iterable[th.Tensor] = ()
-    ) -> None:
+    def _optimize(self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, *also: th.Tensor) -> None:
         """Gradients of the optimiser's parameters, and of nothing else but ``also``; a look at them; its step."""
-        inputs = [p for g in optimizer.param_groups for p in g["params"] if p.requires_grad] if optimizer else []
+        inputs = list(also)
         if optimizer is not None:
             optimizer.zero_grad()
-        inputs.extend(also)
+            inputs += [p for group in optimizer.param_groups for p in group["params"] if p.requires_grad]
         if inputs:
             loss.backward(inputs=inputs)
-        self._guard.step(name, loss, optimizer, also)
+        self._guard.step(name, loss, optimizer, inputs)
 
     @property
     def _progress_remaining(self) -> float:
@@ -634,7 +630,8 @@ class CuRe(OffPolicyAlgorithm):
         return max(self._current_progress_remaining, 0.0)
 
     def _autocast(self, enabled: bool = True) -> th.autocast:
-        return autocast_context(self._computed_precision if enabled else "fp32", self.device)
+        """Context in which convolutions and linear maps compute in bf16, if they are to; weights stay fp32."""
+        return th.autocast(self.device.type, th.bfloat16, enabled=enabled and self._computed_precision == "bf16")
 
     def dump_logs(self) -> None:
         """Write the logs, and look at what a GPU has found."""

@@ -129,12 +129,16 @@ class EncoderUpdate:
                 run = self._runs[which] = Encoded(features, self.encoder.projection(features).float())
         return run
 
-    def backward(self, source: str, gradients: Sequence[tuple[th.Tensor, th.Tensor]]) -> None:
-        """Take a loss's gradient.
+    def backward(self, source: str, read: Sequence[tuple[th.Tensor, th.Tensor]]) -> None:
+        """Take a loss's gradient, if it has one.
 
         :param source: Name of the loss
-        :param gradients: Latents with their graph, and the gradient of the loss at each, [B, features_dim]
+        :param read: Latents with their graph, and the copy of each that the loss read, with its gradient,
+            [B, features_dim]
         """
+        gradients = [(latents, copy.grad) for latents, copy in read if copy.grad is not None]
+        if not gradients:
+            return
         norm = th.stack(th._foreach_norm([gradient for _, gradient in gradients])).norm()
         self.gradient_norms[source] = norm
         if self._n_updates % SHARE_INTERVAL == 0:
@@ -152,7 +156,7 @@ class EncoderUpdate:
             self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
             size = (self.mean_squares[source] / self.weights[source]).sqrt().clamp(min=1e-30)
             gradients = [(latents, gradient / size) for latents, gradient in gradients]
-        self._pulls[source] = list(gradients)
+        self._pulls[source] = gradients
 
     def step(self, optimize: Optimize) -> None:
         """Move the encoder along the gradients that were given since the last step; without any, do nothing.

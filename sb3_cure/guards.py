@@ -68,35 +68,25 @@ class Guard:
         self._bad = None
 
     def step(
-        self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, also: Iterable[th.Tensor] = ()
+        self, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None, tensors: Iterable[th.Tensor]
     ) -> None:
         """Step, unless the loss or a gradient is not finite.
 
         :param name: Name of the loss
         :param loss: Scalar, of which the gradients have been computed
         :param optimizer: Makes the step; None: there is none to make
-        :param also: Further tensors whose gradients are looked at
+        :param tensors: What the loss has gradients of
         :raises NonFiniteError: if something is not finite, unless that is found out later
         """
-        owned = [p for group in optimizer.param_groups for p in group["params"]] if optimizer is not None else []
-        gradients = [tensor.grad for tensor in [*owned, *also] if tensor.grad is not None]
+        gradients = [tensor.grad for tensor in tensors if tensor.grad is not None]
         loss = loss.detach().float()
         norm = th.stack(th._foreach_norm(gradients)).norm() if gradients else th.zeros_like(loss)
         if self.deferred:
             self._look_later(name, loss, norm)
         elif not (math.isfinite(loss) and norm <= LARGEST_NORM):
             raise NonFiniteError(name, float(loss), float(norm), self._update)
-        if optimizer is not None:
-            self._step(optimizer)
-
-    def _look_later(self, name: str, loss: th.Tensor, norm: th.Tensor) -> None:
-        bad = ~(loss.isfinite() & (norm <= LARGEST_NORM))
-        now = th.stack([loss, norm, th.full_like(loss, self._update)])
-        first = self._first.get(name, th.full_like(now, -1))
-        self._first[name] = th.where(bad & (first[2] < 0), now, first)
-        self._bad = bad.float() if self._bad is None else th.maximum(self._bad, bad.float())
-
-    def _step(self, optimizer: th.optim.Optimizer) -> None:
+        if optimizer is None:
+            return
         if self._bad is None:
             optimizer.step()
         elif all(group.get("fused") for group in optimizer.param_groups):
@@ -108,6 +98,13 @@ class Guard:
                 del optimizer.found_inf  # type: ignore[attr-defined]
         elif not self._bad:  # other optimisers know no flag: the device is waited for
             optimizer.step()
+
+    def _look_later(self, name: str, loss: th.Tensor, norm: th.Tensor) -> None:
+        bad = ~(loss.isfinite() & (norm <= LARGEST_NORM))
+        now = th.stack([loss, norm, th.full_like(loss, self._update)])
+        first = self._first.get(name, th.full_like(now, -1))
+        self._first[name] = th.where(bad & (first[2] < 0), now, first)
+        self._bad = bad.float() if self._bad is None else th.maximum(self._bad, bad.float())
 
     def rate(self, rate: float) -> float | th.Tensor:
         """

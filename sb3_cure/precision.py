@@ -38,15 +38,6 @@ def resolve_precision(precision: str, device: th.device, observation_space: spac
     return precision
 
 
-def autocast_context(precision: str, device: th.device) -> th.autocast:
-    """
-    :param precision: ``"fp32"`` or ``"bf16"``
-    :param device: Device of the networks
-    :return: Context in which convolutions and linear maps use that format; weights stay fp32
-    """
-    return th.autocast(device.type, th.bfloat16, enabled=precision == "bf16")
-
-
 @functools.cache
 def _why_not_compiled(device_type: str) -> str | None:
     """What keeps torch.compile from working here, or None. Only trying tells: it needs a C++ compiler, for GPUs Triton,

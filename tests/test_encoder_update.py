@@ -37,6 +37,13 @@ class Linear(nn.Module):
         return self.projection(self.trunk(observations))
 
 
+def with_gradient(gradient: th.Tensor) -> th.Tensor:
+    """What a loss has read, with the gradient that it left there."""
+    copy = th.zeros_like(gradient)
+    copy.grad = gradient
+    return copy
+
+
 def inputs(step: int) -> th.Tensor:
     return th.randn(5, 4, generator=th.Generator().manual_seed(step))
 
@@ -58,7 +65,7 @@ def optimize(name: str, loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
 def give(update: EncoderUpdate, source: str, scale: float = 1.0) -> None:
     """A source's gradient, with the step that follows in sequential mode."""
     latents = update.run().latents
-    update.backward(source, [(latents, gradient(source, latents, scale))])
+    update.backward(source, [(latents, with_gradient(gradient(source, latents, scale)))])
     if update.mode == "sequential":
         update.step(optimize)
 
@@ -168,7 +175,9 @@ def test_joint_step_is_as_long_as_sequential_steps() -> None:
             before = values(encoder)
             update.begin(th.ones(1, 1), th.ones(1, 1))
             for source, size in sizes.items():
-                update.backward(source, [(update.run().latents, size * th.randn(1, 64, generator=noise))])
+                update.backward(
+                    source, [(update.run().latents, with_gradient(size * th.randn(1, 64, generator=noise)))]
+                )
                 if mode == "sequential":
                     update.step(optimize)
             update.step(optimize)
@@ -199,7 +208,7 @@ def test_gradients_through_next_latents_count(mode: str) -> None:
     update.begin(inputs(0), inputs(1))
     runs = [update.run(), update.next_run(gradient=True)]
     given = [gradient("task", run.latents) for run in runs]
-    update.backward("srl", [(run.latents, grad) for run, grad in zip(runs, given, strict=True)])
+    update.backward("srl", [(run.latents, with_gradient(grad)) for run, grad in zip(runs, given, strict=True)])
     update.step(optimize)
     loss = LOSSES["task"](expected(inputs(0))) + LOSSES["task"](expected(inputs(1)))
     size = 1.0 if mode == "sequential" else float(th.stack([grad.square().sum() for grad in given]).sum().sqrt())
@@ -216,7 +225,7 @@ def test_update_that_was_broken_off_is_forgotten(mode: str) -> None:
     encoder, update = make(mode)
     other, fresh = make(mode)
     update.begin(inputs(0), inputs(0))
-    update.backward("task", [(update.run().latents, th.ones(5, 3))])
+    update.backward("task", [(update.run().latents, with_gradient(th.ones(5, 3)))])
     update.mean_squares["task"], update.weights["task"] = th.zeros(()), 0.0
     whole(update, 1)
     whole(fresh, 1)
@@ -229,7 +238,7 @@ def test_other_optimizers_and_their_arguments(mode: str) -> None:
     encoder, update = make(mode, ("task",), optimizer_class=th.optim.SGD, weight_decay=0.5)
     before = values(encoder)
     update.begin(inputs(0), inputs(0))
-    update.backward("task", [(update.run().latents, th.zeros(5, 3))])
+    update.backward("task", [(update.run().latents, with_gradient(th.zeros(5, 3)))])
     update.step(optimize)
     th.testing.assert_close(values(encoder), before * (1 - LR * 0.5))
 
@@ -390,7 +399,7 @@ def test_shares_of_joint_steps_are_measured_at_the_parameters() -> None:
     for source, pull in pulls.items():
         moved = th.autograd.grad(latents, list(encoder.trunk.parameters()), pull, retain_graph=True)
         sizes[source] = float(th.stack([part.square().sum() for part in moved]).sum().sqrt())
-        update.backward(source, [(latents, pull)])
+        update.backward(source, [(latents, with_gradient(pull))])
     update.step(optimize)
     logged = update.end()
     assert float(logged["latent_grad_norm_srl"]) == float(logged["latent_grad_norm_task"])

@@ -106,7 +106,7 @@ def test_guard_steps_along_sound_gradients_alone(loss: float, gradient: float, s
     guard = Guard(deferred)
     guard.begin(7)
     try:
-        guard.step("some", th.tensor(loss), optimizer)
+        guard.step("some", th.tensor(loss), optimizer, [parameter])
         guard.report()
         found = None
     except NonFiniteError as error:
@@ -120,14 +120,14 @@ def test_deferred_guard_skips_the_rest_of_the_update() -> None:
     guard = Guard(deferred=True)
     first, second, third = (parameter_with(1.0) for _ in range(3))
     guard.begin(1)
-    guard.step("bad", th.tensor(np.nan), first[1])
-    guard.step("good", th.tensor(1.0), second[1])
+    guard.step("bad", th.tensor(np.nan), first[1], [first[0]])
+    guard.step("good", th.tensor(1.0), second[1], [second[0]])
     assert th.equal(first[0], th.ones(3)) and th.equal(second[0], th.ones(3))
     assert float(guard.rate(0.5)) == 0
     guard.begin(2)
-    guard.step("worse", th.tensor(np.inf), None)
+    guard.step("worse", th.tensor(np.inf), None, [])
     guard.begin(3)
-    guard.step("good", th.tensor(1.0), third[1])
+    guard.step("good", th.tensor(1.0), third[1], [third[0]])
     assert guard.rate(0.5) == 0.5 and not th.equal(third[0], th.ones(3))
     with pytest.raises(NonFiniteError) as caught:
         guard.report()
@@ -141,8 +141,8 @@ def test_deferred_guard_knows_other_optimizers() -> None:
     optimizer = th.optim.SGD([parameter], lr=0.1)
     guard = Guard(deferred=True)
     guard.begin(1)
-    guard.step("bad", th.tensor(np.nan), optimizer)
+    guard.step("bad", th.tensor(np.nan), optimizer, [parameter])
     assert th.equal(parameter, th.ones(3))
     guard.begin(2)
-    guard.step("good", th.tensor(1.0), optimizer)
+    guard.step("good", th.tensor(1.0), optimizer, [parameter])
     assert not th.equal(parameter, th.ones(3))
