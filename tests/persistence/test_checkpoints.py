@@ -255,7 +255,9 @@ def _wait_for_generation(folder: Path, number: int, process: Any) -> None:
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize(("name", "delay"), [("rae, joint", 0.0), ("curl, sequential", 0.02), ("workers", 0.03)])
+@pytest.mark.parametrize(
+    ("name", "delay"), [("rae, joint", 0.0), ("curl, sequential", 0.02), ("pretraining", 0.01), ("workers", 0.03)]
+)
 def test_kill_9_loses_nothing(
     name: str, delay: float, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
