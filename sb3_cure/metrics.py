@@ -26,7 +26,6 @@ class Metrics(KVWriter):
         self.latest: dict[str, th.Tensor] = {}
         self._sums: dict[str, th.Tensor] = {}
         self._counts: dict[str, int] = {}
-        self._next_picture = 0
         self._logger: Logger | None = None
 
     def attach(self, logger: Logger) -> None:
@@ -56,14 +55,13 @@ class Metrics(KVWriter):
                 self._logger.record(key, value)
 
     def log_reconstructions(self, model: OffPolicyAlgorithm, batch: Samples) -> None:
-        """Now and then, for loggers that keep pictures (TensorBoard).
+        """After the first update and now and then, for loggers that keep pictures (TensorBoard).
 
         :param model: The model
         :param batch: The samples that it has just learned from
         """
         keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
-        if keeps and model._n_updates >= self._next_picture:
-            self._next_picture = model._n_updates + RECONSTRUCTION_INTERVAL
+        if keeps and model._n_updates % RECONSTRUCTION_INTERVAL == 1:
             strip = reconstruction_strip(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
             if strip is not None:
                 image = Image(strip, "CHW")
@@ -82,17 +80,15 @@ class Metrics(KVWriter):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: What was recorded since the last dump, and when the next picture is due
+        :return: What was recorded since the last dump
         """
-        sums = {key: value.cpu() for key, value in self._sums.items()}
-        return {"sums": sums, "counts": dict(self._counts), "next_picture": self._next_picture}
+        return {"sums": {key: value.cpu() for key, value in self._sums.items()}, "counts": dict(self._counts)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: Of ``state_dict``
         """
         self._sums, self._counts = dict(state["sums"]), dict(state["counts"])
-        self._next_picture = state["next_picture"]
 
 
 @th.no_grad()
