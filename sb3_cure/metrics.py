@@ -26,7 +26,6 @@ class Metrics(KVWriter):
         self.latest: dict[str, th.Tensor] = {}
         self._sums: dict[str, th.Tensor] = {}
         self._counts: dict[str, int] = {}
-        self._next_picture = 0
         self._logger: Logger | None = None
 
     def attach(self, logger: Logger) -> None:
@@ -56,14 +55,13 @@ class Metrics(KVWriter):
                 self._logger.record(key, value)
 
     def log_reconstructions(self, model: OffPolicyAlgorithm, batch: Samples) -> None:
-        """Now and then, for loggers that keep pictures (TensorBoard).
+        """After the first update and now and then, for loggers that keep pictures (TensorBoard).
 
         :param model: The model
         :param batch: The samples that it has just learned from
         """
         keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
-        if keeps and model._n_updates >= self._next_picture:
-            self._next_picture = model._n_updates + RECONSTRUCTION_INTERVAL
+        if keeps and model._n_updates % RECONSTRUCTION_INTERVAL == 1:
             strip = reconstruction_strip(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
             if strip is not None:
                 image = Image(strip, "CHW")

@@ -38,9 +38,10 @@ from benchmarks.fuzz import (
     watching,
     zip_of,
 )
-from sb3_cure import CuReSAC
-from sb3_cure.buffers import SkippingReplayBuffer
+from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.buffers import Samples, SkippingReplayBuffer
 from sb3_cure.encoders import VectorEncoder
+from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.persistence import ArchiveError, Persistence
 
 
@@ -147,7 +148,7 @@ def test_attributes_of_subclasses_and_users_come_back() -> None:
     "kwargs",
     [
         dict(srl_kwargs=OrderedDict(latent_penalty=1e-6), policy_kwargs=dict(net_arch=dict(pi=(8,), qf=[np.int64(8)]))),
-        dict(seed=np.int64(3), ent_coef=np.str_("auto_0.1"), srl=np.str_("rae"), batch_size=np.int64(2)),
+        dict(ent_coef=np.str_("auto_0.1"), srl=np.str_("rae"), batch_size=np.int64(2)),
         {name: np.float32(0.5) for name in ("tau", "gamma", "curiosity_prob", "target_entropy", "ent_coef")},
     ],
     ids=["containers", "texts", "numbers"],
@@ -293,6 +294,43 @@ def test_moments_lie_in_memory_as_their_weights(fused: bool, tmp_path: Path) -> 
         th.manual_seed(0)
         each.train(2, batch_size=8)
     assert differences(state_of(model), state_of(loaded)) == []
+
+
+class Seen(IntrinsicReward):
+    """Learned by a convolution of its own."""
+
+    def __init__(self, *args: Any):
+        super().__init__(*args)
+        self.conv = nn.Conv2d(6, 3, 3).to(memory_format=th.channels_last)
+
+    def loss(self, batch: Samples, latents: Any, next_latents: Any, srl_error: Any) -> tuple[th.Tensor, th.Tensor]:
+        error = self.conv(batch.observations.float() / 255).square().mean(dim=(1, 2, 3))
+        return error.mean(), error.detach()
+
+
+@pytest.mark.parametrize("algorithm", [CuReSAC, CuReTQC])
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_moments_of_every_part_are_laid_out(algorithm: type[CuReSAC | CuReTQC], update: str, tmp_path: Path) -> None:
+    """Of the encoder's optimisers, which are held by name, of the head's and the reward's."""
+    model = tiny_model("CnnPolicy", PixelBox(), algorithm, update=update, intrinsic=Seen).learn(12)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", custom_objects={"intrinsic": Seen})
+    policy, laid_out, permuted = loaded.policy, set(), set()
+    named = {
+        **policy.encoder_update.optimizers,
+        "head": policy.srl.optimizer,
+        "reward": policy.intrinsic.optimizer,
+        "temperature": policy.curious.ent_coef_optimizer,
+        **{f"{name} actor": agent.actor.optimizer for name, agent in policy.agents.items()},
+        **{f"{name} critic": agent.critic.optimizer for name, agent in policy.agents.items()},
+    }
+    for name, optimizer in named.items():
+        for parameter, state in optimizer.state.items():
+            assert state["exp_avg"].stride() == state["exp_avg_sq"].stride() == parameter.stride(), name
+            laid_out.add(name)
+            permuted |= set() if parameter.is_contiguous() else {name}
+    assert laid_out == named.keys()
+    assert permuted == {*policy.encoder_update.optimizers, "head", "reward"}, "or nothing was compared"
 
 
 @pytest.mark.parametrize("moment", [th.zeros(()), th.zeros(1), th.zeros(10**4)], ids=lambda moment: str(moment.shape))

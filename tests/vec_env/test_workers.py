@@ -25,8 +25,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from sb3_cure import make_dmc_env
-from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure import buffers, make_dmc_env
+from sb3_cure.buffers import SkippingReplayBuffer
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv
 
@@ -149,13 +149,13 @@ class BreakDown(BaseCallback):
 def train_on_breaking_dmc() -> dict[str, Any]:
     env = made([breakable_dmc, breakable_dmc], timeout=4, frozen_steps=10)
     model = tiny_model("CnnPolicy", env, overlap=True)
-    sampled, original = [], FrameStackReplayBuffer.transitions
+    sampled, original = [], buffers.transitions
 
     def spy(buffer: Any, rows: np.ndarray, env_inds: np.ndarray, *rest: Any) -> Any:
         sampled.append(buffer.marked[rows, env_inds].any())
         return original(buffer, rows, env_inds, *rest)
 
-    FrameStackReplayBuffer.transitions = spy
+    buffers.transitions = spy
     breaking = BreakDown(list(SAID))
     model.learn(120, callback=breaking)
     buffer = model.replay_buffer
