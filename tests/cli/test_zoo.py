@@ -202,8 +202,8 @@ def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
 )
 def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., Any], changes: dict[str, Any]) -> None:
     """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
-    with pytest.raises(ValueError, match="VecNormalize"):
-        set_up(**changes)
+    with pytest.raises(ValueError, match="VecNormalize|this buffer stores"):
+        set_up(**changes)[0].learn(20)
 
 
 def test_rewards_of_stacked_frames_can_be_normalized(set_up: Callable[..., Any]) -> None:
@@ -345,7 +345,7 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
     assert type(played[0].policy.srl) is Gentle
     assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "episode_length:2") == 0
     assert "7 Episodes" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="observations"):
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
         replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40")
 
 
