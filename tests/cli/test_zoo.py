@@ -202,7 +202,7 @@ def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
 )
 def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., Any], changes: dict[str, Any]) -> None:
     """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
-    with pytest.raises(ValueError, match="VecNormalize|this buffer stores"):
+    with pytest.raises(ValueError, match=r"VecNormalize|this buffer stores"):
         set_up(**changes)[0].learn(20)
 
 
