@@ -74,10 +74,9 @@ test: gl  ## run the tests in two processes (options for pytest: make test PYTES
 	$(RUN) pytest -n 2 --dist worksteal $(PYTEST_ARGS)
 
 # What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
-# the replay buffer, wrong arguments, and the pixels of dm_control.
+# the replay buffer, CuRe's own arguments, and the pixels of dm_control.
 SMOKE := tests/test_sb3_parity.py tests/test_compatibility.py tests/test_buffers.py \
-	tests/test_bad_input.py::test_constructor tests/test_bad_input.py::test_unknown_keywords \
-	tests/test_envs.py::test_frames_and_rewards_are_those_of_dm_control
+	tests/test_arguments.py tests/envs/test_envs.py::test_frames_and_rewards_are_those_of_dm_control
 
 .venv-oldest/.installed: .venv/.installed setup.cfg constraints-oldest.txt
 	@rm -rf .venv-oldest

@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import PassiveEnvChecker
 from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
@@ -212,6 +213,9 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
         if not is_of_the_suite(layer._env):
             raise _NotPlain(f"the task {type(layer._env.task).__name__} is not one of dm_control.suite")
         own, attributes = integration_state(layer._env), {}
+    elif isinstance(layer, PassiveEnvChecker):
+        # It looks at the first steps alone, and until then keeps a whole one. To a resumed environment they are over.
+        attributes = {key: True for key in attributes if key.startswith("checked_")}
     elif isinstance(layer, DummyVecEnv | SubprocVecEnv):
         attributes = {"_seeds": layer._seeds, "_options": layer._options}
     elif isinstance(layer, VecEnv) and not isinstance(layer, VecEnvWrapper):

@@ -144,7 +144,7 @@ def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
 
 
 def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
-    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "srl_kwargs:dict(augmentation='shift', pad=1)"]
+    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "augmentation_kwargs:dict(pad=1)"]
     kwargs = ["--env-kwargs", "size:40", "--eval-env-kwargs", "size:44"]
     model, manager = set_up("-params", *overrides, *kwargs, "--seed", "3", srl="rae")
     assert (model.curiosity_prob, model.n_envs, model.srl, model.seed) == (0.5, 2, "curl", 3)
@@ -202,8 +202,8 @@ def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
 )
 def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., Any], changes: dict[str, Any]) -> None:
     """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
-    with pytest.raises(ValueError, match="VecNormalize"):
-        set_up(**changes)
+    with pytest.raises(ValueError, match=r"VecNormalize|this buffer stores"):
+        set_up(**changes)[0].learn(20)
 
 
 def test_rewards_of_stacked_frames_can_be_normalized(set_up: Callable[..., Any]) -> None:
@@ -345,7 +345,7 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
     assert type(played[0].policy.srl) is Gentle
     assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "episode_length:2") == 0
     assert "7 Episodes" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="observations"):
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
         replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40")
 
 
