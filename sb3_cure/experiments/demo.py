@@ -30,7 +30,8 @@ ENV_KWARGS: dict[str, Any] = dict(image_size=36, grayscale=True, camera_id=1, re
 # of the paper's updates.
 SETTINGS: dict[str, Any] = dict(
     srl="curl",
-    srl_kwargs=dict(augmentation="shift", pad=2),
+    augmentation="shift",
+    augmentation_kwargs=dict(pad=2),
     learning_starts=500,
     warmup_updates=300,
     gamma=0.98,

@@ -1,5 +1,6 @@
 """Saving, loading and exact resume for any of SB3's off-policy algorithms."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,13 +24,12 @@ class Persistence(SavesModels, SavesReplayBuffers):
     nothing that it names. With ``ExactCheckpoint`` as a callback, ``resume`` goes on with a training that was killed.
     """
 
-    _run: Run
     #: What the running ``learn`` is to checkpoints: a call of this name
     _call_name = "learn"
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        self._run = Run()
-        super().__init__(*args, **kwargs)
+    @cached_property
+    def _run(self) -> Run:  # made when it is first asked for: an ``__init__`` here would hide the algorithm's signature
+        return Run()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_run", "_call_name"]

@@ -144,7 +144,7 @@ def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
 
 
 def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
-    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "srl_kwargs:dict(augmentation='shift', pad=1)"]
+    overrides = ["curiosity_prob:0.5", "n_envs:2", "srl:'curl'", "augmentation_kwargs:dict(pad=1)"]
     kwargs = ["--env-kwargs", "size:40", "--eval-env-kwargs", "size:44"]
     model, manager = set_up("-params", *overrides, *kwargs, "--seed", "3", srl="rae")
     assert (model.curiosity_prob, model.n_envs, model.srl, model.seed) == (0.5, 2, "curl", 3)

@@ -116,7 +116,7 @@ def test_every_fast_entry_is_the_demos_settings(method: str, task: str, tmp_path
     model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
     expected = {**SETTINGS, **METHODS[method]}
     if model.srl == "rae":
-        expected.update(srl_kwargs={}, warmup_updates=1000)
+        expected.update(augmentation="auto", augmentation_kwargs={}, warmup_updates=1000)
     assert entry_of(path, task)["policy_kwargs"] == expected.pop("policy_kwargs")
     assert {name: getattr(model, name) for name in expected} == expected
     assert manager.env_kwargs == (ENV_KWARGS if "cartpole" in task else {"image_size": 48, "renderer": "fast"})
