@@ -279,14 +279,17 @@ class CuRe(OffPolicyAlgorithm):
 
     def _setup_temperatures(self) -> None:
         """The task's agent takes SB3's own; the curious one gets another."""
-        lr = self.lr_schedule(1) * self.ent_coef_lr_factor
         if self.log_ent_coef is not None:
-            self.policy.task.adopt_temperature(self.log_ent_coef, lr)
+            self.policy.task.adopt_temperature(self.log_ent_coef, self.lr_schedule(1) * self.ent_coef_lr_factor)
             self.ent_coef_optimizer = self.policy.task.ent_coef_optimizer
         else:
             self.policy.task.ent_coef_tensor = self.ent_coef_tensor
+        self._setup_curious_temperature()
+
+    def _setup_curious_temperature(self) -> None:
         if self.policy.curious is not None:
             ent_coef = self.ent_coef if self.curiosity_ent_coef is None else self.curiosity_ent_coef
+            lr = self.lr_schedule(1) * self.ent_coef_lr_factor
             self.policy.curious.set_temperature(ent_coef, lr, self.device)
 
     def _setup_learn(

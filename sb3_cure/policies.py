@@ -211,9 +211,6 @@ class CuRePolicy(BasePolicy):
             srl_kwargs=srl_kwargs,
             augmentation=augmentation,
             augmentation_kwargs=augmentation_kwargs,
-            intrinsic_class=intrinsic_class,
-            intrinsic_kwargs=intrinsic_kwargs,
-            encoder_sources=encoder_sources,
             update=update,
         )
         if augmentation == "auto":
@@ -252,6 +249,7 @@ class CuRePolicy(BasePolicy):
         self._intrinsic_seed = seed + 1
 
     def _build_intrinsic(self, intrinsic_class: type[IntrinsicReward], kwargs: dict[str, Any]) -> None:
+        self._intrinsic_kwargs = kwargs
         with _seeded(self._intrinsic_seed):
             self.intrinsic = intrinsic_class(
                 self.observation_space,
@@ -425,6 +423,8 @@ class CuRePolicy(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         del data["normalize_images"]
+        # Of what there is now: a curious agent may have come for a pretraining.
+        intrinsic = (None, None) if self.intrinsic is None else (type(self.intrinsic), self._intrinsic_kwargs)
         return data | dict(
             lr_schedule=self._dummy_schedule,
             net_arch=self.net_arch,
@@ -433,7 +433,10 @@ class CuRePolicy(BasePolicy):
             features_extractor_kwargs=self.features_extractor_kwargs,
             optimizer_class=self.optimizer_class,
             optimizer_kwargs=self.optimizer_kwargs,
+            intrinsic_class=intrinsic[0],
+            intrinsic_kwargs=intrinsic[1],
             curious=self.curious is not None,
+            encoder_sources=tuple(self.encoder_update.weights),
             default_agent=self.default_agent,
             **self._choices,
             **self.critic_kwargs,

@@ -13,12 +13,26 @@ Self = TypeVar("Self", bound="Pretraining")
 class Pretraining(CuRe):
     """Adds ``pretrain`` to CuRe: a ``learn`` with ``task=False``, after which the settings are what they were."""
 
-    #: What ``task`` and ``curiosity`` were before the pretraining that is under way; None: there is none
-    _before_pretraining: dict[str, Any] | None = None
     #: Of ``Persistence``: whether a script that is run again has nothing to do in this call
     _was_over: Callable[[str, bool], bool]
-    #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
-    _is_pretrained = False
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        #: What ``task`` and ``curiosity`` were before the pretraining that is under way; None: there is none
+        self._before_pretraining: dict[str, Any] | None = None
+        #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
+        self._is_pretrained = False
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        before, self._before_pretraining = self._before_pretraining, None
+        if before is None:
+            super()._setup_model()
+            return
+        # Of an archive that was saved while pretraining: its networks are those of before and what came on top of them.
+        collector = "curious" if self._has_curious_agent else "random"
+        self.task, self.curiosity = before["task"], before["curiosity"]
+        super()._setup_model()
+        self._begin_pretraining(collector)
 
     def pretrain(
         self: Self,
@@ -110,7 +124,7 @@ class Pretraining(CuRe):
         for source in self._policy_choices()["encoder_sources"]:
             if source not in update.mean_squares:
                 update.add_source(source)
-        self._setup_temperatures()
+        self._setup_curious_temperature()
 
     def _end_pretraining(self) -> None:
         if self._before_pretraining is None:

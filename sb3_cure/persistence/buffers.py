@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence.encoding import BUFFERS, ArchiveError, is_state, read_state, refusing, write_state
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
@@ -67,8 +67,6 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
     """
     with refusing(name):
         kind = model.replay_buffer_class
-        if kind is ReplayBuffer and state["class"] == SkippingReplayBuffer.__name__:
-            kind = SkippingReplayBuffer  # which the first mark has made of it
         if kind not in BUFFERS or kind is None or (state["class"], state["n_envs"]) != (kind.__name__, model.n_envs):
             own = "no replay buffer" if kind is None else f"a {kind.__name__}"
             raise ArchiveError(

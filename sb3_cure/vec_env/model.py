@@ -108,7 +108,3 @@ class ModelEnvironments(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_overlapped"]
-
-    def _stateful_parts(self) -> dict[str, Any]:
-        parts = super()._stateful_parts()  # type: ignore[misc]
-        return {**parts, "environments": self.env} if isinstance(self.env, FiniteCheck) else parts

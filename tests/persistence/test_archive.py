@@ -147,7 +147,7 @@ def test_attributes_of_subclasses_and_users_come_back() -> None:
     "kwargs",
     [
         dict(srl_kwargs=OrderedDict(latent_penalty=1e-6), policy_kwargs=dict(net_arch=dict(pi=(8,), qf=[np.int64(8)]))),
-        dict(seed=np.int64(3), ent_coef=np.str_("auto_0.1"), srl=np.str_("rae"), batch_size=np.int64(2)),
+        dict(ent_coef=np.str_("auto_0.1"), srl=np.str_("rae"), batch_size=np.int64(2)),
         {name: np.float32(0.5) for name in ("tau", "gamma", "curiosity_prob", "target_entropy", "ent_coef")},
     ],
     ids=["containers", "texts", "numbers"],

@@ -102,7 +102,10 @@ class Flawed(VectorBox):
 
 CASES = {
     "rae, joint": Case(pixels()),
-    "curl, sequential": Case(pixels(), {"srl": "curl", "srl_kwargs": {"crop_size": 32}, "update": "sequential"}),
+    "curl, sequential": Case(
+        pixels(),
+        {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 32}, "update": "sequential"},
+    ),
     "four environments, small ring": Case(pixels(4), {"buffer_size": 60}, steps=120),
     "frames on disk, small ring": Case(pixels(), {"buffer_size": 25}, frames_on_disk=True),
     "vectors": Case(vectors, policy="MlpPolicy"),

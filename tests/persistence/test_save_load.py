@@ -9,36 +9,33 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from envs_for_tests import PixelBox, VectorBox, differences, samples_of, state_of, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import CheckpointCallback
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import FrameStackReplayBuffer, Samples
 from sb3_cure.encoders import Encoder
 from sb3_cure.policies import CnnPolicy, CuRePolicy
 from sb3_cure.srl import SRLHead, SRLOutput
 
 
 class Denoising(SRLHead):
-    """A user's head: draw the clean image from the latents of a noisy one."""
+    """A user's head: draw the image from noisy latents."""
 
-    def __init__(self, encoder: Encoder, observation_space: spaces.Box, noise: float = 30.0):
+    def __init__(self, encoder: Encoder, observation_space: spaces.Box, noise: float = 0.1):
         super().__init__(encoder, observation_space)
         self.noise = noise
         self.decoder = nn.Linear(encoder.features_dim, int(np.prod(observation_space.shape)))
 
-    def augment(self, observations: th.Tensor) -> th.Tensor:
-        noisy = observations + self.noise * th.randn(observations.shape, device=observations.device)
-        return noisy.clamp(0, 255)
-
-    def loss(self, batch: ReplayBufferSamples, latents: th.Tensor) -> SRLOutput:
-        clean = self.preprocess(batch.observations).flatten(1)
-        error = (self.decoder(latents) - clean).square().mean(dim=1)
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        error = self.error(batch, latents + self.noise * th.randn_like(latents))
         return SRLOutput(error.mean(), error.detach())
+
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
+        return (self.decoder(latents) - self.preprocess(batch.views).flatten(1)).square().mean(dim=1)
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         drawn = self.decoder(latents).view(-1, *self.observation_space.shape)
@@ -61,7 +58,8 @@ def srl_errors(model: CuReSAC) -> th.Tensor | None:
     policy = model.policy
     if policy.srl is None:
         return None
-    batch = ReplayBufferSamples(th.as_tensor(IMAGES), *[None] * 4)  # type: ignore[arg-type]
+    images = th.as_tensor(IMAGES)
+    batch = Samples(images, *[None] * 4, views=policy.augmentation.center(images))  # type: ignore[arg-type]
     with th.no_grad():
         return policy.srl.error(batch, policy.encode(batch.observations))
 
@@ -129,7 +127,7 @@ def test_loaded_model_acts_and_learns_alike(
     model.learn(21)
     assert model._n_updates == 11
     if curiosity in ("separate", "bonus"):
-        assert model.policy.curiosity.weight > 0 and model.policy.curiosity.mean_square > 0
+        assert model.policy.scale.weight > 0 and model.policy.scale.variance > 0
     if srl == "curl":
         assert model.policy.srl.bank_filled == 64 and model.policy.srl.bank.any()
     check_save_load(model, PixelBox, tmp_path)
@@ -144,8 +142,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "curious about the next observation": dict(curiosity_gamma=0.0, curiosity_target="next_observation"),
     "curious critics do not train the encoder": dict(curiosity_encoder_grad=False, update="joint"),
     "bare curious reward": dict(normalize_curiosity=False, curiosity_beta=3.0),
-    "crops": dict(srl="curl", srl_kwargs=dict(crop_size=30, bank_size=9)),
-    "head's arguments": dict(srl=Denoising, srl_kwargs=dict(noise=3.0)),
+    "crops": dict(srl="curl", srl_kwargs=dict(bank_size=9), augmentation="crop", augmentation_kwargs=dict(size=30)),
+    "head's arguments": dict(srl=Denoising, srl_kwargs=dict(noise=0.3)),
     "three environments": dict(n_envs=3),
 }
 
@@ -293,7 +291,7 @@ def test_users_head_trains() -> None:
 def srl_loss(model: CuReSAC) -> float:
     policy = model.policy
     np.random.seed(0)
-    batch = model.replay_buffer.sample(64)
+    batch = samples_of(model, 64)
     with th.no_grad():
         return policy.srl.error(batch, policy.encode(batch.observations)).mean().item()
 
@@ -391,8 +389,9 @@ def test_policy_alone_acts_alike(srl: str | type[SRLHead] | None, curiosity: str
     for cls in (CnnPolicy, CuRePolicy):
         loaded = cls.load(tmp_path / "policy.pt")
         assert differences(dict(policy.state_dict()), dict(loaded.state_dict())) == []
-        for actor in ["actor"] + ["curious_actor"] * (curiosity is not None):
-            with policy.acting(actor), loaded.acting(actor):
+        assert ("curious" in loaded.agents) == (curiosity == "separate")
+        for agent in policy.agents:
+            with policy.acting(agent), loaded.acting(agent):
                 np.testing.assert_array_equal(
                     policy.predict(IMAGES, deterministic=True)[0], loaded.predict(IMAGES, deterministic=True)[0]
                 )
@@ -410,7 +409,7 @@ def test_policy_saved_while_pretraining(tmp_path: Path) -> None:
 
     model.pretrain(14, callback=save)
     loaded = CnnPolicy.load(tmp_path / "policy.pt")
-    with loaded.acting("curious_actor"):
+    with loaded.acting("curious"):
         np.testing.assert_array_equal(loaded.predict(IMAGES, deterministic=True)[0], actions[-1])
 
 

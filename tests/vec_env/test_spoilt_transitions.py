@@ -1,10 +1,9 @@
 """Nothing of a fault is sampled: buffers never draw transitions that their infos mark."""
 
 import os
-import pickle
 import signal
-from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,16 +13,13 @@ from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cure import buffers
-from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
-from sb3_cure.callbacks import _spread_over
+from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, transitions
+from sb3_cure.callbacks import ReconstructionCallback
 from sb3_cure.evaluation import most_uncomfortable
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
-
-ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
 
 pytestmark = pytest.mark.filterwarnings("ignore:Environment [0-9]+ :RuntimeWarning", "ignore:.*fork:DeprecationWarning")
 
@@ -119,83 +115,6 @@ def test_no_transition_that_spans_a_fault_is_sampled(data: st.DataObject) -> Non
         assert differences(tuple(batches[0]), tuple(batches[1])) == []
 
 
-def stream(n_envs: int, n_steps: int, marks: set[tuple[int, int]], key: str) -> Iterator[tuple[Any, ...]]:
-    """Transitions with their number as the reward; the marked ones have a key in ``info``."""
-    rng = np.random.default_rng(0)
-    obs = rng.integers(0, 256, (n_envs, 2, 3, 3), dtype=np.uint8)
-    for row in range(n_steps):
-        new = rng.integers(0, 256, (n_envs, 1, 3, 3), dtype=np.uint8)
-        next_obs = np.concatenate([obs[:, 1:], new], axis=1)
-        infos = [{key: "why"} if (row, i) in marks else {} for i in range(n_envs)]
-        numbers = np.arange(row * n_envs, (row + 1) * n_envs, dtype=np.float32)
-        yield obs, next_obs, rng.uniform(-1, 1, (n_envs, 2)), numbers, np.zeros(n_envs), infos
-        obs = next_obs
-
-
-def buffer_of(kind: type[ReplayBuffer], size: int, n_envs: int) -> Any:
-    space = spaces.Box(0, 255, (2, 3, 3), np.uint8)
-    stacks = {"frame_stack": 2} if kind is FrameStackReplayBuffer else {}
-    return kind(size, space, ACTIONS, "cpu", n_envs, **stacks)
-
-
-@pytest.mark.parametrize("kind", [FrameStackReplayBuffer, SkippingReplayBuffer])
-@pytest.mark.parametrize("key", buffers.MARKS)
-def test_other_transitions_are_drawn_evenly(kind: type[ReplayBuffer], key: str) -> None:
-    marks = {(0, 0), (1, 0), (1, 1), (3, 1), (5, 0)}
-    buffer = buffer_of(kind, 16, 2)
-    for transition in stream(2, 8, marks, key):
-        buffer.add(*transition)
-    good = {row * 2 + i for row in range(8) for i in range(2) if (row, i) not in marks}
-    np.random.seed(0)
-    drawn, counts = np.unique(buffer.sample(110_000).rewards.numpy().astype(int), return_counts=True)
-    assert set(drawn) == good
-    # 10 000 each, with a standard deviation of 95
-    assert np.abs(counts - 10_000).max() < 500
-    copy = pickle.loads(pickle.dumps(buffer))
-    assert np.array_equal(copy.marked, buffer.marked)
-    assert not np.any(buffer.rewards[buffer.marked]) and not np.any(buffer.actions[buffer.marked])
-
-
-@pytest.mark.parametrize("kind", [FrameStackReplayBuffer, SkippingReplayBuffer])
-def test_mark_is_gone_with_its_transition(kind: type[ReplayBuffer]) -> None:
-    buffer = buffer_of(kind, 8, 2)
-    for transition in stream(2, 4 + 3, {(2, 0), (6, 1)}, "env_fault"):  # row 2 is overwritten by row 6
-        buffer.add(*transition)
-    assert np.argwhere(buffer.marked).tolist() == [[2, 1]]
-
-
-def test_skipping_changes_nothing_without_marks() -> None:
-    batches = []
-    for kind in (ReplayBuffer, SkippingReplayBuffer, FrameStackReplayBuffer):
-        buffer = buffer_of(kind, 20, 2)
-        for transition in stream(2, 14, set(), "env_fault"):
-            buffer.add(*transition)
-        np.random.seed(0)
-        batches.append([tuple(buffer.sample(64)) for _ in range(3)])
-    assert differences(batches[0], batches[1]) == differences(batches[0], batches[2]) == []
-
-
-def test_sb3_buffers_learn_to_skip_or_refuse() -> None:
-    buffer = buffer_of(ReplayBuffer, 20, 2)
-    for transition in stream(2, 10, {(7, 1)}, "bad_transition"):
-        buffers.skip_marked(buffer, transition[-1])
-        assert type(buffer) is (ReplayBuffer if transition[3][0] < 14 else SkippingReplayBuffer)
-        buffer.add(*transition)
-    assert 15 not in buffer.sample(2000).rewards
-    with pytest.raises(ValueError, match=r"out of the replay buffer \(broken\), which a DictReplayBuffer cannot do"):
-        images = spaces.Dict({"image": spaces.Box(0, 255, (2, 3, 3), np.uint8)})
-        buffers.skip_marked(DictReplayBuffer(10, images, ACTIONS), [{"env_fault": "broken"}])
-    with pytest.raises(ValueError, match=r"optimize_memory_usage is True.*: leave it False"):
-        SkippingReplayBuffer(
-            10, buffer.observation_space, ACTIONS, optimize_memory_usage=True, handle_timeout_termination=False
-        )
-    only_faults = buffer_of(SkippingReplayBuffer, 20, 1)
-    for transition in stream(1, 2, {(0, 0), (1, 0)}, "env_fault"):
-        only_faults.add(*transition)
-    with pytest.raises(ValueError, match="All 2 transitions in the replay buffer are marked"):
-        only_faults.sample(1)
-
-
 class KillNow(BaseCallback):
     """Kills the worker of environment 1 at some steps."""
 
@@ -210,7 +129,7 @@ class KillNow(BaseCallback):
         return True
 
 
-def test_pictures_and_measurements_leave_out_marked_ones() -> None:
+def test_pictures_and_measurements_leave_out_marked_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = FaultTolerantSubprocVecEnv([partial(PixelBox, size=36)] * 2, on_env_fault="restart", start_method="fork")
     model = tiny_model("CnnPolicy", env)
     callback = KillNow(3, 6, 9, 12)
@@ -219,28 +138,32 @@ def test_pictures_and_measurements_leave_out_marked_ones() -> None:
     buffer = model.replay_buffer
     assert callback.faults == buffer.marked.sum() == 4
     looked_at = []
-    original = buffer.transitions
-    buffer.transitions = lambda rows, env_inds, *rest: (  # type: ignore[method-assign]
-        looked_at.append(buffer.marked[rows, env_inds]),
-        original(rows, env_inds, *rest),
-    )[1]
+
+    def look(buffer: Any, rows: np.ndarray, env_inds: np.ndarray, *rest: Any) -> Any:
+        looked_at.append(buffer.marked[rows, env_inds])
+        return transitions(buffer, rows, env_inds, *rest)
+
+    for module in ("callbacks", "evaluation"):
+        monkeypatch.setattr(f"sb3_cure.{module}.transitions", look)
+    picture = ReconstructionCallback(tmp_path)
+    picture.init_callback(model)
     buffer.marked[0, 0] = True  # one that a picture from the first to the last would begin with
-    _spread_over(buffer, 10)
+    assert len(picture._spread(10)) == 10
     most_uncomfortable(model, k=40)
     assert len(looked_at) > 1 and not np.concatenate(looked_at).any()
     buffer.marked[:, 0] = True
-    assert len(_spread_over(buffer, 10)) == 10 and not looked_at[-1].any(), "those of the other environment"
+    assert len(picture._spread(10)) == 10 and not looked_at[-1].any(), "those of the other environment"
     buffer.marked[:] = True
-    assert _spread_over(buffer, 10) is None
-    with pytest.raises(ValueError, match="all transitions in the replay buffer are marked as faulty"):
+    assert len(picture._spread(10)) == 0
+    with pytest.raises(ValueError, match="all its transitions are marked as faulty"):
         most_uncomfortable(model, k=40)
 
 
-def test_buffer_that_cannot_leave_faults_out_is_warned_of() -> None:
+def test_buffer_that_samples_faults_is_refused() -> None:
     """When training begins, not at the first fault."""
     venv = FaultTolerantSubprocVecEnv([VectorBox], on_env_fault="restart", start_method="fork")
     try:
-        with pytest.warns(UserWarning, match=r"on_env_fault='restart' leaves .*NStepReplayBuffer cannot"):
+        with pytest.raises(ValueError, match="NStepReplayBuffer cannot promise that faulty transitions are never"):
             tiny_model("MlpPolicy", venv, curiosity=None, n_steps=3).learn(2)
     finally:
         venv.close()
