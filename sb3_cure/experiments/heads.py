@@ -168,7 +168,7 @@ def _judge(cell: Cell) -> CuReSAC:
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
     env = gym.make(cell.task, **cell.env_kwargs)
-    model = CuReSAC(
+    model: CuReSAC = ALGOS[cell.algo](
         arguments["policy"],
         env,
         srl="rae",
