@@ -47,10 +47,6 @@ class CommonHeads:
     updates: int
     share: int
 
-    #: As in tables beside cells
-    method = "common heads"
-    seed = ""
-
     @property
     def folder(self) -> Path:
         """Where they lie below the folder of results."""
