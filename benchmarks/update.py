@@ -115,16 +115,15 @@ def breakdown(updates: int = 20, **kwargs: Any) -> dict[str, float]:
     timer.wrap(model.replay_buffer, "sample", "sample")
     timer.wrap(model.policy, "augment", "augment and scale")
     timer.wrap(model.policy.encoder_target, "forward", "target encoder")
-    timer.wrap(model, "_encode", "encoder forward")
-    timer.wrap(model.policy.encoder.trunk, "forward", "encoder forward")
+    timer.wrap(model.policy.encoder_update, "_run", "encoder forward")
     timer.wrap(model, "_update_srl", "SRL head")
     timer.wrap(model, "_update_actor_critic", "critics")
     timer.wrap(model, "_update_actor", "actors")
-    timer.wrap(model.policy.encoder_optimizer, "pull", "encoder backward and step")
-    timer.wrap(model.policy.encoder_optimizer, "step", "encoder backward and step")
+    timer.wrap(model.policy.encoder_update, "backward", "encoder backward and step")
+    timer.wrap(model.policy.encoder_update, "step", "encoder backward and step")
     timer.wrap(model, "_update_targets", "Polyak")
-    policy = model.policy
-    for owner in (policy.srl, policy.actor, policy.critic, policy.curious_actor, policy.curious_critic):
+    agents = model.policy.agents.values()
+    for owner in (model.policy.srl, *(part for agent in agents for part in (agent.actor, agent.critic))):
         if owner is not None and owner.optimizer is not None:
             timer.wrap(owner.optimizer, "step", "Adam of heads and agents")
     with timer.phase("rest"):

@@ -21,7 +21,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from dm_control import suite
 
 #: Domain, task and action repeat
 TASKS = (
@@ -44,6 +43,8 @@ def targets(domain: str, task: str, action_repeat: int, seed: int, steps: int = 
     :param steps: Pictures, evenly spread over the episode
     :return: What the autoencoder is to draw: pictures in 5 bits, in [-0.5, 0.5], float64 [steps, 84, 84, 3]
     """
+    from dm_control import suite  # loads OpenGL, which `python -m benchmarks.yardsticks` does in its own way
+
     env = suite.load(domain, task, task_kwargs={"random": seed})
     env.reset()
     bounds, rng = env.action_spec(), np.random.default_rng(seed)

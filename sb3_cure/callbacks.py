@@ -438,16 +438,10 @@ class CuriosityMapCallback(RolloutCallback):
 
     def _finite(self, actor: str, states: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Without the states that have no place on a map: that is no reason to end a training."""
-        finite = np.isfinite(states)
-        bad = [name for name, column in zip(self.names, finite.T, strict=True) if not column.all()]
-        if not bad:
-            return states, errors
-        good = finite.all(axis=1)
-        warnings.warn(
-            f"CuriosityMapCallback leaves out {np.count_nonzero(~good)} of {len(states)} states of the {actor} policy, "
-            f"whose {', '.join(bad)} is not finite: look at what `state` returns.",
-            stacklevel=2,
-        )
+        good = np.isfinite(states).all(axis=1)
+        if not good.all():
+            left_out = f"{np.count_nonzero(~good)} of {len(states)} states of the {actor} policy"
+            warnings.warn(f"CuriosityMapCallback leaves out {left_out}, which are not finite.", stacklevel=2)
         return states[good], errors[good] if len(errors) else errors
 
 

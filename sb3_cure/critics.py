@@ -39,7 +39,6 @@ class LatentCritic(nn.Module):
     ):
         super().__init__()
         self.n_critics = n_critics
-        self.n_values = n_values
         self.q_networks = nn.ModuleList(
             nn.Sequential(*create_mlp(features_dim + action_dim, n_values, net_arch, activation_fn))
             for _ in range(n_critics)

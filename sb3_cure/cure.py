@@ -16,8 +16,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule, TrainFreq
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 
 from sb3_cure.arguments import check_arguments
 from sb3_cure.augmentations import Augmentation
@@ -297,13 +296,11 @@ class CuRe(OffPolicyAlgorithm):
         total_timesteps: int,
         callback: MaybeCallback = None,
         reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
+        *args: Any,
+        **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         resets = reset_num_timesteps or self._last_obs is None
-        total, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         # SB3 does so after each step: the first one would see where the former call ended.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         self._metrics.attach(self.logger)
@@ -395,35 +392,17 @@ class CuRe(OffPolicyAlgorithm):
 
     # -------------------------------------------------------------- learning
 
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        train_freq: TrainFreq,
-        replay_buffer: ReplayBuffer,
-        action_noise: ActionNoise | None = None,
-        learning_starts: int = 0,
-        log_interval: int | None = None,
-    ) -> RolloutReturn:
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """SB3's loop, with the mixer of Algorithm 1 in ``_sample_action``, and the burst of updates after the warm-up.
 
-        :param env: Training environments
-        :param callback: Called at each step
-        :param train_freq: How much to collect
-        :param replay_buffer: Where to store it
-        :param action_noise: Noise added to the actions
-        :param learning_starts: Agent steps with uniformly random actions
-        :param log_interval: Episodes between two dumps of the logger
         :return: What was collected
         """
-        rollout = super().collect_rollouts(
-            env, callback, train_freq, replay_buffer, action_noise, learning_starts, log_interval
-        )
-        if not self._warmed_up and self.num_timesteps > learning_starts and rollout.continue_training:
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not self._warmed_up and self.num_timesteps > self.learning_starts and rollout.continue_training:
             self._warmed_up = True
             updates = self.warmup_updates
             if updates is None:
-                updates = 0 if self.srl is None or learning_starts == 0 else get_srl_class(self.srl).warmup_updates
+                updates = 0 if self.srl is None or self.learning_starts == 0 else get_srl_class(self.srl).warmup_updates
             if updates > 0 and self.gradient_steps != 0:
                 self._in_burst = True
                 try:

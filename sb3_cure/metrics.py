@@ -109,17 +109,7 @@ def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, c
     drawn = policy.srl.reconstruct(policy.encode(observations))
     if drawn is None:
         return None
-    return image_strip(policy.augmentation.center(observations), drawn, frame_stack)
-
-
-def image_strip(observed: th.Tensor, drawn: th.Tensor, frame_stack: int) -> np.ndarray:
-    """Newest frames of images, side by side, above those of others.
-
-    :param observed: Images for the upper row, 0-255, [B, C, H, W]
-    :param drawn: Images for the lower row, 0-255, [B, C, H, W]
-    :param frame_stack: Frames per image
-    :return: uint8 image (C', 2 * H, B * W) with C' = 1 or 3
-    """
+    observed = policy.augmentation.center(observations)
     rows = [th.cat(list(newest_frames(images, frame_stack)), dim=2) for images in (observed, drawn)]
     return th.cat(rows, dim=1).cpu().numpy()
 

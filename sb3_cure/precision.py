@@ -12,10 +12,7 @@ from torch import nn
 from torch._functorch import config as functorch_config
 
 #: Why ``compile="auto"`` is eager
-NOT_COMPILED = {
-    "cpu": "compiled updates were slower on the CPU they were measured on",
-    "cuda": "compiled updates were not measured on a GPU yet",
-}
+NOT_COMPILED = "compiled updates were slower on the CPU they were measured on, and not measured on a GPU yet"
 
 
 def _has_fast_bf16(device: th.device) -> bool:
@@ -59,8 +56,7 @@ def resolve_compile(compile: str | bool, device: th.device) -> tuple[bool, str]:
         torch.compile does not work, they do not, and a warning says why
     """
     if compile == "auto":
-        reason = NOT_COMPILED.get(device.type, NOT_COMPILED["cuda"])
-        return False, f"Networks run eagerly (compile='auto': {reason})"
+        return False, f"Networks run eagerly (compile='auto': {NOT_COMPILED})"
     if not compile:
         return False, "Networks run eagerly (compile=False)"
     failure = _why_not_compiled(device.type)

@@ -161,11 +161,20 @@ def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
     for updates in (1, 150):
         th.manual_seed(0)
         np.random.seed(0)
-        decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, updates, batch_size=16)
+        decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, updates)
         observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
         distances.append(float((observed - drawn).abs().mean()))
     assert distances[1] < 0.5 * distances[0]
     assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
+
+
+def test_probe_draws_what_the_encoder_sees() -> None:
+    """Of crops, pictures of the crops' size."""
+    crops: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=30))
+    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", **crops).learn(30)
+    decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, 1)
+    observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+    assert observed.shape == drawn.shape == (4, model.observation_space.shape[0], 30, 30)
 
 
 def all_errors(model: Any) -> list[tuple[int, int, float]]:

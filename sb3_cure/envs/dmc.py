@@ -8,12 +8,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
-from sb3_cure.envs.wrappers import (
-    ActionRepeat,
-    NormalizeActions,
-    PixelObservation,
-    StackFrames,
-)
+from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
 
 # PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
 ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}

@@ -47,10 +47,6 @@ class CommonHeads:
     updates: int
     share: int
 
-    #: As in tables beside cells
-    method = "common heads"
-    seed = ""
-
     @property
     def folder(self) -> Path:
         """Where they lie below the folder of results."""
@@ -168,7 +164,7 @@ def _judge(cell: Cell) -> CuReSAC:
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
     env = gym.make(cell.task, **cell.env_kwargs)
-    model = CuReSAC(
+    model: CuReSAC = ALGOS[cell.algo](
         arguments["policy"],
         env,
         srl="rae",

@@ -328,17 +328,7 @@ def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
     axes.spines[:].set_visible(False)
 
 
-def reconstruction_grid(path: Path, strip: np.ndarray, title: str) -> None:
-    """Observations (upper row) and their reconstructions (lower row).
-
-    :param path: File to write
-    :param strip: uint8 image (C, 2 * H, columns * W) as of ``sb3_cure.metrics.reconstruction_strip``
-    :param title: Title of the figure
-    """
-    rows = np.split(strip, 2, axis=1)
-    _draw_rows(path, dict(zip(("observed", "reconstructed"), rows, strict=True)), title)
-
-
+@in_style
 def reconstructions_over_training(
     path: Path, observed: np.ndarray, rows: Sequence[tuple[int, np.ndarray]], title: str
 ) -> None:
@@ -353,18 +343,12 @@ def reconstructions_over_training(
     for steps, drawn in rows:
         error = np.square((drawn.astype(np.float32) - observed) / 255).mean()
         strips[f"{steps:,} agent steps\nMSE {error:.2g}"] = drawn
-    _draw_rows(path, {label: np.concatenate(list(images), axis=-1) for label, images in strips.items()}, title)
-
-
-@in_style
-def _draw_rows(path: Path, strips: Mapping[str, np.ndarray], title: str) -> None:
-    """Pictures [C, H, W] of the same size below each other, each with its label."""
-    first, width = next(iter(strips.values())), 10.0
-    figure = Figure(figsize=(width, 0.4 + len(strips) * (width - 1.2) * first.shape[1] / first.shape[2]))
+    (n, _, height, width), inches = observed.shape, 10.0
+    figure = Figure(figsize=(inches, 0.4 + len(strips) * (inches - 1.2) * height / (n * width)))
     figure.get_layout_engine().set(h_pad=0.02, hspace=0)  # type: ignore[union-attr, call-arg]
-    for axes, (label, strip) in zip(np.atleast_1d(figure.subplots(len(strips))), strips.items(), strict=True):
-        _show(axes, [strip])
-        axes.set_yticks([strip.shape[1] / 2], [label])
+    for axes, (label, images) in zip(figure.subplots(len(strips), squeeze=False).flat, strips.items(), strict=True):
+        _show(axes, images)
+        axes.set_yticks([height / 2], [label])
     figure.suptitle(title)
     save(figure, path, 120, tight=True)
 

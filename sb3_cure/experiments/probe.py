@@ -12,25 +12,22 @@ from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import PixelDecoder
 
 
-def fit_probe(
-    model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000, batch_size: int = 64
-) -> nn.Module:
+def fit_probe(model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000) -> nn.Module:
     """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
 
     :param model: A model of any SB3 algorithm that learns from images with an encoder (``policies.encoder_of``)
     :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W], on the model's device
-    :param updates: Updates of the decoder
-    :param batch_size: Observations per update
+    :param updates: Updates of the decoder, of 64 observations each
     :return: The decoder: latents -> images in [-0.5, 0.5]
     :raises ValueError: if the model has no encoder
     """
-    encoder: Any = _encoder(model)[0]
-    shape: tuple[int, ...] = getattr(model.policy, "encoder_space", model.observation_space).shape or ()
+    images, latents = _images_and_latents(model, sample(1))
+    shape = tuple(images.shape[1:])
     layers = min(4, (min(shape[1:]) + 1) // 4)  # as many as small images allow
-    decoder: nn.Module = PixelDecoder(encoder.features_dim, shape, n_layers=layers).to(model.device)
+    decoder: nn.Module = PixelDecoder(latents.shape[1], shape, n_layers=layers).to(model.device)
     optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
     for _ in range(updates):
-        images, latents = _images_and_latents(model, sample(batch_size))
+        images, latents = _images_and_latents(model, sample(64))
         loss = F.mse_loss(decoder(latents), images - 0.5)
         optimizer.zero_grad()
         loss.backward()
@@ -57,11 +54,7 @@ def _images_and_latents(model: BaseAlgorithm, observations: th.Tensor) -> tuple[
     if isinstance(policy, CuRePolicy):
         images = policy.center(observations)
         return images, policy.encoder(images)
-    return observations.float() / 255, _encoder(model)[1](observations)
-
-
-def _encoder(model: BaseAlgorithm) -> tuple[nn.Module, Callable[[th.Tensor], th.Tensor]]:
-    found = encoder_of(model.policy)
+    found = encoder_of(policy)
     if found is None:
-        raise ValueError(f"the {type(model.policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")
-    return found
+        raise ValueError(f"the {type(policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")
+    return observations.float() / 255, found[1](observations)

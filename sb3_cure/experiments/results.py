@@ -148,12 +148,6 @@ class Experiment:
         """
         return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}
 
-    def has_unlike_heads(self, task: str) -> bool:
-        """Whether common heads of a task were not all made of the same cells: some are out of date."""
-        paths = sorted((self.folder / task / "common_heads").glob("*/common_head.json"))
-        made_of = [_read_json(path, f"remove {path.parent} and run the grid again").get("cells") for path in paths]
-        return any(cells != made_of[0] for cells in made_of)
-
     @property
     def sees_published_pixels(self) -> bool:
         """Whether all of its finished cells do, see ``CellResult``."""

@@ -4,7 +4,6 @@ import argparse
 import os
 import platform
 import re
-import signal
 import sys
 import threading
 import time
@@ -295,19 +294,16 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
         while not over:
             over = stopped.wait(1.0)
             lines = tell(list_units(), results)
-            try:
-                if live is not None:
-                    live.update("\n".join(line for line in lines.values() if ": waiting" not in line), refresh=True)
-                    continue
-                for folder, line in lines.items():
-                    if _ENDED.search(line) and told.get(folder) != line:
-                        told[folder] = line
-                        print(line, flush=True)
-                if over or time.monotonic() - told_at >= SUMMARY_SECONDS:
-                    told_at = time.monotonic()
-                    print(lines[_ALL], flush=True)
-            except BrokenPipeError:  # nobody reads on, and the cells are to be finished all the same
-                _write_to_nobody()
+            if live is not None:
+                live.update("\n".join(line for line in lines.values() if ": waiting" not in line), refresh=True)
+                continue
+            for folder, line in lines.items():
+                if _ENDED.search(line) and told.get(folder) != line:
+                    told[folder] = line
+                    print(line, flush=True)
+            if over or time.monotonic() - told_at >= SUMMARY_SECONDS:
+                told_at = time.monotonic()
+                print(lines[_ALL], flush=True)
 
     with live or nullcontext():
         thread = threading.Thread(target=watch, daemon=True)
@@ -317,11 +313,6 @@ def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Itera
         finally:
             stopped.set()
             thread.join()
-
-
-def _write_to_nobody() -> None:
-    """After a BrokenPipeError: else whatever is written later would raise another, at the latest when Python ends."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 # ---------------------------------------------------------------- command line
@@ -399,9 +390,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("Stopped; the same command goes on from the last checkpoints.")
         return 130
-    except BrokenPipeError:  # such as `--dry-run | head`, which has read enough
-        _write_to_nobody()
-        return 128 + signal.SIGPIPE
     return 1 if failed else 0
 
 

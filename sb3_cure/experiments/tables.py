@@ -319,9 +319,7 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
         policy = [row.task, row.method, row.head.replace("_", " "), row.actor, str(len(row.values))]
         rows.append([*policy, *errors, ratio_text(row.ratio), ratio_text(row.task_ratio), shown])
     columns = ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_RATIOS, ">paper"]
-    unlike = [task for task in experiment.tasks if experiment.has_unlike_heads(task)]
-    note = words("errors", published, _baselines(experiment), compares, _list(unlike) if unlike else "")
-    return _table("SRL error per step", columns, rows, note)
+    return _table("SRL error per step", columns, rows, words("errors", published, _baselines(experiment), compares))
 
 
 def _baselines(experiment: Experiment) -> str:

@@ -34,11 +34,7 @@ class IntrinsicReward(nn.Module):
         super().__init__()
 
     def loss(
-        self,
-        batch: Samples,
-        latents: th.Tensor | None,
-        next_latents: th.Tensor | None,
-        srl_error: th.Tensor | None,
+        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
     ) -> tuple[th.Tensor | None, th.Tensor]:
         """The reward of a batch, as it is before the step that the loss then makes.
 

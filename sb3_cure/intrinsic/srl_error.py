@@ -12,11 +12,7 @@ class SRLError(IntrinsicReward):
     needs_srl = True
 
     def loss(
-        self,
-        batch: Samples,
-        latents: th.Tensor | None,
-        next_latents: th.Tensor | None,
-        srl_error: th.Tensor | None,
+        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
     ) -> tuple[None, th.Tensor]:
         """
         :param batch: Unused

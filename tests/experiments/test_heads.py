@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from grids_for_tests import DMC_TASK, TASK, method, write_grid
+from grids_for_tests import DMC_TASK, TASK, TINY, method, write_grid
 
-from sb3_cure import CuReSAC
+from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.experiments import cells, heads, run
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Grid, load_grid
 
 FOLDER = Path("tiny", "PixelBox")
+QUICK: dict[str, Any] = dict(budget=100, evaluation=dict(every=100, episodes=1))
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +172,23 @@ def test_without_models_no_heads_are_made(visits: Path, capsys: pytest.CaptureFi
     assert run.run_grid(load_grid(visits, seeds=4), out, pictures=False) == []
     assert f"No common heads for {TASK}: they need two seeds" in capsys.readouterr().out
     assert common_rows(out) == {**rows, "seed3": []}
+
+
+def test_arms_of_tqc_are_trained_and_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A method says which algorithm it trains; the common head has the networks of that."""
+    monkeypatch.setattr(heads, "COMMON_UPDATES", 1)
+    monkeypatch.setattr(heads, "COMMON_SHARE", 4)
+    quantiles = {**TINY["policy_kwargs"], "n_quantiles": 5}
+    tqc = {**method(policy_kwargs=quantiles, top_quantiles_to_drop_per_net=1), "algo": "cure_tqc"}
+    path = write_grid(tmp_path, kind="visitation", seeds=2, methods={"tqc": tqc}, **QUICK)
+    grid, out = load_grid(path), tmp_path / "out"
+    assert run.run_grid(grid, out, pictures=False) == []
+    folder = out / grid.cells[0].folder
+    model = CuReTQC.load(folder / "model.zip")
+    assert model.policy.critic.q_networks[0][-1].out_features == 5 and model.top_quantiles_to_drop_per_net == 1
+    config = cells.read_kept(folder / "config.json")
+    assert config["algo"] == "cure_tqc" and config["defaults"]["curiosity_prob"] == 0.2
+    assert {row["head"] for row in read_rows(folder / "visitation.csv")} >= {"own", "common"}
 
 
 def visitation_grid(folder: Path) -> Grid:

@@ -9,8 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -179,46 +177,6 @@ def test_only_of_other_machines_the_clock_counts(tmp_path: Path) -> None:
         (folder / "progress.json").write_text(json.dumps({**here, **change}))
         states.append(run.read_progress(cell, tmp_path)[0])
     assert states == ["interrupted", "running", "interrupted"]
-
-
-@contextmanager
-def unread_stdout() -> Iterator[None]:
-    """Standard output is a pipe that nobody reads any more; what is left in it must not raise when Python ends."""
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "w") as pipe, redirect_stdout(pipe):
-        yield
-        print("more", flush=True)
-
-
-def test_list_of_cells_may_be_cut_off(tmp_path: Path) -> None:
-    """``sb3-cure experiment --dry-run | head -1`` ends without a traceback, as a program that a pipe ends."""
-    path = write_grid(tmp_path)
-    with unread_stdout():
-        assert run.main([str(path), "--out", str(tmp_path / "out"), "--dry-run"]) == 128 + 13
-
-
-def test_cells_are_finished_though_nobody_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``sb3-cure experiment | tee log``, whose ``tee`` has died: neither cells nor what is shown later know of it."""
-    monkeypatch.setattr(run, "SUMMARY_SECONDS", 0.0)
-    tell, run_cell, told = run.tell, run.run_cell, threading.Event()
-
-    def lines(*arguments: Any) -> Any:
-        told.set()
-        return tell(*arguments)
-
-    def run_later(*arguments: Any) -> None:
-        """Each cell sees another line being told."""
-        told.clear()
-        assert told.wait(60)
-        run_cell(*arguments)
-
-    monkeypatch.setattr(run, "tell", lines)
-    monkeypatch.setattr(run, "run_cell", run_later)
-    grid = load_grid(write_grid(tmp_path, seeds=2, **QUICK))
-    with unread_stdout():
-        assert run.run_grid(grid, tmp_path / "out", pictures=False) == []
-    assert all(cell.is_done(tmp_path / "out") for cell in grid.cells)
 
 
 def test_results_name_their_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

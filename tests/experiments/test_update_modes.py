@@ -64,7 +64,7 @@ def test_cells_run_once_with_same_settings(tmp_path: Path, monkeypatch: pytest.M
 def test_cell_trains_on_real_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows of an actual run: returns of both policies, the training loss of the head and its measured error."""
     quick = dict(learning_starts=10, warmup_updates=0, batch_size=8)
-    monkeypatch.setattr(update_modes, "SETTINGS", {**update_modes.SETTINGS, **quick})
+    monkeypatch.setitem(update_modes.HEADS, "rae", {**update_modes.HEADS["rae"], **quick})
     monkeypatch.setattr(update_modes, "EVALUATIONS", 1)
     monkeypatch.setattr(update_modes, "EPISODES", 1)
     update_modes.run_cell(tmp_path / "seed0.csv", "rae", "joint", 0, 20)
