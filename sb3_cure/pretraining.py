@@ -17,7 +17,7 @@ class Pretraining(CuRe):
     #: Of ``Persistence``: whether a script that is run again has nothing to do in this call
     _was_over: Callable[[str, bool], bool]
 
-    @functools.wraps(CuRe.__init__)  # so that help() shows the arguments
+    @functools.wraps(CuRe.__init__)  # type: ignore[misc]  # so that help() shows the arguments
     def __init__(self, *args: Any, **kwargs: Any):
         #: What ``task`` and ``curiosity`` were before the pretraining that is under way; None: there is none
         self._before_pretraining: dict[str, Any] | None = None
