@@ -513,6 +513,7 @@ class CuRe(OffPolicyAlgorithm):
         read = self._read_centred(batch, intrinsic.trains_encoder) if intrinsic.needs_latents else []
         latents, next_latents = [latents for _, latents in read] or (None, None)
         loss, raw = intrinsic.loss(batch, latents, next_latents, srl_error)
+        raw = raw.detach().float()
         if loss is not None:
             self._learn_from("intrinsic reward", loss, intrinsic.optimizer, "intrinsic", read)
         centers = self._has_curious_agent

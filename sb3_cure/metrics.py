@@ -80,17 +80,15 @@ class Metrics(KVWriter):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: What was recorded since the last dump, and when the next picture is due
+        :return: What was recorded since the last dump
         """
-        sums = {key: value.cpu() for key, value in self._sums.items()}
-        return {"sums": sums, "counts": dict(self._counts), "next_picture": self._next_picture}
+        return {"sums": {key: value.cpu() for key, value in self._sums.items()}, "counts": dict(self._counts)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: Of ``state_dict``
         """
         self._sums, self._counts = dict(state["sums"]), dict(state["counts"])
-        self._next_picture = state["next_picture"]
 
 
 @th.no_grad()
