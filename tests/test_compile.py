@@ -172,7 +172,7 @@ def test_auto_is_eager_and_says_why(policy: str, env: type, capsys: pytest.Captu
     """One sentence, for those who ask for any; none without."""
     model = tiny_model(policy, env(), verbose=1)
     assert (
-        "Networks run eagerly (compile='auto': compiled updates were slower on the CPU they were measured on)"
+        "Networks run eagerly (compile='auto': compiled updates were slower on the CPU they were measured on"
         in capsys.readouterr().out
     )
     assert not any(module._compiled_call_impl for module in model.policy.modules())
