@@ -5,6 +5,7 @@ python -m benchmarks.mutation --jobs 2
 cosmic-ray's operators list the mutants of each file in ``TESTS``. The seed decides which are drawn: as many of each
 file (small files give all they have), in turn from each kind of operator, and one per place before a second one there.
 Left out are type hints and operators of another type (``+`` by ``|``). Each mutant runs in a copy of package and tests.
+The tests of a file are a fast part of the suite: its other tests may kill what survives here.
 
 ``mutation.csv`` has a row for each. What has one is not run again, so that a run that was killed goes on where it was;
 delete rows of survivors to run them against new tests. Lines may move: ``id`` is made of function, code and operator.
@@ -122,13 +123,14 @@ def _run(row: Row) -> Row:
     return {**row, "mutant": mutant, "outcome": outcome, "test": test, "cpu_seconds": seconds, "reason": ""}
 
 
-def _total(rows: list[Row]) -> dict[str, float]:
+def _total(rows: list[Row]) -> Row:
     """Mutants by outcome, the share that died of those that are not equivalent, and what it took."""
     outcomes = Counter(row["outcome"] for row in rows)
     equivalent = sum(row["reason"].startswith("equivalent") for row in rows)
-    score = (outcomes["killed"] + outcomes["timeout"]) / max(len(rows) - equivalent, 1)
+    died, counted = outcomes["killed"] + outcomes["timeout"], len(rows) - equivalent
+    score = round(died / counted, 3) if counted else None
     seconds = sum(row["cpu_seconds"] for row in rows)
-    return dict(run=len(rows), **outcomes, equivalent=equivalent, score=round(score, 3), cpu_seconds=round(seconds))
+    return dict(run=len(rows), **outcomes, equivalent=equivalent, score=score, cpu_seconds=round(seconds))
 
 
 def main() -> None:
@@ -140,6 +142,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="decides which are drawn (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="how many run at the same time (default: 2)")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     table, drawn = options.out / "mutation.csv", {file: _draw(file, options.seed) for file in TESTS}
     lines = dict(pair for rows in drawn.values() for pair in zip(rows["id"], rows["line"], strict=True))
     old = {row["id"]: row for row in (read_rows(table, COLUMNS) if table.exists() else [])}
