@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl screens demo test test-oldest check bench notebooks clean help
+.PHONY: .venv gl screens demo test test-oldest check bench mutation notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -15,6 +15,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
 export MUJOCO_GL ?= egl
 RUN := .venv/bin/python -m
 PYTEST_ARGS ?=
+MUTATION_ARGS ?=
 
 # $(call apt_install,PACKAGES) installs them as root on Debian and Ubuntu and stops elsewhere: the sentence
 # printed before it has named them. On a machine that has just booted, apt is often busy updating it: wait.
@@ -95,6 +96,9 @@ check: .venv/.installed  ## lint, formatting and types
 
 bench: gl  ## measure speed and memory and write results/benchmarks/ (half an hour; leave the machine alone)
 	$(RUN) benchmarks
+
+mutation: gl  ## mutation testing of the method, into results/robustness/ (hours; make mutation MUTATION_ARGS="--jobs 8")
+	$(RUN) benchmarks.mutation $(MUTATION_ARGS)
 
 notebooks: gl  ## execute the notebooks in place
 	$(RUN) nbconvert --to notebook --execute --inplace notebooks/*.ipynb

@@ -1,0 +1,173 @@
+"""Do the tests notice a wrong operator? Small faults, one at a time, in the files that compute the method.
+
+python -m benchmarks.mutation --jobs 2
+
+cosmic-ray's operators list the mutants of each file in ``TESTS``. The seed decides which are drawn: as many of each
+file (small files give all they have), in turn from each kind of operator, and one per place before a second one there.
+Left out are type hints and operators of another type (``+`` by ``|``). Each mutant runs in a copy of package and tests.
+The tests of a file are a fast part of the suite: its other tests may kill what survives here.
+
+``mutation.csv`` has a row for each. What has one is not run again, so that a run that was killed goes on where it was;
+delete rows of survivors to run them against new tests. Lines may move: ``id`` is made of function, code and operator.
+``reason`` is written by hand, why a survivor lives; one that begins with "equivalent" does not count in the score.
+"""
+
+import argparse
+import ast
+import hashlib
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.ast.ast_query import ASTQuery
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+
+from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json
+
+ROOT = Path(__file__).resolve().parent.parent
+#: What should kill the mutants of each file, the likeliest and fastest first (below tests/, or options of pytest)
+TESTS = {
+    "cure.py": """test_gradients.py test_actor_critic.py test_temperatures.py test_polyak_rates.py test_warmup_burst.py
+        test_curiosity_target.py test_guards.py test_alternating.py test_resume_and_more.py test_training.py
+        -k 'not (one_update_per or vectors or can_be_changed or frame_stack or pretraining or bar or csv or board)'""",
+    "critics.py": "test_critics.py test_gradients.py test_actor_critic.py",
+    "encoder_update.py": "test_encoder_update.py test_encoder_shares.py test_gradients.py",
+    "mixers.py": "test_mixers.py test_resume_and_more.py test_training.py::test_schedules_begin_where_the_call_begins",
+    "intrinsic/__init__.py": "intrinsic test_arguments.py",
+    "intrinsic/base.py": "intrinsic test_curiosity_target.py test_gradients.py",
+    "intrinsic/srl_error.py": "intrinsic test_curiosity_target.py test_gradients.py",
+    "buffers.py": "test_buffers.py persistence/test_frame_rows.py",
+}
+#: Only these replace each other; "Delete" takes a sign or a negation away
+ALIKE = ("Add Sub Mul Div FloorDiv Mod Pow", "BitOr BitAnd BitXor", "Eq NotEq Lt LtE Gt GtE", "Is IsNot", "UAdd USub")
+#: CPU seconds of a mutant, so that other work on the machine changes nothing; twenty times as long if it just waits
+LIMIT = 120
+COLUMNS = ("id", "file", "line", "function", "operator", "code", "mutant", "outcome", "test", "cpu_seconds", "reason")
+
+
+def _mutants(file: str) -> Iterator[Row]:
+    source = (ROOT / "sb3_cure" / file).read_text()
+    nodes, lines, seen = list(ast_nodes(get_ast(source))), source.splitlines(), Counter[tuple]()
+    hints = [getattr(node, name, None) for node in ast.walk(ast.parse(source)) for name in ("annotation", "returns")]
+    spans = [((hint.lineno, hint.col_offset), (hint.end_lineno, hint.end_col_offset)) for hint in hints if hint]
+    for operator in operator_names():
+        kind, *swap = operator.removeprefix("core/").split("_")
+        alike = not swap or swap[0] == "Delete" or any({*swap} <= {*group.split()} for group in ALIKE)
+        if not alike or get_operator(operator).arguments():
+            continue
+        places = ((node, *place) for node in nodes for place in get_operator(operator)().mutation_positions(node))
+        for occurrence, (node, start, _) in enumerate(places):
+            if any(first <= start < last for first, last in spans) or node.parent.type in ("dictorsetmaker", "atom"):
+                continue  # a type hint, or the stars of {**mapping}
+            row = {"file": file, "function": ASTQuery(node).get_definition_name() or "", "operator": operator}
+            row["code"] = lines[start[0] - 1].strip()
+            seen[known := (*row.values(), start[1])] += 1
+            number = hashlib.sha256(repr((known, seen[known])).encode()).hexdigest()[:12]
+            yield dict(row, id="m" + number, line=start[0], place=start, kind=kind, occurrence=occurrence)
+
+
+def _draw(file: str, seed: int) -> pd.DataFrame:
+    """All mutants of a file, in the order of drawing: by a hash, so that an edit leaves those of other code alone."""
+    rows = pd.DataFrame(_mutants(file))
+    rows["turn"] = [hashlib.sha256(f"{seed} {name}".encode()).hexdigest() for name in rows["id"]]
+    for group in (["kind", "place"], ["kind"]):  # the first of each group, then the second of each, and so on
+        rows = rows.sort_values("turn", kind="stable")
+        rows["turn"] = rows.groupby(group).cumcount()
+    return rows.sort_values("turn", kind="stable")
+
+
+def _run(row: Row) -> Row:
+    """Run a file's tests on a copy with this mutant; without an operator, on the code as it is."""
+    with tempfile.TemporaryDirectory(prefix="mutation-", ignore_cleanup_errors=True) as folder:
+        for name in ("sb3_cure", "tests"):
+            shutil.copytree(ROOT / name, Path(folder, name), ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", folder)
+        path, mutant = Path(folder, "sb3_cure", row["file"]), ""
+        if row["operator"]:
+            before = path.read_text()
+            path.write_text(mutate_code(before, get_operator(row["operator"])(), row["occurrence"]))
+            after = path.read_text().splitlines()
+            mutant = after[row["line"] - 1].strip() if len(after) == len(before.splitlines()) else "(line removed)"
+        tests = [name if name[0] in "-n" else f"tests/{name}" for name in shlex.split(TESTS[row["file"]])]
+        command = f"{sys.executable} -m pytest -x -q -p no:cacheprovider --hypothesis-seed=0 --basetemp=tmp".split()
+        limited = [
+            "timeout",
+            "-sKILL",
+            str(20 * LIMIT),
+            "bash",
+            "-c",
+            f'ulimit -t {LIMIT}; TIMEFORMAT="CPU %U"; time "$@"',
+        ]
+        environment = {**os.environ, "PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
+        with Path(folder, "output").open("w") as file:
+            run = [*limited, "", *command, *tests]
+            code = subprocess.run(run, cwd=folder, env=environment, stdout=file, stderr=file).returncode
+        text = Path(folder, "output").read_text()
+    outcome = "survived" if code == 0 else "timeout" if code in (-9, 137, 152) else "killed"  # SIGKILL, SIGXCPU
+    test = (re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", text, re.MULTILINE) or [f"exit {code}"])[0] if code else ""
+    if not row["operator"] and code:
+        raise SystemExit(f"The tests of {row['file']} fail without a mutant: {test}\n{text[-2000:]}")
+    seconds = sum(map(float, re.findall(r"^CPU (\S+)$", text, re.MULTILINE)))
+    return {**row, "mutant": mutant, "outcome": outcome, "test": test, "cpu_seconds": seconds, "reason": ""}
+
+
+def _total(rows: list[Row]) -> Row:
+    """Mutants by outcome, the share that died of those that are not equivalent, and what it took."""
+    outcomes = Counter(row["outcome"] for row in rows)
+    equivalent = sum(row["reason"].startswith("equivalent") for row in rows)
+    died, counted = outcomes["killed"] + outcomes["timeout"], len(rows) - equivalent
+    score = round(died / counted, 3) if counted else None
+    seconds = sum(row["cpu_seconds"] for row in rows)
+    return dict(run=len(rows), **outcomes, equivalent=equivalent, score=score, cpu_seconds=round(seconds))
+
+
+def main() -> None:
+    """Run the drawn mutants that have no row yet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "results/robustness", help="folder to write")
+    parser.add_argument("--only", nargs="+", choices=list(TESTS), default=list(TESTS), help="files (default: all)")
+    parser.add_argument("--sample", type=int, default=320, help="mutants of all files together (default: 320)")
+    parser.add_argument("--seed", type=int, default=0, help="decides which are drawn (default: 0)")
+    parser.add_argument("--jobs", type=int, default=2, help="how many run at the same time (default: 2)")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    table, drawn = options.out / "mutation.csv", {file: _draw(file, options.seed) for file in TESTS}
+    lines = dict(pair for rows in drawn.values() for pair in zip(rows["id"], rows["line"], strict=True))
+    old = {row["id"]: row for row in (read_rows(table, COLUMNS) if table.exists() else [])}
+    done = {name: {**row, "line": lines[name]} for name, row in old.items() if name in lines}  # the code is still there
+    share = 1
+    while sum(len(rows[:share]) for rows in drawn.values()) < min(options.sample, len(lines)):
+        share += 1
+    sample = [row for file in options.only for row in drawn[file][:share].to_dict("records")]
+    todo = [row for row in sample if row["id"] not in done]
+    pool = ThreadPoolExecutor(options.jobs)
+    try:
+        for row in pool.map(_run, [{"file": name, "operator": ""} for name in dict.fromkeys(r["file"] for r in todo)]):
+            print(f"{row['file']}: its tests take {row['cpu_seconds']} s of CPU time", flush=True)
+        for future in as_completed([pool.submit(_run, row) for row in todo]):
+            done[future.result()["id"]] = row = future.result()
+            print("{outcome} {file}:{line} {operator} {test}\n- {code}\n+ {mutant}".format(**row), flush=True)
+            write_csv(table, COLUMNS, sorted(done.values(), key=lambda row: (row["file"], row["line"], row["id"])))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    conditions = dict(seed=options.seed, sample=options.sample, cosmic_ray=version("cosmic-ray"), **describe_run())
+    total, by_file = _total(list(done.values())), {f: [r for r in done.values() if r["file"] == f] for f in TESTS}
+    files = {file: {"mutants": len(drawn[file]), **_total(rows)} for file, rows in by_file.items()}
+    write_json(options.out / "mutation.json", {**conditions, "all": total, "files": files})
+    print(total)
+
+
+if __name__ == "__main__":
+    main()
