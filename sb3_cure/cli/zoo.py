@@ -22,7 +22,7 @@ from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_class_by_name
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import LinearSchedule, set_random_seed
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 import sb3_cure
@@ -293,15 +293,14 @@ def _load(
         env_kwargs["render_mode"] = render_mode
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
-    set_random_seed(args.seed)
     env = create_test_env(
-        task, stats_path=str(folder), seed=args.seed, should_render=False, hyperparams=settings, env_kwargs=env_kwargs
+        task, stats_path=str(folder), should_render=False, hyperparams=settings, env_kwargs=env_kwargs
     )
     objects: dict[str, Any] = {name: get_class_by_name(vars(args)[name]) for name in OWN if vars(args)[name]}
     # The smallest buffer, of the default class: it is not used, and its own may be one that archives do not hold.
     objects.update(replay_buffer_class=None, replay_buffer_kwargs={}, optimize_memory_usage=False)
     load: Any = ALGORITHMS[args.algo].load
-    return load(path, env, args.device, objects, buffer_size=1, trusted=args.trusted), path
+    return load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted), path
 
 
 def _find_model(parser: argparse.ArgumentParser, args: argparse.Namespace, task: str) -> Path:

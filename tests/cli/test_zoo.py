@@ -362,6 +362,26 @@ def test_actions_are_means_unless_asked(flags: list[str], run: Path, monkeypatch
     assert asked == 14 * [not flags]
 
 
+def test_seed_decides_what_is_played(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The environment's starts and the sampled actions."""
+    outputs = []
+    for flags in (["--seed", "1"], ["--seed", "1"], ["--seed", "2"]):
+        for sampled in ([], ["--stochastic"]):
+            assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", *flags, *sampled) == 0
+            outputs.append(re.findall(r"Mean reward: .*", capsys.readouterr().out))
+    assert outputs[:2] == outputs[2:4]
+    assert outputs[0] != outputs[4] and outputs[1] != outputs[5] and outputs[0] != outputs[1]
+
+
+def test_env_kwargs_of_the_command_line_are_remembered(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also where the file has none."""
+    config = write({"default": {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}})
+    flags = ["--env-kwargs", "episode_length:5", "--eval-freq", "-1"]
+    assert main(["train", "--env", TASK, "--conf-file", config, *flags]) == 0
+    assert replay("enjoy", Path("logs/cure_sac", f"{RUN}_1")) == 0
+    assert "2 Episodes" in capsys.readouterr().out
+
+
 def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
     assert replay("record", run, "--srl", "heads_of_mine.Gentle", "--load-best", "-o", str(tmp_path)) == 0
     (video,) = tmp_path.glob("best_model-*.mp4")
