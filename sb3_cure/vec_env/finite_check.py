@@ -92,7 +92,8 @@ class FiniteCheck(VecEnvWrapper):
         self.n_steps += self.num_envs
         if rewards.dtype == object:  # of worker processes, one of which returned None
             rewards = rewards.astype(np.float32)
-        self._look_for_light(observations)
+        if self._steps_in_the_dark < STEPS_IN_THE_DARK:
+            self._look_for_light(observations)
         bad_rewards = self._find_bad("reward", rewards)
         bad_ends = np.zeros(self.num_envs, dtype=bool)
         for i in np.flatnonzero(dones):
@@ -161,8 +162,6 @@ class FiniteCheck(VecEnvWrapper):
         return True
 
     def _look_for_light(self, observations: np.ndarray) -> None:
-        if self._steps_in_the_dark >= STEPS_IN_THE_DARK:
-            return
         self._steps_in_the_dark += 1
         brightest = np.max(observations)
         if brightest > 1:
