@@ -265,6 +265,8 @@ def test_head_that_holds_the_encoder_trains_it_no_more(update: str) -> None:
         train_once(model)
     ours, theirs = (list(model.policy.encoder.parameters()) for model in models)
     assert equal(ours, theirs)
+    held = {id(p) for group in models[1].policy.srl.optimizer.param_groups for p in group["params"]}
+    assert held and held.isdisjoint(map(id, theirs))
 
 
 def test_target_encoder_is_the_moving_average() -> None:
