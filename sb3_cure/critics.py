@@ -4,15 +4,15 @@ Both act on the latents of the shared encoder. Wherever a value is formed, [B, K
 K = 1 for SAC (the smallest of the twin Q values), the quantiles that are kept for TQC.
 """
 
+from itertools import chain, pairwise
 from typing import Any, ClassVar
 
 import torch as th
 from sb3_contrib.common.utils import quantile_huber_loss
-from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.layers import first_in_fp32, full_precision
+from sb3_cure.layers import EnsembleLinear, run_mlp
 
 
 class LatentCritic(nn.Module):
@@ -39,10 +39,9 @@ class LatentCritic(nn.Module):
     ):
         super().__init__()
         self.n_critics = n_critics
-        self.q_networks = nn.ModuleList(
-            nn.Sequential(*create_mlp(features_dim + action_dim, n_values, net_arch, activation_fn))
-            for _ in range(n_critics)
-        )
+        sizes = [features_dim + action_dim, *net_arch]
+        hidden = [[EnsembleLinear(n_critics, *pair), activation_fn()] for pair in pairwise(sizes)]
+        self.ensemble = nn.Sequential(*chain(*hidden), EnsembleLinear(n_critics, sizes[-1], n_values))
 
     def forward(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -50,13 +49,8 @@ class LatentCritic(nn.Module):
         :param actions: In [-1, 1], [B, action_dim]
         :return: Values in fp32, [B, n_critics, n_values]
         """
-        inputs = th.cat([latents, actions], dim=1)
-        values = []
-        for network in self.q_networks:
-            hidden = first_in_fp32(list(network.children())[:-1], inputs)
-            with full_precision(inputs):  # values need more digits than bf16 has
-                values.append(network[-1](hidden.float()))  # type: ignore[index]
-        return th.stack(values, dim=1)
+        inputs = th.cat([latents, actions], dim=1).expand(self.n_critics, -1, -1)
+        return run_mlp(self.ensemble, inputs).transpose(0, 1)
 
 
 class TwinQ:

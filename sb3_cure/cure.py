@@ -427,7 +427,7 @@ class CuRe(OffPolicyAlgorithm):
             learns_srl, learns_rl = self._phase()
             for _ in range(2 if self.srl_schedule == "alternating" else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                batch = Samples(**sampled._asdict(), views=self.policy.augmentation(sampled.observations))
+                batch = Samples(**sampled._asdict(), views=self.policy.views(sampled.observations))
                 self._guard.begin(self._n_updates)
                 with crash_report(self, batch):
                     self._gradient_step(batch, learns_srl, learns_rl)
@@ -479,7 +479,7 @@ class CuRe(OffPolicyAlgorithm):
         :return: SRL error of the observations (or next observations) that an intrinsic reward may be made of, [B]
         """
         encoder = self.policy.encoder_update
-        runs = [encoder.run(), encoder.next_run(gradient=True)] if srl.needs_next_latents else [encoder.run()]
+        runs = [encoder.run(), encoder.next_run()] if srl.needs_next_latents else [encoder.run()]
         read = [_read(run.latents, trains) for run in runs]
         with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
             loss, error = srl.loss(batch, *(latents for _, latents in read))
@@ -533,7 +533,7 @@ class CuRe(OffPolicyAlgorithm):
         """Latents and next latents of centred views, by the online encoder."""
         encoder, policy = self.policy.encoder_update, self.policy
         if type(policy.augmentation) is Augmentation:  # then the views that all others see are the centred ones
-            runs = [encoder.run().latents, encoder.next_run(gradient).latents]
+            runs = [encoder.run().latents, encoder.next_run().latents]
         else:
             with th.set_grad_enabled(gradient), self._autocast():
                 runs = [policy.encode(each).float() for each in (batch.observations, batch.next_observations)]
@@ -552,7 +552,7 @@ class CuRe(OffPolicyAlgorithm):
         """
         agent, encoder = self.policy.agents[name], self.policy.encoder_update
         with th.no_grad(), self._autocast():
-            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.next_run().features)
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.next_features())
             next_values = self._critics.next_values(agent.critic_target, next_latents, next_actions)
         target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
 

@@ -103,6 +103,7 @@ class EncoderUpdate:
         """
         self._inputs = {"": views, "next ": next_views}
         self._runs: dict[str, Encoded] = {}
+        self._next_features: th.Tensor | None = None
         self._pulls: dict[str, list[tuple[th.Tensor, th.Tensor]]] = {}
         self.gradient_norms: dict[str, th.Tensor] = {}
         self._measured: dict[str, th.Tensor] = {}
@@ -111,23 +112,32 @@ class EncoderUpdate:
         """
         :return: Features and latents of the observations, by the encoder as it is now, with their graph
         """
-        return self._run("", gradient=True)
+        return self._run("")
 
-    def next_run(self, gradient: bool = False) -> Encoded:
+    def next_run(self) -> Encoded:
         """
-        :param gradient: Whether features and latents are to have their graph
-        :return: Features and latents of the next observations, by the encoder as it is now
+        :return: Features and latents of the next observations, by the encoder as it is now, with their graph
         """
-        return self._run("next ", gradient)
+        return self._run("next ")
 
-    def _run(self, which: str, gradient: bool) -> Encoded:
-        run = self._runs.get(which)
-        if run is None or (gradient and not run.latents.requires_grad):
-            with th.set_grad_enabled(gradient), self.autocast():
+    def next_features(self) -> th.Tensor:
+        """
+        :return: Features alone of the next observations, which actors read, [B, trunk_dim]
+        """
+        if "next " in self._runs:
+            return self._runs["next "].features
+        if self._next_features is None:
+            with th.no_grad(), self.autocast():
+                self._next_features = self.encoder.trunk(self._inputs["next "])
+        return self._next_features
+
+    def _run(self, which: str) -> Encoded:
+        if which not in self._runs:
+            with self.autocast():
                 features = self.encoder.trunk(self._inputs[which])
                 # In full precision, whatever the encoder ends with: losses and optimisers work with these.
-                run = self._runs[which] = Encoded(features, self.encoder.projection(features).float())
-        return run
+                self._runs[which] = Encoded(features, self.encoder.projection(features).float())
+        return self._runs[which]
 
     def backward(self, source: str, read: Sequence[tuple[th.Tensor, th.Tensor]]) -> None:
         """Take a loss's gradient, if it has one.
@@ -173,7 +183,7 @@ class EncoderUpdate:
         factor = len(losses) ** 0.5 if self.mode == "joint" else 1.0
         update_learning_rate(optimizer, self.learning_rate * factor)
         optimize("encoder", th.stack(list(losses.values())).sum(), optimizer)
-        self._pulls, self._runs = {}, {}
+        self._pulls, self._runs, self._next_features = {}, {}, None
 
     def end(self) -> dict[str, th.Tensor]:
         """End an update.

@@ -1,13 +1,17 @@
 """Building blocks of the encoder, the decoder, the actors and the critics."""
 
 import contextlib
-from typing import Any, TypeVar
+from collections.abc import Iterable
+from functools import partial
+from typing import TypeVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
 from torch.nn import functional
+
+from sb3_cure.fast_ops import add_bias
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -91,33 +95,68 @@ class FullPrecision(nn.Sequential):
             return super().forward(inputs)
 
 
-def first_in_fp32(layers: Any, inputs: th.Tensor) -> th.Tensor:
-    """Run layers of an actor or a critic, the first of them in fp32: of bf16's digits, actions .500 and .501 are one.
+#: Weights from which on a layer of an actor or a critic is computed in bf16: below, casting costs what bf16 gains
+WIDE = 2**18
 
-    The first layer is small; the products of the wide hidden layers are what bf16 is for.
+
+class EnsembleLinear(nn.Module):
+    """Linear maps of several networks, side by side, as one product; orthogonal at first.
+
+    :param n: Number of networks
+    :param in_features: Size of each input
+    :param out_features: Size of each output
+    """
+
+    def __init__(self, n: int, in_features: int, out_features: int):
+        super().__init__()
+        self.weight = nn.Parameter(
+            th.stack([nn.init.orthogonal_(th.empty(in_features, out_features)) for _ in range(n)])
+        )
+        self.bias = nn.Parameter(th.zeros(n, 1, out_features))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [n, B, in_features]
+        :return: [n, B, out_features]
+        """
+        return th.baddbmm(self.bias, inputs, self.weight)
+
+
+def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
+    """Run an actor or critics: within autocast, too, everything but wide hidden layers in fp32.
+
+    The first layer sees latents and actions: of bf16's digits, actions .500 and .501 are one. The last one gives values
+    and means, which need more digits, too.
 
     :param layers: Linear maps and activations
-    :param inputs: Latents, with or without actions, [B, n]
-    :return: Output of the last layer
+    :param inputs: Latents, with or without actions, [..., B, n]
+    :return: Output of the last layer, fp32
     """
-    for i, layer in enumerate(layers):
-        with full_precision(inputs) if i == 0 else contextlib.nullcontext():
-            inputs = layer(inputs.float() if i == 0 else inputs)
-    return inputs
+    layers, device = list(layers), inputs.device.type
+    fast = partial(th.autocast, device, th.get_autocast_dtype(device), th.is_autocast_enabled(device))
+    with full_precision(inputs):
+        for i, layer in enumerate(layers):
+            if 0 < i < len(layers) - 1 and getattr(layer, "weight", inputs[:0]).numel() >= WIDE:
+                with fast():
+                    inputs = layer(inputs)
+            elif i == 0 or isinstance(layer, nn.Linear | EnsembleLinear):
+                inputs = layer(inputs.float())
+            else:
+                inputs = layer(inputs)
+        return inputs.float()
 
 
-class ConvTranspose2d(nn.ConvTranspose2d):
-    """torch's transposed convolution, its bias added afterwards: inside, oneDNN's bias gradient costs as much as
-    that of the weights. Square strides, no padding but ``output_padding``."""
+class ConvTranspose2dReLU(nn.ConvTranspose2d):
+    """torch's transposed convolution of stride 1, and a ReLU. The bias is added afterwards: inside, oneDNN's bias
+    gradient costs as much as that of the weights."""
 
     def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
         """
-        :param images: [B, in_channels, H, W]
+        :param images: In NHWC memory order, [B, in_channels, H, W]
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        drawn = functional.conv_transpose2d(images, self.weight, None, self.stride, output_padding=self.output_padding)
-        return drawn.add_(self.bias.to(drawn.dtype).view(-1, 1, 1))  # type: ignore[union-attr]
+        return add_bias(functional.conv_transpose2d(images, self.weight), self.bias, relu=True)  # type: ignore[arg-type]
 
 
 class FlattenImage(nn.Module):

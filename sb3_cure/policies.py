@@ -22,7 +22,7 @@ from sb3_cure.critics import LatentCritic, TwinQ
 from sb3_cure.encoder_update import EncoderUpdate
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.intrinsic import IntrinsicReward, RewardScale
-from sb3_cure.layers import Projection, first_in_fp32, full_precision, init_weights, preprocess
+from sb3_cure.layers import Projection, full_precision, init_weights, preprocess, run_mlp
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import SRLHead
 
@@ -40,9 +40,8 @@ class TrunkActor(Actor):
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation before squashing, [B, action_dim] each
         """
-        latent = first_in_fp32(self.latent_pi, self.features_extractor(obs))
+        latent = run_mlp(self.latent_pi, self.features_extractor(obs))
         with full_precision(latent):
-            latent = latent.float()
             # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
             log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
             log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
@@ -373,7 +372,15 @@ class CuRePolicy(BasePolicy):
         :param observations: [B, *shape], images in 0-255
         :return: Randomly augmented encoder inputs, as in training
         """
-        return self.preprocess(self.augmentation(observations))
+        return self.preprocess(self.views(observations))
+
+    def views(self, observations: th.Tensor) -> th.Tensor:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: What the encoder is to learn from: random views, images in NHWC memory order, [B, *view shape]
+        """
+        views = self.augmentation(observations)
+        return views.contiguous(memory_format=th.channels_last) if views.dim() == 4 else views
 
     def center(self, observations: th.Tensor) -> th.Tensor:
         """

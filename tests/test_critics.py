@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sb3_contrib.common.utils import quantile_huber_loss
 from torch import nn
-from updates_for_tests import ALGORITHMS
+from updates_for_tests import ALGORITHMS, critic_values
 
+from sb3_cure import layers
 from sb3_cure.critics import LatentCritic, TruncatedQuantiles, TwinQ
 
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -42,9 +43,12 @@ def test_critics_are_separate_networks_of_latents_and_actions(n_critics: int) ->
         _, critic = make(kind, n_critics)
         values = critic(latents, actions)
         assert values.shape == (6, n_critics, n_values)
-        for i, network in enumerate(critic.q_networks):
-            th.testing.assert_close(values[:, i], network(th.cat([latents, actions], dim=1)))
-        assert len({id(parameter) for parameter in critic.parameters()}) == 6 * n_critics
+        for i, expected in enumerate(critic_values(critic, latents, actions)):
+            th.testing.assert_close(values[:, i], expected)
+        sizes = [layer.bias.numel() for layer in critic.ensemble if list(layer.parameters())]
+        assert sum(p.numel() for p in critic.parameters()) == sum(sizes) + sum(
+            layer.weight[0].numel() * n_critics for layer in critic.ensemble if list(layer.parameters())
+        )
 
 
 @pytest.mark.parametrize("n_critics", [1, 2, 3])
@@ -144,11 +148,12 @@ def test_bf16_tells_actions_apart_that_differ_in_the_third_digit(
         assert float((found - exact).mean().abs()) < 0.5 * float(exact.abs().mean())
 
 
-def test_first_layer_of_critics_is_exact_within_autocast() -> None:
-    """Bit for bit what it is in fp32; the hidden layers in between are the only ones in bf16."""
+def test_first_layer_of_critics_is_exact_within_autocast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit what it is in fp32; wide hidden layers in between are the only ones in bf16."""
     _, critic = make(TwinQ)
     formats: dict[int, list[th.dtype]] = {0: [], 1: [], 2: []}
-    linear = [layer for layer in critic.q_networks[0] if isinstance(layer, nn.Linear)]
+    monkeypatch.setattr(layers, "WIDE", 0)  # as if they were wide
+    linear = [layer for layer in critic.ensemble if isinstance(layer, layers.EnsembleLinear)]
     outputs: list[th.Tensor] = []
     linear[0].register_forward_hook(lambda module, args, out: outputs.append(out))
     for i, layer in enumerate(linear):
@@ -157,7 +162,11 @@ def test_first_layer_of_critics_is_exact_within_autocast() -> None:
     with th.autocast("cpu", th.bfloat16):
         critic(latents, actions)
     assert formats == {0: [th.float32], 1: [th.bfloat16], 2: [th.float32]}
-    assert th.equal(outputs[0], linear[0](th.cat([latents, actions], dim=1)))
+    assert th.equal(outputs[0], linear[0](th.cat([latents, actions], dim=1).expand(2, -1, -1)))
+    monkeypatch.undo()
+    with th.autocast("cpu", th.bfloat16):
+        critic(latents, actions)
+    assert formats[1][-1] == th.float32
 
 
 def test_bf16_tells_vectors_apart_that_differ_in_the_third_digit() -> None:

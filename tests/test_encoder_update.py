@@ -206,7 +206,7 @@ def test_gradients_through_next_latents_count(mode: str) -> None:
     encoder, update = make(mode, ("srl",), optimizer_class=th.optim.SGD)
     expected = Linear()
     update.begin(inputs(0), inputs(1))
-    runs = [update.run(), update.next_run(gradient=True)]
+    runs = [update.run(), update.next_run()]
     given = [gradient("task", run.latents) for run in runs]
     update.backward("srl", [(run.latents, with_gradient(grad)) for run, grad in zip(runs, given, strict=True)])
     update.step(optimize)
@@ -282,27 +282,28 @@ def test_runs_show_the_encoder_as_it_is(mode: str) -> None:
     encoder.trunk.register_forward_hook(lambda *_: calls.append(1))
     update.begin(inputs(0), inputs(1))
     for source in SOURCES:
-        run, following = update.run(), update.next_run()
-        assert run.latents.requires_grad and not following.latents.requires_grad
-        assert update.run() is run and update.next_run() is following
+        run, following = update.run(), update.next_features()
+        assert run.latents.requires_grad and not following.requires_grad
+        assert update.run() is run and update.next_features() is following
         with th.no_grad():
             features = encoder.trunk[1](encoder.trunk[0](inputs(0)))
             th.testing.assert_close(run.features.detach(), features, rtol=0, atol=0)
             th.testing.assert_close(run.latents.detach(), encoder.projection(features), rtol=0, atol=0)
             later = encoder.trunk[1](encoder.trunk[0](inputs(1)))
-            th.testing.assert_close(following.latents, encoder.projection(later), rtol=0, atol=0)
+            th.testing.assert_close(following, later, rtol=0, atol=0)
         give(update, source)
     assert len(calls) == (2 if mode == "joint" else 6)
 
 
-def test_next_run_with_a_gradient_replaces_one_without() -> None:
-    """And serves those who need none afterwards."""
-    _, update = make("joint")
+def test_features_of_next_observations_come_from_their_run() -> None:
+    """If there is one: a head that reads next latents runs the encoder with its graph, which serves the actors, too."""
+    encoder, update = make("joint")
     update.begin(inputs(0), inputs(1))
-    plain = update.next_run()
-    graph = update.next_run(gradient=True)
-    assert graph.latents.requires_grad and th.equal(plain.latents, graph.latents.detach())
-    assert update.next_run() is graph
+    alone, run = update.next_features(), update.next_run()
+    assert run.latents.requires_grad and update.next_run() is run and update.next_features() is run.features
+    th.testing.assert_close(run.features.detach(), alone, rtol=0, atol=0)
+    with th.no_grad():
+        th.testing.assert_close(run.latents, encoder.projection(alone), rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------- states

@@ -14,6 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cure import layers
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.layers import conv_sizes, preprocess
@@ -89,7 +90,7 @@ def test_delta_orthogonal_initialisation(module: nn.Module) -> None:
             center, gain = layer.weight.detach(), 1.0
         else:
             continue
-        kinds.add(type(layer))
+        kinds.add(nn.Linear if isinstance(layer, nn.Linear) else nn.Conv2d)
         # Rows or columns, whichever are fewer, are orthogonal and of equal length.
         smaller = center if len(center) <= center.shape[1] else center.T
         th.testing.assert_close(smaller @ smaller.T, gain * th.eye(len(smaller)), rtol=0, atol=1e-5)
@@ -101,12 +102,13 @@ def test_actors_and_critics_are_initialised_alike() -> None:
     """Orthogonal linear maps and zero biases in both agents (SAC-AE), not torch's default."""
     policy = tiny_model("CnnPolicy", PixelBox()).policy
     for network in (policy.actor, policy.critic, policy.curious.actor, policy.curious.critic):
-        layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
-        assert len(layers) >= 4
-        for layer in layers:
-            weight = layer.weight.detach()
-            smaller = weight if len(weight) <= weight.shape[1] else weight.T
-            th.testing.assert_close(smaller @ smaller.T, th.eye(len(smaller)), rtol=0, atol=1e-5)
+        linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear | layers.EnsembleLinear)]
+        assert len(linear) >= 2
+        for layer in linear:
+            weights = layer.weight.detach()
+            for weight in weights if weights.dim() == 3 else [weights]:
+                smaller = weight if len(weight) <= weight.shape[1] else weight.T
+                th.testing.assert_close(smaller @ smaller.T, th.eye(len(smaller)), rtol=0, atol=1e-5)
             assert not layer.bias.any()
 
 
@@ -266,8 +268,9 @@ def test_log_probability_is_that_of_the_squashed_gaussian() -> None:
     np.testing.assert_allclose(log_prob[:, 0].numpy(), expected, rtol=1e-3, atol=1e-3)
 
 
-def test_bf16_stays_within_the_hidden_layers() -> None:
-    """Under autocast hidden layers compute in bf16; latents, Q, log-probabilities, targets and losses are fp32."""
+def test_bf16_stays_within_the_hidden_layers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under autocast wide layers compute in bf16; latents, Q, log-probabilities, targets and losses are fp32."""
+    monkeypatch.setattr(layers, "WIDE", 0)
     model = tiny_model("CnnPolicy", PixelBox(), precision="bf16", policy_kwargs={"net_arch": [16, 16]})
     policy = model.policy
     observations = th.randint(256, (4, 6, 36, 36), dtype=th.uint8, generator=th.Generator().manual_seed(0))
@@ -276,8 +279,7 @@ def test_bf16_stays_within_the_hidden_layers() -> None:
     hidden: list[th.dtype] = []
     for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[2]):
         layer.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
-    for q_net in policy.critic.q_networks:
-        q_net[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
+    policy.critic.ensemble[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
     policy.srl.decoder.linear.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
 
     def compute() -> dict[str, th.Tensor]:
@@ -295,7 +297,7 @@ def test_bf16_stays_within_the_hidden_layers() -> None:
     with th.no_grad(), model._autocast():
         halves = compute()
     assert set(hidden) == {th.bfloat16}
-    assert len(hidden) == 7
+    assert len(hidden) == 6
     with th.no_grad():
         full = compute()
     for name, value in halves.items():

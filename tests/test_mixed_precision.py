@@ -76,7 +76,7 @@ def test_actions_reach_the_critics_first_layer(model: CuReSAC, name: str) -> Non
     """In fp32: the first layer's output differs by what its weights make of the difference."""
     critic: Any = actor_critic(model, name).critic
     seen: list[th.Tensor] = []
-    handle = critic.q_networks[0][0].register_forward_hook(lambda _, inputs, output: seen.append(output))
+    handle = critic.ensemble[0].register_forward_hook(lambda _, inputs, output: seen.append(output))
     latents = th.full((1, model.policy.encoder.features_dim), 0.7)
 
     def layer(actions: th.Tensor) -> th.Tensor:

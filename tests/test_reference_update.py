@@ -51,8 +51,10 @@ def copy_weights(model: CuReSAC, plain: PlainSacAe) -> None:
     for head, part in ((policy.actor.mu, slice(n_actions)), (policy.actor.log_std, slice(n_actions, None))):
         head.weight.copy_(output.weight[part])
         head.bias.copy_(output.bias[part])
-    for mine, other in zip(policy.critic.q_networks, (plain.critic.q1, plain.critic.q2), strict=True):
-        copy_layers(mine, other)
+    for i, other in enumerate((plain.critic.q1, plain.critic.q2)):
+        for mine, theirs in zip(policy.critic.ensemble[::2], other[::2], strict=True):
+            mine.weight[i].copy_(theirs.weight.T)
+            mine.bias[i].copy_(theirs.bias)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
     decoder.linear.weight.copy_(plain.decoder.fc.weight.view(FILTERS, LAST, LAST, -1).permute(1, 2, 0, 3).flatten(0, 2))
     decoder.linear.bias.copy_(plain.decoder.fc.bias.view(FILTERS, LAST, LAST).permute(1, 2, 0).flatten())
@@ -81,7 +83,7 @@ def test_sequential_updates_are_sac_aes(monkeypatch: pytest.MonkeyPatch) -> None
     plain = PlainSacAe(channels, actions, HIDDEN, size=SIZE, filters=FILTERS, decoder_first=True)
     copy_weights(model, plain)
     # The only noise that the two would draw otherwise.
-    monkeypatch.setattr(autoencoder, "_random_bytes_like", lambda images: th.full_like(images, 99))
+    monkeypatch.setattr(autoencoder, "random_bytes_like", lambda images: th.full_like(images, 99))
     monkeypatch.setattr(plain, "dither", lambda images: th.full_like(images, 99.5 / 256))
     model.set_logger(Logger(None, []))
     model.replay_buffer.dones[::5] = 1

@@ -245,7 +245,11 @@ def test_net_arch(extras: dict[str, Any], net_arch: list[int] | dict[str, list[i
     for actor, critic in agents:
         assert widths(actor.latent_pi) == hidden["pi"]
         assert widths(actor.mu, actor.log_std) == [2, 2]
-        assert widths(critic) == [*hidden["qf"], 1] * 3
+        if extras is OFF:
+            assert widths(critic) == [*hidden["qf"], 1] * 3
+        else:
+            biases = [layer.bias for layer in critic.ensemble if list(layer.parameters())]
+            assert [bias.shape for bias in biases] == [(3, 1, width) for width in [*hidden["qf"], 1]]
 
 
 @both_modes
@@ -420,7 +424,8 @@ def test_get_and_set_parameters(extras: dict[str, Any]) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     model.learn(20)
     moved = {name.split("[")[0].lstrip(".") for name in differences(before, state_of(model))}
-    for module in ("actor.mu", "critic.q", "critic_target.q"):
+    critics = "q_networks" if extras is OFF else "ensemble"
+    for module in ("actor.mu", f"critic.{critics}", f"critic_target.{critics}"):
         assert any(module in name for name in moved), module
     assert not np.array_equal(actions, model.predict(observations, deterministic=True)[0])
     model.set_parameters(saved)
@@ -663,9 +668,10 @@ def test_n_step_returns(extras: dict[str, Any], monkeypatch: pytest.MonkeyPatch)
     batch = model.replay_buffer.sample(200)
     assert set(batch.discounts.flatten().tolist()) == {0.5, 0.25, 0.125}
     monkeypatch.setattr(model.replay_buffer, "sample", lambda *args, **kwargs: batch)
-    for q_network in model.critic_target.q_networks:
-        nn.init.zeros_(q_network[-1].weight)
-        nn.init.constant_(q_network[-1].bias, 10.0)
+    target = model.critic_target
+    for last in [network[-1] for network in target.q_networks] if extras is OFF else [target.ensemble[-1]]:
+        nn.init.zeros_(last.weight)
+        nn.init.constant_(last.bias, 10.0)
     model.train(1, batch_size=200)
     with th.no_grad():
         inputs = batch.observations if extras is OFF else model.policy.encode(batch.observations)

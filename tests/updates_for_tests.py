@@ -10,6 +10,7 @@ from torch import nn
 
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.buffers import Samples
+from sb3_cure.fast_ops import from_cells, to_cells
 
 ALGORITHMS: dict[str, Any] = {"sac": CuReSAC, "tqc": CuReTQC}
 BATCH = 8
@@ -108,6 +109,22 @@ def prepare(model: CuReSAC) -> None:
             parameter.mul_(1.1)
 
 
+def critic_values(critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
+    """
+    :param critic: A ``LatentCritic``
+    :param latents: [B, features_dim]
+    :param actions: [B, action_dim]
+    :return: Values of each critic, one layer of one network after the other, [B, n_values]
+    """
+    values = [th.cat([latents, actions], dim=1)] * critic.n_critics
+    for layer in critic.ensemble:
+        if list(layer.parameters()):
+            values = [each @ layer.weight[i] + layer.bias[i, 0] for i, each in enumerate(values)]
+        else:
+            values = [layer(each) for each in values]
+    return values
+
+
 class StraightLine:
     """One update of the autoencoder and of both agents under plain gradient descent, written out from the papers.
 
@@ -140,8 +157,14 @@ class StraightLine:
     def scaled(self, observations: th.Tensor) -> th.Tensor:
         return observations.float() / 255 if observations.dtype == th.uint8 else observations
 
+    def goal(self, observations: th.Tensor) -> th.Tensor:
+        """What the decoder is to draw, its noise drawn in the order in which pixels are."""
+        if observations.dim() != 4:
+            return self.head.target(observations, dither=True)
+        return from_cells(self.head.target(to_cells(observations), dither=True))
+
     def values(self, critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
-        return [network(th.cat([latents, actions], dim=1)) for network in critic.q_networks]
+        return critic_values(critic, latents, actions)
 
     def critic_loss(self, values: list[th.Tensor], target: th.Tensor) -> th.Tensor:
         """
@@ -186,7 +209,7 @@ class StraightLine:
 
         latents = shared
         if batch.observations.dtype == th.uint8:
-            drawn, goal = self.head.decoder(latents), self.head.target(batch.observations, dither=True)
+            drawn, goal = self.head.decoder(latents), self.goal(batch.observations)
         else:
             drawn, goal = self.head.decoder(latents), obs
         errors = ((drawn - goal) ** 2).flatten(1).mean(dim=1)

@@ -1,7 +1,5 @@
 """Regularised autoencoder (RAE): eq. 2 of the paper, as SAC-AE (Yarats et al., 2019) implements it."""
 
-from typing import Any
-
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
@@ -9,7 +7,8 @@ from torch import nn
 
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
-from sb3_cure.layers import ConvTranspose2d, FullPrecision, conv_sizes, full_precision, init_weights
+from sb3_cure.fast_ops import SquaredError, conv_transpose_cells, from_cells, random_bytes_like, to_cells
+from sb3_cure.layers import ConvTranspose2dReLU, FullPrecision, conv_sizes, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -27,61 +26,23 @@ class PixelDecoder(nn.Module):
         sizes = conv_sizes(shape[1], shape[2], n_layers)
         self.first_shape = (*sizes[-1], n_filters)
         self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
-        hidden: list[nn.Module] = []
-        for _ in range(n_layers - 1):
-            hidden += [ConvTranspose2d(n_filters, n_filters, 3), nn.ReLU(inplace=True)]
-        self.hidden = nn.Sequential(*hidden)
-        # The strided convolution may drop the last row or column; output padding gives it back.
-        padding = (sizes[0][0] - (2 * sizes[1][0] + 1), sizes[0][1] - (2 * sizes[1][1] + 1))
-        self.output = ConvTranspose2d(n_filters, shape[0], 3, stride=2, output_padding=padding)
+        self.hidden = nn.Sequential(*(ConvTranspose2dReLU(n_filters, n_filters, 3) for _ in range(n_layers - 1)))
+        self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2)
+        self.shape = shape
         init_weights(self)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, latents: th.Tensor) -> th.Tensor:
+    def forward(self, latents: th.Tensor, as_cells: bool = False) -> th.Tensor:
         """
         :param latents: [B, latent_dim]
+        :param as_cells: Whether to return them as ``to_cells`` does, as they are drawn; for even sizes
         :return: Images in the target's scale, about [-0.5, 0.5], [B, C, H, W]
         """
         hidden = th.relu(self.linear(latents)).view(-1, *self.first_shape)
         # The linear map writes NHWC, which the convolutions read without a copy.
         hidden = self.hidden(hidden.permute(0, 3, 1, 2))
-        with full_precision(hidden):
-            return self.output(hidden.float())
-
-
-def _random_bytes_like(images: th.Tensor) -> th.Tensor:
-    """Uniform random bytes, eight per draw of the generator: drawn singly they would cost as much as the encoder.
-
-    :param images: uint8, dense
-    :return: uint8 of the same shape and memory order
-    """
-    draws = th.empty(-(-images.numel() // 8), dtype=th.int64, device=images.device).random_(-(2**63), None)
-    return draws.view(th.uint8)[: images.numel()].as_strided(images.shape, images.stride())
-
-
-class _SquaredError(th.autograd.Function):
-    """Mean squared error of each image, [B]: as few passes over the images as there can be, forward and backward."""
-
-    @staticmethod
-    def forward(ctx: Any, drawn: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
-        :param drawn: fp32 images, [B, C, H, W]; their gradient is all that is computed
-        :param target: The same; it is overwritten
-        :return: [B]
-        """
-        difference = th.sub(drawn, target, out=target) if target.stride() == drawn.stride() else drawn - target
-        ctx.save_for_backward(difference)
-        flat = difference.permute(0, 2, 3, 1).flatten(1)  # a view where kernels write NHWC
-        return flat.square().mean(dim=1)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
-        """
-        :param gradient: [B]
-        :return: Gradient of ``drawn``
-        """
-        (difference,) = ctx.saved_tensors
-        return difference * (gradient * (2 / difference[0].numel())).view(-1, 1, 1, 1), None
+        cells = conv_transpose_cells(hidden, self.output.weight, self.output.bias)  # type: ignore[arg-type]
+        return cells if as_cells else from_cells(cells)[..., : self.shape[1], : self.shape[2]]
 
 
 class VectorDecoder(FullPrecision):
@@ -150,7 +111,7 @@ class RAE(SRLHead):
         levels = th.bitwise_right_shift(images, 8 - self.bits).to(th.int16).sub_(2 ** (self.bits - 1)).mul_(256)
         middle = 128.0
         if dither:
-            levels.add_(_random_bytes_like(images))
+            levels.add_(random_bytes_like(images))
             middle = 0.5
         return levels.float().add_(middle).div_(256 * 2**self.bits)
 
@@ -162,7 +123,7 @@ class RAE(SRLHead):
         :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, [B]
         """
-        error = self._squared_error(self.target(batch.views, dither=True), latents)
+        error = self._squared_error(batch.views, latents, dither=True)
         penalty = 0.5 * latents.square().sum(dim=1).mean()
         return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
 
@@ -173,7 +134,7 @@ class RAE(SRLHead):
         :param latents: [B, features_dim]
         :return: [B]
         """
-        return self._squared_error(self.target(batch.views, dither=False), latents).detach()
+        return self._squared_error(batch.views, latents, dither=False).detach()
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         """
@@ -183,9 +144,13 @@ class RAE(SRLHead):
         drawn = self.decoder(latents).float()
         return ((drawn + 0.5) * 256).clamp(0, 255).to(th.uint8) if self.pixels else drawn
 
-    def _squared_error(self, target: th.Tensor, latents: th.Tensor) -> th.Tensor:
-        drawn = self.decoder(latents).float()
-        with full_precision(drawn):
-            if self.pixels:
-                return _SquaredError.apply(drawn, target)  # type: ignore[no-any-return]
-            return (drawn - target).square().mean(dim=1)
+    def _squared_error(self, views: th.Tensor, latents: th.Tensor, dither: bool) -> th.Tensor:
+        """Of each view against its target, fp32, [B]."""
+        if isinstance(self.decoder, PixelDecoder) and not (views.shape[2] % 2 or views.shape[3] % 2):
+            drawn, views = self.decoder(latents, as_cells=True), to_cells(views)  # compared as it is drawn
+        else:
+            drawn = self.decoder(latents)
+        target = self.target(views, dither)
+        if self.pixels:
+            return SquaredError.apply(drawn, target)  # type: ignore[no-any-return]
+        return (drawn - target).square().mean(dim=1)  # type: ignore[no-any-return]

@@ -185,7 +185,7 @@ def test_arms_of_tqc_are_trained_and_judged(tmp_path: Path, monkeypatch: pytest.
     assert run.run_grid(grid, out, pictures=False) == []
     folder = out / grid.cells[0].folder
     model = CuReTQC.load(folder / "model.zip")
-    assert model.policy.critic.q_networks[0][-1].out_features == 5 and model.top_quantiles_to_drop_per_net == 1
+    assert model.policy.critic.ensemble[-1].bias.shape == (2, 1, 5) and model.top_quantiles_to_drop_per_net == 1
     config = cells.read_kept(folder / "config.json")
     assert config["algo"] == "cure_tqc" and config["defaults"]["curiosity_prob"] == 0.2
     assert {row["head"] for row in read_rows(folder / "visitation.csv")} >= {"own", "common"}

@@ -1,0 +1,131 @@
+"""Kernels written for speed against their plain twins: values, and the gradients of all that they read."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import functional as F
+
+from sb3_cure import layers
+from sb3_cure.fast_ops import SquaredError, add_bias, conv_transpose_cells, from_cells, random_bytes_like, to_cells
+from sb3_cure.layers import ConvTranspose2dReLU, EnsembleLinear, run_mlp
+
+sizes = st.integers(1, 9)
+
+
+def tensor(*shape: int, seed: int = 0, dtype: th.dtype = th.float64) -> th.Tensor:
+    """Normal numbers; images in NHWC memory order."""
+    drawn = th.randn(shape, generator=th.Generator().manual_seed(seed), dtype=th.float64).to(dtype)
+    return drawn.contiguous(memory_format=th.channels_last) if len(shape) == 4 else drawn
+
+
+def agree(fast: Callable[..., th.Tensor], plain: Callable[..., th.Tensor], *inputs: th.Tensor) -> None:
+    """Same values, same gradients."""
+    results = []
+    for function in (fast, plain):
+        own = [each.clone().requires_grad_() for each in inputs]
+        value = function(*own)
+        (value * tensor(*value.shape, seed=9)).sum().backward()
+        results.append([value.detach(), *(each.grad for each in own)])
+    for mine, theirs in zip(*results, strict=True):
+        th.testing.assert_close(mine, theirs)
+
+
+@given(batch=sizes, channels=sizes, height=sizes, width=sizes, relu=st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_bias_of_channels(batch: int, channels: int, height: int, width: int, relu: bool) -> None:
+    def plain(images: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        biased = images + bias.view(-1, 1, 1)
+        return biased.relu() if relu else biased
+
+    images, bias = tensor(batch, channels, height, width), tensor(channels, seed=1)
+    agree(lambda x, b: add_bias(x, b, relu), plain, images, bias)
+    assert add_bias(images, bias, relu).is_contiguous(memory_format=th.channels_last)
+
+
+@given(batch=sizes, channels=sizes, height=sizes, width=sizes)
+@settings(max_examples=30, deadline=None)
+def test_cells_are_pixels_in_another_order(batch: int, channels: int, height: int, width: int) -> None:
+    images = tensor(batch, channels, 2 * height, 2 * width)
+    cells = to_cells(images)
+    assert cells.shape == (batch, 4 * channels, height, width)
+    assert th.equal(from_cells(cells), images)
+    for row in (0, 1):
+        for column in (0, 1):
+            first = (2 * row + column) * channels
+            assert th.equal(cells[:, first : first + channels], images[:, :, row::2, column::2])
+
+
+@given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes)
+@settings(max_examples=30, deadline=None)
+def test_transposed_convolution_by_cells(batch: int, channels: int, drawn: int, height: int, width: int) -> None:
+    def plain(images: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        return F.conv_transpose2d(images, weight, bias, stride=2, output_padding=1)
+
+    inputs = tensor(batch, channels, height, width), tensor(channels, drawn, 3, 3, seed=1), tensor(drawn, seed=2)
+    agree(lambda *args: from_cells(conv_transpose_cells(*args)), plain, *inputs)
+
+
+def test_transposed_convolution_with_relu() -> None:
+    layer = ConvTranspose2dReLU(4, 5, 3).double()
+
+    def plain(images: th.Tensor) -> th.Tensor:
+        return F.conv_transpose2d(images, layer.weight, layer.bias).relu()
+
+    agree(layer, plain, tensor(2, 4, 6, 7))
+
+
+@pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
+def test_squared_error(dtype: th.dtype) -> None:
+    """Of images in bf16 it is fp32, and so is their difference."""
+    drawn, target = tensor(3, 2, 4, 6, dtype=dtype).requires_grad_(), tensor(3, 2, 4, 6, seed=1, dtype=th.float32)
+    same = drawn.detach().clone().requires_grad_()
+    expected = (same.float() - target).square().flatten(1).mean(dim=1)
+    error: Any = SquaredError.apply(drawn, target.clone(memory_format=th.preserve_format))
+    assert error.dtype == th.float32
+    th.testing.assert_close(error, expected)
+    for value in (error, expected):
+        (value * th.tensor([1.0, -2.0, 3.0])).sum().backward()
+    th.testing.assert_close(drawn.grad, same.grad, rtol=1e-2 if dtype == th.bfloat16 else 1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
+def test_random_bytes(memory_format: th.memory_format) -> None:
+    """Every value equally likely (chi-square of 255 degrees of freedom), in the images' memory order."""
+    th.manual_seed(0)
+    images = th.zeros(7, 3, 33, 35, dtype=th.uint8).contiguous(memory_format=memory_format)
+    drawn = th.cat([random_bytes_like(images).flatten() for _ in range(10)])
+    assert random_bytes_like(images).stride() == images.stride()
+    expected = len(drawn) / 256
+    counts = th.bincount(drawn.int(), minlength=256).double()
+    assert 170 < float(((counts - expected) ** 2 / expected).sum()) < 350
+
+
+def test_ensemble_is_separate_linear_maps() -> None:
+    ensemble = EnsembleLinear(3, 4, 5).double()
+    for parameter, seed in zip(ensemble.parameters(), (1, 2), strict=True):
+        parameter.data.copy_(tensor(*parameter.shape, seed=seed))
+
+    def plain(inputs: th.Tensor) -> th.Tensor:
+        maps = zip(inputs, ensemble.weight, ensemble.bias[:, 0], strict=True)
+        return th.stack([F.linear(each, weight.T, bias) for each, weight, bias in maps])
+
+    agree(ensemble, plain, tensor(3, 6, 4))
+
+
+def test_wide_hidden_layers_alone_are_computed_in_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first and the last layer never are; without autocast nothing is."""
+    monkeypatch.setattr(layers, "WIDE", 30)
+    mlp = th.nn.Sequential(*(th.nn.Linear(*pair) for pair in ((9, 5), (5, 5), (5, 8), (8, 9), (9, 9))))
+    formats: list[th.dtype] = []
+    for layer in mlp:
+        layer.register_forward_hook(lambda module, args, output: formats.append(output.dtype))
+    inputs = tensor(2, 9, dtype=th.float32)
+    with th.autocast("cpu", th.bfloat16):
+        assert run_mlp(mlp, inputs).dtype == th.float32
+    assert formats == [th.float32, th.float32, th.bfloat16, th.bfloat16, th.float32]
+    th.testing.assert_close(run_mlp(mlp, inputs), mlp(inputs))
+    assert set(formats[5:]) == {th.float32}
