@@ -60,8 +60,8 @@ class CuRe(OffPolicyAlgorithm):
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         agent steps, two updates per step, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Updates of the counter per phase when alternating
-    :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), or a subclass of
-        ``IntrinsicReward``
+    :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), ``"reconstruction"`` (what
+        the latents do not hold of the image, for any head), or a subclass of ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
         task's; ``"random"``: the second actor draws uniform actions (control); None: off
@@ -510,12 +510,13 @@ class CuRe(OffPolicyAlgorithm):
 
         :return: Scaled reward, [B, 1]
         """
-        read = self._read_centred(batch, intrinsic.trains_encoder) if intrinsic.needs_latents else []
-        latents, next_latents = [latents for _, latents in read] or (None, None)
-        loss, raw = intrinsic.loss(batch, latents, next_latents, srl_error)
+        read = self._read_centred(batch, intrinsic)
+        latents, next_latents = [read[name][1] if name in read else None for name in ("latents", "next_latents")]
+        with self._autocast(intrinsic.mixed_precision):
+            loss, raw = intrinsic.loss(batch, latents, next_latents, srl_error)
         raw = raw.detach().float()
         if loss is not None:
-            self._learn_from("intrinsic reward", loss, intrinsic.optimizer, "intrinsic", read)
+            self._learn_from("intrinsic reward", loss.float(), intrinsic.optimizer, "intrinsic", list(read.values()))
         centers = self._has_curious_agent
         reward = self.policy.scale(raw, self.curiosity_beta, self.normalize_curiosity, centers)
         self._metrics.record(
@@ -529,15 +530,18 @@ class CuRe(OffPolicyAlgorithm):
         )
         return reward
 
-    def _read_centred(self, batch: Samples, gradient: bool) -> list[Read]:
-        """Latents and next latents of centred views, by the online encoder."""
-        encoder, policy = self.policy.encoder_update, self.policy
-        if type(policy.augmentation) is Augmentation:  # then the views that all others see are the centred ones
-            runs = [encoder.run().latents, encoder.next_run().latents]
-        else:
-            with th.set_grad_enabled(gradient), self._autocast():
-                runs = [policy.encode(each).float() for each in (batch.observations, batch.next_observations)]
-        return [_read(latents, gradient) for latents in runs]
+    def _read_centred(self, batch: Samples, intrinsic: IntrinsicReward) -> dict[str, Read]:
+        """The latents that a reward reads, of centred views, by the online encoder."""
+        encoder, policy, read = self.policy.encoder_update, self.policy, {}
+        for name in intrinsic.reads:
+            if type(policy.augmentation) is Augmentation:  # then the views that all others see are the centred ones
+                latents = (encoder.run() if name == "latents" else encoder.next_run()).latents
+            else:
+                observations = batch.observations if name == "latents" else batch.next_observations
+                with th.set_grad_enabled(intrinsic.trains_encoder), self._autocast():
+                    latents = policy.encode(observations).float()
+            read[name] = _read(latents, intrinsic.trains_encoder)
+        return read
 
     def _update_actor_critic(
         self, name: str, batch: Samples, rewards: th.Tensor, discounts: th.Tensor, next_latents: th.Tensor

@@ -16,9 +16,9 @@ from torch.nn import functional as F
 
 from sb3_cure import layers
 from sb3_cure.buffers import Samples
+from sb3_cure.decoders import PixelDecoder
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.layers import conv_sizes, preprocess
-from sb3_cure.srl.autoencoder import PixelDecoder
 
 
 def image_space(channels: int = 3, height: int = 84, width: int | None = None) -> spaces.Box:

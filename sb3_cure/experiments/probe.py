@@ -8,8 +8,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_cure.decoders import PixelDecoder
 from sb3_cure.policies import CuRePolicy, encoder_of
-from sb3_cure.srl import PixelDecoder
 
 
 def fit_probe(model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000) -> nn.Module:

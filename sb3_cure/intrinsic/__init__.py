@@ -4,9 +4,10 @@
 """
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardScale
+from sb3_cure.intrinsic.reconstruction import Reconstruction
 from sb3_cure.intrinsic.srl_error import SRLError
 
-INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {"srl_error": SRLError}
+INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {"srl_error": SRLError, "reconstruction": Reconstruction}
 
 
 def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[IntrinsicReward]:
@@ -23,4 +24,4 @@ def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[Intrinsi
     raise ValueError(f"intrinsic is {intrinsic!r}: choose one of {names}, or a subclass of IntrinsicReward.")
 
 
-__all__ = ["INTRINSIC_REWARDS", "IntrinsicReward", "RewardScale", "SRLError", "get_intrinsic_class"]
+__all__ = ["INTRINSIC_REWARDS", "IntrinsicReward", "Reconstruction", "RewardScale", "SRLError", "get_intrinsic_class"]

@@ -23,10 +23,12 @@ class IntrinsicReward(nn.Module):
 
     #: Whether the reward is made of the SRL error, so that ``srl=None`` is refused
     needs_srl: ClassVar[bool] = False
-    #: Whether the reward reads latents and next latents; they are None otherwise
-    needs_latents: ClassVar[bool] = False
+    #: Which of ``"latents"`` and ``"next_latents"`` the reward reads; the other ones are None
+    reads: ClassVar[tuple[str, ...]] = ()
     #: Whether the latents keep their graph, so that this loss trains the encoder, too
     trains_encoder: ClassVar[bool] = False
+    #: Whether ``loss`` runs under autocast where the agent computes in bf16; the reward itself is fp32
+    mixed_precision: ClassVar[bool] = False
     #: Optimiser of the reward's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
 

@@ -1,56 +1,17 @@
 """Regularised autoencoder (RAE): eq. 2 of the paper, as SAC-AE (Yarats et al., 2019) implements it."""
 
+from functools import partial
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from torch import nn
 
 from sb3_cure.buffers import Samples
+from sb3_cure.decoders import PixelDecoder, VectorDecoder, squared_error
 from sb3_cure.encoders import Encoder
-from sb3_cure.fast_ops import SquaredError, conv_transpose_cells, from_cells, random_bytes_like, to_cells
-from sb3_cure.layers import ConvTranspose2dReLU, FullPrecision, conv_sizes, init_weights
+from sb3_cure.fast_ops import random_bytes_like
 from sb3_cure.srl.base import SRLHead, SRLOutput
-
-
-class PixelDecoder(nn.Module):
-    """The mirror image of ``PixelEncoder``: a linear map, transposed 3x3 convolutions, the last one with stride 2.
-
-    :param latent_dim: Size of the latent state
-    :param shape: Shape of the observation to draw, (C, H, W)
-    :param n_filters: Channels of the hidden layers
-    :param n_layers: Number of transposed convolutions
-    """
-
-    def __init__(self, latent_dim: int, shape: tuple[int, ...], n_filters: int = 32, n_layers: int = 4):
-        super().__init__()
-        sizes = conv_sizes(shape[1], shape[2], n_layers)
-        self.first_shape = (*sizes[-1], n_filters)
-        self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
-        self.hidden = nn.Sequential(*(ConvTranspose2dReLU(n_filters, n_filters, 3) for _ in range(n_layers - 1)))
-        self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2)
-        self.shape = shape
-        init_weights(self)
-        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
-
-    def forward(self, latents: th.Tensor, as_cells: bool = False) -> th.Tensor:
-        """
-        :param latents: [B, latent_dim]
-        :param as_cells: Whether to return them as ``to_cells`` does, as they are drawn; for even sizes
-        :return: Images in the target's scale, about [-0.5, 0.5], [B, C, H, W]
-        """
-        hidden = th.relu(self.linear(latents)).view(-1, *self.first_shape)
-        # The linear map writes NHWC, which the convolutions read without a copy.
-        hidden = self.hidden(hidden.permute(0, 3, 1, 2))
-        cells = conv_transpose_cells(hidden, self.output.weight, self.output.bias)  # type: ignore[arg-type]
-        return cells if as_cells else from_cells(cells)[..., : self.shape[1], : self.shape[2]]
-
-
-class VectorDecoder(FullPrecision):
-    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]; in fp32, as its target is."""
-
-    def __init__(self, latent_dim: int, out_dim: int, hidden_dim: int = 256):
-        super().__init__(nn.Linear(latent_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, out_dim))
-        init_weights(self)
 
 
 class RAE(SRLHead):
@@ -123,7 +84,7 @@ class RAE(SRLHead):
         :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, [B]
         """
-        error = self._squared_error(batch.views, latents, dither=True)
+        error = squared_error(self.decoder, latents, batch.views, partial(self.target, dither=True))
         penalty = 0.5 * latents.square().sum(dim=1).mean()
         return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
 
@@ -134,7 +95,7 @@ class RAE(SRLHead):
         :param latents: [B, features_dim]
         :return: [B]
         """
-        return self._squared_error(batch.views, latents, dither=False).detach()
+        return squared_error(self.decoder, latents, batch.views, partial(self.target, dither=False)).detach()
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         """
@@ -143,14 +104,3 @@ class RAE(SRLHead):
         """
         drawn = self.decoder(latents).float()
         return ((drawn + 0.5) * 256).clamp(0, 255).to(th.uint8) if self.pixels else drawn
-
-    def _squared_error(self, views: th.Tensor, latents: th.Tensor, dither: bool) -> th.Tensor:
-        """Of each view against its target, fp32, [B]."""
-        if isinstance(self.decoder, PixelDecoder) and not (views.shape[2] % 2 or views.shape[3] % 2):
-            drawn, views = self.decoder(latents, as_cells=True), to_cells(views)  # compared as it is drawn
-        else:
-            drawn = self.decoder(latents)
-        target = self.target(views, dither)
-        if self.pixels:
-            return SquaredError.apply(drawn, target)  # type: ignore[no-any-return]
-        return (drawn - target).square().mean(dim=1)  # type: ignore[no-any-return]

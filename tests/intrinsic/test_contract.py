@@ -36,7 +36,7 @@ class Forward(IntrinsicReward):
 class LatentStep(IntrinsicReward):
     """How far a step leads in the latents; keeps what it was given."""
 
-    needs_latents = True
+    reads = ("latents", "next_latents")
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
