@@ -4,12 +4,14 @@
 
 Both arms of a seed start from the same weights and the same random warm-up. Each cell (head, mode, seed) is one CSV
 file; a cell whose file exists is not run again, so that several processes can share the work (``--srl``, ``--seeds``).
-At the end ``curves.png`` and ``table.md`` are drawn from all cells in the folder. Settings are the demo's.
+At the end ``curves.png`` and ``table.md`` are drawn from all cells in the folder. Settings are the demo's, with the
+paper's reward.
 """
 
 import argparse
 import csv
 import json
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,15 @@ from matplotlib.ticker import EngFormatter
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import run_episodes
-from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, SETTINGS, TASK, RecordCurve
+from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, TASK
+from sb3_cure.experiments.demo import SETTINGS as DEMO
 from sb3_cure.experiments.files import describe_run, write_csv
 from sb3_cure.experiments.plots import in_style, save
 
 MODES = ("sequential", "joint")
+SETTINGS = {**DEMO, "intrinsic": "srl_error", "intrinsic_kwargs": {}}
 HEADS: dict[str, dict[str, Any]] = {
     "curl": {},
     # As in SAC-AE: no augmentation, and the burst of 1000 updates after the warm-up.
@@ -44,8 +49,33 @@ MEASURES = {
 Rows = list[dict[str, float]]
 
 
+class RecordCurve(EvalBothCallback):
+    """Evaluates both policies and keeps the rows of the learning curve."""
+
+    def __init__(self, *args: Any, action_repeat: int, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.action_repeat = action_repeat
+        self.rows: list[dict[str, float]] = []
+        self.start = time.monotonic()
+
+    def evaluate(self) -> dict[str, float]:
+        row = super().evaluate()
+        self.rows.append(
+            {
+                "agent_steps": self.num_timesteps,
+                "environment_steps": self.num_timesteps * self.action_repeat,
+                "seconds": round(time.monotonic() - self.start, 1),
+                "task_return": row["eval/task_reward"],
+                "curious_return": row["eval/curious_reward"],
+                "task_srl_error": row["eval/task_srl_error"],
+                "curious_srl_error": row["eval/curious_srl_error"],
+            }
+        )
+        return row
+
+
 class RecordUpdates(RecordCurve):
-    """The demo's curve, with the training loss of the head and its error on frames that no arm chose.
+    """That curve, with the training loss of the head and its error on frames that no arm chose.
 
     ``srl_loss`` is the mean over the updates since the row before (nan if there were none); ``random_srl_error`` the
     noise-free error on episodes of the random policy, the same ones for all arms and seeds.

@@ -317,17 +317,20 @@ class ReconstructionCallback(PeriodicCallback):
             self.observations = None
             return
         observed = th.as_tensor(self.observations, device=model.device)
-        head, title = getattr(model.policy, "srl", None), "Reconstructions over training"
+        title = "What the agent sees, and what its latents hold of it"
+        reconstruct = getattr(model.policy, "reconstruct", lambda observations: None)
         with th.no_grad():
-            drawn = None if head is None else head.reconstruct(model.policy.encode(observed))
-        if drawn is None:
+            pair = reconstruct(observed)
+        if pair is None:
             if self.probe_updates == 0:
+                head = getattr(model.policy, "srl", None)
                 warnings.warn(f"{type(head).__name__} does not reconstruct: give probe_updates=500.", stacklevel=2)
             if self.probe_updates == 0 or len(self._spread(1)) == 0:
                 return
             title = "What a decoder fitted afterwards draws from the latents"
             decoder = _room("probe").fit_probe(model, self._sample, self.probe_updates)
-            observed, drawn = _room("probe").draw_with_probe(model, decoder, observed)
+            pair = _room("probe").draw_with_probe(model, decoder, observed)
+        observed, drawn = pair
         frame_stack = self.frame_stack or frame_stack_of(self.training_env)
         self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))

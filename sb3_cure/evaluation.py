@@ -45,9 +45,10 @@ class Episode:
 
 def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk: int = 128) -> np.ndarray:
     """
-    SRL error of transitions without training noise, as the acting agent sees them (no augmentation).
+    Error of transitions without training noise, as the acting agent sees them (no augmentation): the SRL head's, or
+    that of an intrinsic reward which measures, such as ``"reconstruction"``.
 
-    :param model: A model with an SRL head
+    :param model: A model with an SRL head, or such a reward
     :param batch: Transitions, observations as stored (images in 0-255)
     :param chunk: How many at a time
     :return: Error per sample, [n]
@@ -60,7 +61,7 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
             rows = slice(start, start + chunk)
             columns = {name: None if column is None else column[rows] for name, column in fields.items()}
             part = Samples(**{**columns, "views": policy.augmentation.center(columns["observations"])})
-            errors.append(policy.srl.error(part, policy.encode(part.observations)).float().cpu().numpy())
+            errors.append(policy.error(part).float().cpu().numpy())
     return np.concatenate(errors)
 
 
@@ -175,7 +176,7 @@ def run_episodes(
         seen: Any = maybe_transpose(np.stack(observations), model.observation_space)
         actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
-        if getattr(model.policy, "srl", None) is not None:
+        if getattr(model.policy, "measures_errors", False):
             errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))
         kept = {"states": np.stack(true_states)} if states else {}
         yield Episode(rewards, errors, seen[:-1], frames, **kept)  # type: ignore[arg-type]

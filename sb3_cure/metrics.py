@@ -95,20 +95,17 @@ class Metrics(KVWriter):
 def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
     """Newest frames of a few observations above their reconstructions.
 
-    :param policy: The policy, whose encoder and SRL head are used
+    :param policy: The policy
     :param batch: Samples of image observations
     :param frame_stack: Frames per observation
     :param columns: How many observations
-    :return: uint8 image (C, 2 * H, columns * W) with C = 1 or 3, or None if the head draws no images
+    :return: uint8 image (C, 2 * H, columns * W) with C = 1 or 3, or None if no images are drawn
     """
     observations = batch.observations[:columns]
-    if policy.srl is None or observations.dim() != 4:
+    pair = policy.reconstruct(observations) if observations.dim() == 4 else None
+    if pair is None:
         return None
-    drawn = policy.srl.reconstruct(policy.encode(observations))
-    if drawn is None:
-        return None
-    observed = policy.augmentation.center(observations)
-    rows = [th.cat(list(newest_frames(images, frame_stack)), dim=2) for images in (observed, drawn)]
+    rows = [th.cat(list(newest_frames(images, frame_stack)), dim=2) for images in pair]
     return th.cat(rows, dim=1).cpu().numpy()
 
 

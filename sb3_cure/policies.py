@@ -18,6 +18,7 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from sb3_cure.augmentations import make_augmentation
+from sb3_cure.buffers import Samples
 from sb3_cure.critics import LatentCritic, TwinQ
 from sb3_cure.encoder_update import EncoderUpdate
 from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
@@ -395,6 +396,35 @@ class CuRePolicy(BasePolicy):
         :return: Latents as the acting agent sees them, [B, features_dim]
         """
         return self.encoder(self.center(observations))
+
+    @property
+    def measures_errors(self) -> bool:
+        """Whether there is something to measure by: see ``error``."""
+        return self.srl is not None or (self.intrinsic is not None and self.intrinsic.measures)
+
+    def error(self, batch: Samples) -> th.Tensor:
+        """The noise-free error by which policies are compared: the intrinsic reward's, if it has one, else the head's.
+
+        :param batch: Samples whose ``views`` are the centred ones
+        :return: [B]
+        """
+        latents = self.encode(batch.observations)
+        if self.intrinsic is not None and self.intrinsic.measures:
+            return self.intrinsic.error(batch.observations, latents)
+        return self.srl.error(batch, latents)  # type: ignore[union-attr]
+
+    def reconstruct(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
+        """
+        :param observations: [B, *shape], images in 0-255
+        :return: What was to be drawn, and what the head, or else the intrinsic reward, draws of it from the latents;
+            None if neither draws
+        """
+        latents = self.encode(observations)
+        for part, seen in ((self.srl, self.augmentation.center(observations)), (self.intrinsic, observations)):
+            drawn = None if part is None else part.reconstruct(latents)
+            if drawn is not None:
+                return seen, drawn
+        return None
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """

@@ -413,7 +413,7 @@ def test_reconstructions_that_improve_are_seen_to(tmp_path: Path, monkeypatch: p
     better = drawn.copy()
     better[..., :1, :] = 0
     plots.reconstructions_over_training(tmp_path / "rows.png", observed, [(10, drawn), (20, better)], "title")
-    assert labels == ["observed", "10 agent steps\nMSE 0.00038", "20 agent steps\nMSE 0.00035"]
+    assert labels == ["seen by the agent", "10 agent steps\nMSE 0.00038", "20 agent steps\nMSE 0.00035"]
 
 
 def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:

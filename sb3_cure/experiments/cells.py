@@ -266,7 +266,7 @@ class _Record(BaseCallback):
                 row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
-            if getattr(model.policy, "srl", None) is not None:
+            if getattr(model.policy, "measures_errors", False):
                 row[f"{actor}_srl_error"] = float(np.concatenate([errors for _, errors in seen]).mean())
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0

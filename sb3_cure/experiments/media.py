@@ -98,17 +98,16 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
                 (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
                 title = f"{actor} policy, deterministic actions: {name}"
                 write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
-    head = getattr(model.policy, "srl", None)
-    if head is None or not is_image_space(model.observation_space) or model.replay_buffer.size() == 0:  # type: ignore[union-attr]
+    measures = getattr(model.policy, "measures_errors", False)
+    if not measures or not is_image_space(model.observation_space) or model.replay_buffer.size() == 0:  # type: ignore[union-attr]
         return
     if not (folder / "reconstructions.png").exists():  # not drawn in training
         for callback in watch_reconstructions(cell, repeat, folder):
             callback.draw(model)
     found = most_uncomfortable(model, FRAMES)
     with th.no_grad():
-        latents = model.policy.encode(th.as_tensor(found.observations, device=model.device))
-        drawn = head.reconstruct(latents)
-    title, drawn = f"What the agent finds uncomfortable: {name}", None if drawn is None else drawn.cpu().numpy()
+        pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))
+    title, drawn = f"What the agent finds uncomfortable: {name}", None if pair is None else pair[1].cpu().numpy()
     plots.uncomfortable_frames(folder / "uncomfortable.png", found, _frames_per_observation(model), title, drawn)
 
 

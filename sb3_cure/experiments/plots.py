@@ -68,15 +68,15 @@ def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """Return of both policies (deterministic actions) over environment steps, with the random policy as a line.
+    """Return (deterministic actions) over environment steps, with the random policy as a line.
 
     :param path: File to write
-    :param rows: Evaluations with ``environment_steps``, ``task_return`` and ``curious_return``
+    :param rows: Evaluations with ``environment_steps`` and ``task_return``
     :param random_return: Mean return of uniformly random actions
     :param title: Title of the figure
     """
     steps = np.array([row["environment_steps"] for row in rows])
-    returns = {actor: np.array([[row[f"{actor}_return"] for row in rows]]) for actor in ("task", "curious")}
+    returns = {"task": np.array([[row["task_return"] for row in rows]])}
     returns["random"] = np.full((1, len(rows)), random_return)
     curves = {f"{actor} policy": (steps, values) for actor, values in returns.items()}
     colors = {f"{actor} policy": COLORS[actor] for actor in returns}
@@ -209,20 +209,6 @@ def aggregate_scores(
 # Bars
 
 
-def srl_error_bars(path: Path, errors: Mapping[str, np.ndarray], title: str) -> None:
-    """SRL error per step met by different policies: mean, with minimum and maximum (paper, Figure 2).
-
-    :param path: File to write
-    :param errors: Errors of all steps, by policy
-    :param title: Title of the figure
-    """
-    bars = [
-        (actor, actor, (values.min(), values.max()), values.mean(keepdims=True), f"mean {values.mean():.2g}")
-        for actor, values in errors.items()
-    ]
-    visitation_bars(path, {title: bars}, {})
-
-
 def visitation_bars(
     path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
 ) -> None:
@@ -339,7 +325,7 @@ def reconstructions_over_training(
     :param rows: Agent steps of training, and what is drawn then of the same shape
     :param title: Title of the figure
     """
-    strips = {"observed": observed}
+    strips = {"seen by the agent": observed}
     for steps, drawn in rows:
         error = np.square((drawn.astype(np.float32) - observed) / 255).mean()
         strips[f"{steps:,} agent steps\nMSE {error:.2g}"] = drawn
@@ -425,7 +411,7 @@ def curiosity_map(
     binned = {actor: binned_errors(places[actor], errors, edges) for actor, (_, errors) in visits.items()}
 
     means = np.concatenate([mean[np.isfinite(mean)] for _, mean in binned.values()])
-    kinds = ["steps in bin"] + (["mean SRL error"] if len(means) else [])
+    kinds = ["steps in bin"] + (["mean error"] if len(means) else [])
     most = max(2, max(counts.max() for counts, _ in binned.values()))
     norms: list[Normalize] = [LogNorm(1, most)]
     if len(means):
@@ -449,7 +435,7 @@ def curiosity_map(
             bar.ax.minorticks_off()
     n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
     figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", wrap=True)
-    save(figure, path, 120)
+    save(figure, path, 120, tight=True)
 
 
 def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:

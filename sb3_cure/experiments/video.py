@@ -2,7 +2,7 @@
 
 import functools
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -31,16 +31,37 @@ def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, 
             writer.append_data(picture)  # type: ignore[attr-defined]
 
 
-def annotated_frames(episode: Episode, action_repeat: int = 1, title: str = "") -> Iterator[np.ndarray]:
+def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
+    """Several policies at once, as ``write_video``, with one scale of the errors.
+
+    :param path: File to write, ``*.mp4``
+    :param episodes: Episodes with ``frames``, by title; all end with the shortest
+    :param fps: Pictures per second, one per agent step
+    :param action_repeat: Environment steps per agent step, for the captions
+    """
+    top = max(float(episode.srl_errors.max(initial=0)) for episode in episodes.values())
+    columns = [annotated_frames(episode, action_repeat, title, top) for title, episode in episodes.items()]
+    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
+        for pictures in zip(*columns, strict=False):
+            height = max(len(picture) for picture in pictures)
+            padded = [np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=255) for each in pictures]
+            writer.append_data(np.concatenate(padded, axis=1))  # type: ignore[attr-defined]
+
+
+def annotated_frames(
+    episode: Episode, action_repeat: int = 1, title: str = "", top: float | None = None
+) -> Iterator[np.ndarray]:
     """The pictures of ``write_video``.
 
     :param episode: As there
     :param action_repeat: As there
     :param title: As there
+    :param top: Error at the upper end of the curve; None: the episode's highest
     :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
     returns = episode.rewards.cumsum()
-    top = float(episode.srl_errors.max()) if len(episode.srl_errors) else 0.0
+    if top is None:
+        top = float(episode.srl_errors.max(initial=0))
     for step, frame in enumerate(episode.frames):
         caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
         errors = episode.srl_errors[: step + 1]

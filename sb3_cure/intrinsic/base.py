@@ -29,6 +29,8 @@ class IntrinsicReward(nn.Module):
     trains_encoder: ClassVar[bool] = False
     #: Whether ``loss`` runs under autocast where the agent computes in bf16; the reward itself is fp32
     mixed_precision: ClassVar[bool] = False
+    #: Whether policies are measured by ``error`` rather than by the SRL error
+    measures: ClassVar[bool] = False
     #: Optimiser of the reward's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
 
@@ -47,6 +49,22 @@ class IntrinsicReward(nn.Module):
         :return: Loss of the reward's own parameters (None if it has none), and the reward, detached, [B]
         """
         raise NotImplementedError
+
+    def error(self, observations: th.Tensor, latents: th.Tensor) -> th.Tensor:
+        """What policies are measured by, if ``measures`` says so.
+
+        :param observations: As stored, [B, *shape]
+        :param latents: Theirs, [B, features_dim]
+        :return: [B]
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement error(observations, latents)")
+
+    def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
+        """
+        :param latents: [B, features_dim]
+        :return: Observations as drawn (images in 0-255), or None if nothing is drawn
+        """
+        return None
 
 
 class RewardScale(nn.Module):

@@ -27,6 +27,7 @@ class Reconstruction(IntrinsicReward):
 
     reads: ClassVar[tuple[str, ...]] = ("next_latents",)
     mixed_precision = True
+    measures = True
 
     def __init__(
         self,

@@ -14,42 +14,68 @@ from sb3_cure import CuReSAC
 from sb3_cure.experiments import demo
 
 
-def test_demo_writes_curve_pictures_video_and_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every promised file is there and holds what its name says; the exit status tells whether the bar was met."""
-    monkeypatch.setattr(
-        demo, "SETTINGS", {**demo.SETTINGS, "learning_starts": 150, "warmup_updates": 5, "batch_size": 8}
-    )
-    for name, few in (("EVALUATIONS", 1), ("EPISODES", 2), ("PROBE_UPDATES", 20)):
-        monkeypatch.setattr(demo, name, few)
-    status = demo.main(["--out", str(tmp_path), "--steps", "170", "--minutes", "5"])
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a short demo, which exits with 0 whatever it learned."""
+    folder = tmp_path_factory.mktemp("demo")
+    with pytest.MonkeyPatch.context() as few:
+        small = dict(learning_starts=150, warmup_updates=5, batch_size=8)
+        few.setattr(demo, "SETTINGS", {**demo.SETTINGS, **small})
+        for name, value in (("EVALUATIONS", 1), ("ROWS", 2), ("EPISODES", 2)):
+            few.setattr(demo, name, value)
+        assert demo.main(["--out", str(folder), "--steps", "170", "--minutes", "5"]) == 0
+    return folder
 
-    summary = json.loads((tmp_path / "summary.json").read_text())
+
+def test_demo_reports_returns_and_errors(written: Path) -> None:
+    """The numbers of the summary are those of the tables."""
+    summary = json.loads((written / "summary.json").read_text())
     assert summary["agent_steps"] == 170 and summary["environment_steps"] == 1360
     assert summary["updates"] == 5 + 20
-    assert status == int(summary["ratio"] < 3)
-    rows = list(csv.DictReader((tmp_path / "learning_curve.csv").open()))
-    assert [int(row["agent_steps"]) for row in rows][-1] == 170
-    assert all(float(row["task_return"]) >= 0 for row in rows)
-    bars = {row["policy"]: row for row in csv.DictReader((tmp_path / "srl_error.csv").open())}
-    assert list(bars) == ["random", "task", "curious"]
-    assert all(float(bar["min"]) <= float(bar["mean"]) <= float(bar["max"]) for bar in bars.values())
-    for name in ("learning_curve", "srl_error", "reconstructions"):
-        picture = np.asarray(Image.open(tmp_path / f"{name}.png").convert("L"))
+    assert summary["ratio"] == pytest.approx(summary["final_return_mean"] / summary["random_return_mean"], abs=0.01)
+    rows = list(csv.DictReader((written / "learning_curve.csv").open()))
+    assert [int(row["agent_steps"]) for row in rows] == [170]
+    errors = list(csv.DictReader((written / "errors.csv").open()))
+    for policy in ("random", "task", "curious"):
+        own = [float(row["mean_error"]) for row in errors if row["policy"] == policy]
+        assert len(own) == 2
+        assert summary["errors"][policy] == pytest.approx(np.mean(own), abs=2e-5)
+    assert CuReSAC.load(written / "model.zip").num_timesteps == 170
+
+
+def test_demo_draws_pictures_and_a_video(written: Path) -> None:
+    for name in ("learning_curve", "errors", "sees_and_holds", "curiosity_map"):
+        picture = np.asarray(Image.open(written / f"{name}.png").convert("L"))
         assert picture.std() > 5, f"{name}.png is blank"
-    frames = imageio.mimread(tmp_path / "policy.mp4", memtest=False)
+    frames = imageio.mimread(written / "policies.mp4", memtest=False)
     assert len(frames) == 125
-    # The panel below the camera's picture: the curve of the SRL error grows from the first to the last frame.
-    panels = [frame[frames[0].shape[1] :] for frame in (frames[1], frames[-1])]
-    red = [((panel[..., 0] > 150) & (panel[..., 1] < 120)).sum() for panel in panels]
-    assert red[1] > red[0]
-    loaded = CuReSAC.load(tmp_path / "model.zip")
-    assert loaded.num_timesteps == 170
+    # Two policies side by side; below each the curve of its error grows from the first to the last frame.
+    width = frames[0].shape[1] // 2
+    for left in (0, width):
+        panels = [frame[width:, left : left + width] for frame in (frames[1], frames[-1])]
+        red = [((panel[..., 0] > 150) & (panel[..., 1] < 120)).sum() for panel in panels]
+        assert red[1] > red[0]
 
 
 def test_demo_ends_at_the_time_limit() -> None:
-    """Training stops when the minutes are over."""
-    model = tiny_model("CnnPolicy", PixelBox()).learn(10_000, callback=demo.TimeLimit(0.02))
+    """Training stops when its share of the minutes is over."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    progress = demo.Progress(demo.make_dmc_env(demo.DOMAIN, demo.TASK, **demo.ENV_KWARGS), 10_000, seconds=1.0)
+    model.learn(10_000, callback=progress)
     assert 0 < model.num_timesteps < 10_000
+
+
+def test_demo_tells_how_far_it_is(capsys: pytest.CaptureFixture) -> None:
+    """Step, returns, and what is left: the shorter of the time limit and what the remaining steps take."""
+    model = tiny_model("CnnPolicy", PixelBox()).learn(20)
+    progress = demo.Progress(demo.make_dmc_env(demo.DOMAIN, demo.TASK, **demo.ENV_KWARGS), 100, seconds=1000.0)
+    progress.init_callback(model)
+    progress.num_timesteps, progress.rows = 20, [{"task_return": 12.0}]
+    progress._tell(30.0)
+    progress._tell(990.0)
+    first, second = capsys.readouterr().out.splitlines()
+    assert "step 20 of 100" in first and "evaluated 12" in first and "2 min 00 s" in first
+    assert "0 min 10 s" in second
 
 
 def test_demo_refuses_nonsense(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

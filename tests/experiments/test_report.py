@@ -494,7 +494,8 @@ def test_line_styles_tell_policies_apart(tmp_path: Path) -> None:
 def test_means_stay_in_sight_below_high_maxima(tmp_path: Path) -> None:
     """Contrastive errors of mean .1 and .3, from 0 to 6: the marks of the means lie well apart."""
     errors = {"random": np.array([0.0] * 59 + [6.0]), "curious": np.array([0.0] * 19 + [6.0])}
-    plots.srl_error_bars(tmp_path / "bars.png", errors, "title")
+    bars = [(actor, actor, (each.min(), each.max()), each.mean(keepdims=True), "") for actor, each in errors.items()]
+    plots.visitation_bars(tmp_path / "bars.png", {"title": bars}, {})
     pixels = np.asarray(Image.open(tmp_path / "bars.png").convert("RGB")).astype(int)
     heights = []
     for red, green, blue in ((0x88, 0x88, 0x88), (0xD6, 0x27, 0x28)):
