@@ -10,7 +10,7 @@ is not run again. The arms of a seed share the evaluations' starts, but not init
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -50,7 +50,7 @@ def public_cell(cell: Cell) -> Cell:
     return replace(cell, method=ARM, arguments={"implementation": SOURCE, **shared, **settings})
 
 
-class _PublicRun:
+class PublicTraining:
     """Its training loop, on an environment of ours.
 
     :param checkout: Folder that holds the public implementation's files
@@ -59,7 +59,7 @@ class _PublicRun:
 
     def __init__(self, checkout: Path, cell: Cell):
         self.cell, self.settings = cell, cell.arguments
-        self.env, self.eval_env = (gym.make(cell.task, **cell.env_kwargs) for _ in range(2))
+        self.env = gym.make(cell.task, **cell.env_kwargs)
         self.action_repeat = action_repeat_of(self.env)
         self.env.action_space.seed(cell.seed)
         utils = import_public(checkout, "utils")
@@ -78,17 +78,15 @@ class _PublicRun:
         )
         self.log, self.losses = Log(), list[float]()
         self.updates = 0
-        self.evaluations: list[Row] = []
-        self.began = time.monotonic()
 
-    def learn(self) -> list[Row]:
+    def steps(self) -> Iterator[int]:
         """
-        :return: Rows of ``eval.csv``
+        :return: Agent steps so far, before each step and after the last: between two of them one is made
         """
         warmup, total = self.settings["learning_starts"], -(-self.cell.budget // self.action_repeat)
         observation, _ = self.env.reset(seed=self.cell.seed)
         for step in range(total):
-            self._evaluate_if_due(step)
+            yield step
             if step < warmup:
                 action = self.env.action_space.sample()
             else:
@@ -103,14 +101,33 @@ class _PublicRun:
             observation = next_observation
             if terminated or truncated:
                 observation, _ = self.env.reset()
-        self._evaluate_if_due(total, finished=True)
+        yield total
+
+
+class _PublicRun(PublicTraining):
+    """Its training with evaluations of ours."""
+
+    def __init__(self, checkout: Path, cell: Cell):
+        self.eval_env = gym.make(cell.task, **cell.env_kwargs)
+        super().__init__(checkout, cell)
+        self.evaluations: list[Row] = []
+        self.began = time.monotonic()
+
+    def learn(self) -> list[Row]:
+        """
+        :return: Rows of ``eval.csv``
+        """
+        for step in self.steps():
+            self._evaluate_if_due(step)
+        self._evaluate_if_due(step, finished=True)
         return self.evaluations
 
     def _evaluate_if_due(self, step: int, finished: bool = False) -> None:
         steps = step * self.action_repeat
         if not is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             return
-        returns = [self._episode(EVAL_SEED if number == 0 else None) for number in range(self.cell.eval_episodes)]
+        seeds = [EVAL_SEED, *[None] * (self.cell.eval_episodes - 1)]
+        returns = [episode_return(self.eval_env, self.agent.select_action, seed) for seed in seeds]
         row = (
             *(steps, step, self.updates, round(time.monotonic() - self.began, 1)),
             *(float(np.mean(returns)), float(np.std(returns)), float(np.mean(self.losses)) if self.losses else ""),
@@ -119,14 +136,20 @@ class _PublicRun:
         self.evaluations.append(dict(zip(_EVAL_COLUMNS, row, strict=True)))
         print(f"{self.cell.folder}: {steps} environment steps, return {np.mean(returns):.1f}", flush=True)
 
-    def _episode(self, seed: int | None) -> float:
-        observation, _ = self.eval_env.reset(seed=seed)
-        total, done = 0.0, False
-        while not done:
-            action = self.agent.select_action(observation)
-            observation, reward, terminated, truncated, _ = self.eval_env.step(action)
-            total, done = total + float(reward), terminated or truncated
-        return total
+
+def episode_return(env: gym.Env, act: Callable[[np.ndarray], np.ndarray], seed: int | None) -> float:
+    """
+    :param env: One (not vectorised) environment
+    :param act: From an observation to an action
+    :param seed: Of the reset
+    :return: Undiscounted return of one episode
+    """
+    observation, _ = env.reset(seed=seed)
+    total, done = 0.0, False
+    while not done:
+        observation, reward, terminated, truncated, _ = env.step(act(observation))
+        total, done = total + float(reward), terminated or truncated
+    return total
 
 
 def run_public(checkout: Path, cell: Cell, results: Path) -> None:

@@ -113,18 +113,25 @@ def public_agent(checkout: Path, shape: tuple[int, ...], n_actions: int, **chang
     return import_public(checkout, "sac_ae").SacAeAgent(shape, (n_actions,), th.device("cpu"), **arguments)
 
 
+def checkout_folder(text: str) -> Path:
+    """
+    :param text: From the command line
+    :return: The folder of that name, which holds the public implementation
+    :raises argparse.ArgumentTypeError: if it does not
+    """
+    if not (Path(text) / "sac_ae.py").is_file():
+        reason = f"{text} holds no sac_ae.py: give the folder into which pytorch_sac_ae was cloned"
+        raise argparse.ArgumentTypeError(reason)
+    return Path(text)
+
+
 def checkout_argument(parser: argparse.ArgumentParser) -> None:
     """
     :param parser: Gets the argument ``checkout``, which must hold the public implementation
     """
-
-    def folder(text: str) -> Path:
-        if not (Path(text) / "sac_ae.py").is_file():
-            reason = f"{text} holds no sac_ae.py: give the folder into which pytorch_sac_ae was cloned"
-            raise argparse.ArgumentTypeError(reason)
-        return Path(text)
-
-    parser.add_argument("checkout", type=folder, help="folder that holds the public implementation's sac_ae.py")
+    parser.add_argument(
+        "checkout", type=checkout_folder, help="folder that holds the public implementation's sac_ae.py"
+    )
 
 
 def compare_losses(checkout: Path, updates: int = 10) -> float:
