@@ -143,6 +143,8 @@ def test_learning_rate_reaches_every_optimiser(factor: float) -> None:
     """A schedule's value in everything but the temperatures, which follow it at their ratio."""
     model = tiny_model("MlpPolicy", VectorBox(), learning_rate=lambda left: 1e-3 * left, ent_coef_lr_factor=factor)
     policy = model.policy
+    for agent in policy.agents.values():  # before the first update, too
+        assert agent.ent_coef_optimizer.param_groups[0]["lr"] == pytest.approx(factor * 1e-3)
     model.learn(20)
     model._current_progress_remaining = 0.4
     model.train(1, 4)

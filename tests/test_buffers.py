@@ -4,6 +4,8 @@ import errno
 import itertools
 import os
 import pickle
+import runpy
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +31,7 @@ from sb3_cure.buffers import (
     FrameStackReplayBuffer,
     Samples,
     SkippingReplayBuffer,
+    told_frame_stack,
     transitions,
     unmarked,
 )
@@ -452,6 +455,22 @@ def test_vec_normalize(norm_obs: bool) -> None:
     assert batch.observations.dtype == (th.float32 if norm_obs else th.uint8)
 
 
+@pytest.mark.parametrize("saves_memory", [False, True])
+def test_transitions_of_sb3s_buffer_are_those_it_samples(saves_memory: bool) -> None:
+    """Also where it stores each observation once, which is the next one of the row before."""
+    kwargs: Any = dict(optimize_memory_usage=saves_memory, handle_timeout_termination=not saves_memory)
+    buffer = ReplayBuffer(7, image_space(1), ACTIONS, "cpu", **kwargs)
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 255, (13, 1, *image_space(1).shape), dtype=np.uint8)
+    for obs, next_obs in itertools.pairwise(frames):
+        buffer.add(obs, next_obs, np.array([ACTIONS.sample()]), rng.random(1), np.zeros(1), [{}])
+    rows, env_inds, ages = unmarked(buffer)
+    found = transitions(buffer, rows, env_inds)
+    assert_equal(found, buffer._get_samples(rows))
+    assert np.array_equal(found.observations, frames[11 - ages, 0])
+    assert np.array_equal(found.next_observations, frames[12 - ages, 0])
+
+
 def test_sac_trains_the_same_on_either_buffer(tmp_path: Path) -> None:
     """Through SB3's own collection, `learn` again, saving and loading: equal parameters, bit for bit."""
     parameters = []
@@ -523,6 +542,13 @@ def test_warns_where_memory_will_not_suffice(monkeypatch: pytest.MonkeyPatch, tm
     with pytest.warns(UserWarning, match="0.00 GB are available"):
         FrameStackReplayBuffer(*arguments, frame_stack=3)
     FrameStackReplayBuffer(*arguments, frame_stack=3, frames_dir=tmp_path)  # a warning would fail
+
+
+def test_works_without_psutil(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which only SB3's extras install; then nothing is known of the memory."""
+    monkeypatch.setitem(sys.modules, "psutil", None)
+    without = runpy.run_path(buffers.__file__)
+    assert without["FrameStackReplayBuffer"](1000, image_space(3), ACTIONS, "cpu", frame_stack=3).size() == 0
 
 
 @pytest.mark.parametrize("n_steps", [0, 7, 50])
@@ -617,6 +643,14 @@ GOOD = image_space(3)
 def test_observations_that_cannot_be_cut_are_refused(space: spaces.Space, frame_stack: int, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         FrameStackReplayBuffer(10, space, ACTIONS, frame_stack=frame_stack)
+
+
+@pytest.mark.parametrize(("told", "frames"), [(2, 2), (6, 6), (4, None), (0, None), (-2, None), ("two", None)])
+def test_environments_are_believed_where_images_can_be_cut_so(told: Any, frames: int | None) -> None:
+    """Of six channels, a positive number that divides them."""
+    env = DummyVecEnv([PixelBox])
+    env.set_attr("frame_stack", told)
+    assert told_frame_stack(env) == frames
 
 
 @pytest.mark.parametrize("which", ["obs", "next_obs"])

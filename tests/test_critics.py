@@ -51,6 +51,15 @@ def test_critics_are_separate_networks_of_latents_and_actions(n_critics: int) ->
         )
 
 
+@BASES
+def test_by_default_there_are_two_critics(algorithm: str) -> None:
+    """With one value or 25 quantiles each, as in SB3 and sb3-contrib; of an agent and where they are made."""
+    critic = tiny_model("MlpPolicy", VectorBox(), ALGORITHMS[algorithm]).policy.critic
+    kind, n_values = {"sac": (TwinQ, 1), "tqc": (TruncatedQuantiles, 25)}[algorithm]
+    for each, features_dim in ((critic, 8), (kind.make(3, 2, [8], nn.ReLU), 3)):
+        assert each(th.zeros(6, features_dim), th.zeros(6, 2)).shape == (6, 2, n_values)
+
+
 @pytest.mark.parametrize("n_critics", [1, 2, 3])
 def test_twin_q_takes_the_smallest_value(n_critics: int) -> None:
     """To bootstrap from and to maximise; the loss is half the sum of the mean squared errors, as SB3's."""

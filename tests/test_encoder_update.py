@@ -271,6 +271,19 @@ def test_frozen_part_of_the_encoder_stays(mode: str) -> None:
     assert sum(shares(logged).values()) == pytest.approx(1)
 
 
+@MODES
+def test_part_of_the_encoder_that_latents_do_not_depend_on_stays(mode: str) -> None:
+    """As an extractor's head for another task: the rest moves, and its shares are measured, as without that part."""
+    plain, expected = make(mode)
+    encoder: Any = Linear()
+    encoder.other = nn.Linear(6, 2)
+    update = EncoderUpdate(encoder, SOURCES, mode, th.optim.Adam, lr=LR)
+    before = values(encoder.other)
+    assert shares(whole(update, 0)) == shares(whole(expected, 0))
+    assert th.equal(values(encoder.other), before)
+    assert th.equal(values(encoder.trunk), values(plain.trunk))
+
+
 # ---------------------------------------------------------------- who reads which encoder
 
 

@@ -468,6 +468,7 @@ def test_pretraining(curiosity: str | None, collector: str, update: str) -> None
     names = parts_of(differences(fresh["policy"], after["policy"]))
     assert {"encoder", "encoder_target", "srl"} <= names
     assert not names & TASK
+    assert (names >= STATISTICS) == (collector == "curious")
     for key in ("actor.optimizer", "critic.optimizer", "ent_coef_optimizer", "log_ent_coef"):
         assert differences(fresh[key], after[key]) == [], key
     assert fresh.keys() == after.keys()
@@ -863,6 +864,21 @@ def test_exploration_can_be_ended_and_fine_tuning_begun() -> None:
     model.curiosity_prob = 0.0
     model.learn(30, log_interval=10**9, reset_num_timesteps=False)
     assert model._mixer.n_steps > 0 and model._mixer.pop_metrics()["rollout/curious_share"] == 0
+
+
+def test_a_call_that_resets_environments_redraws_who_acts() -> None:
+    """By its argument or as the environment is a new one; else who acts for an episode goes on."""
+    shares = []
+    for resets, new in ((True, False), (False, True), (False, False)):
+        kwargs: dict[str, Any] = dict(learning_starts=0, curiosity_bout="episode", curiosity_prob=0.0)
+        model = tiny_model("MlpPolicy", VectorBox(), **kwargs).learn(5, log_interval=10**9)
+        model._mixer.pop_metrics()
+        model.curiosity_prob = 1.0
+        if new:
+            model.set_env(VectorBox())
+        model.learn(5, log_interval=10**9, reset_num_timesteps=resets)
+        shares.append(model._mixer.pop_metrics()["rollout/curious_share"])
+    assert shares == [1, 1, 0]
 
 
 @pytest.mark.parametrize(("own", "around", "last"), [(1, 3, False), (3, 2, False), (2, 3, True)])
