@@ -2,6 +2,8 @@
 
 import copy
 import functools
+import os
+import signal
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +11,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cure import CuReSAC
@@ -238,3 +241,17 @@ def differences(first: Any, second: Any, path: str = "") -> list[str]:
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         return [] if first.dtype == second.dtype and np.array_equal(first, second) else [path]
     return [] if first == second else [path]
+
+
+class KillNow(BaseCallback):
+    """Kills the worker of environment 1 at some steps."""
+
+    def __init__(self, *at: int) -> None:
+        super().__init__()
+        self.at, self.faults = at, 0
+
+    def _on_step(self) -> bool:
+        self.faults += sum("env_fault" in info for info in self.locals["infos"])
+        if self.n_calls in self.at:
+            os.kill(self.training_env.unwrapped.processes[1].pid, signal.SIGKILL)
+        return True

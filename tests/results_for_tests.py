@@ -16,6 +16,9 @@ RAE = {"policy": "CnnPolicy", "srl": "rae", "curiosity": None}
 CURE = {"policy": "CnnPolicy", "srl": "rae"}
 
 
+TASK = "cartpole-swingup"
+
+
 def write_grid(folder: Path, **changes: Any) -> dict[str, Any]:
     """A grid of one task, two arms and two seeds, but for the changes.
 
@@ -109,3 +112,16 @@ def write_cell(
     if done:
         (cell / "DONE").touch()
     return cell
+
+
+def curve(*values: float) -> dict[int, float]:
+    """Evaluations that divide 100 000 environment steps evenly."""
+    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
+
+
+def write_two_arms(folder: Path) -> None:
+    """Two arms and two seeds, all done: areas 50, 100 (baseline) and 100, 200; finals 100, 200 and 200, 400."""
+    write_grid(folder)
+    for seed in (0, 1):
+        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
+        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)

@@ -5,28 +5,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from results_for_tests import CURE, RAE, write_cell, write_grid
+from results_for_tests import RAE, TASK, curve, write_cell, write_grid, write_two_arms
 
 from sb3_cure.experiments import published
 from sb3_cure.experiments.results import read_results
 
-TASK = "cartpole-swingup"
-
-
-def curve(*values: float) -> dict[int, float]:
-    """Evaluations that divide 100 000 environment steps evenly."""
-    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
-
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """Two arms and two seeds, all done: areas 50, 100 (baseline) and 100, 200; finals 100, 200 and 200, 400."""
-    folder = tmp_path / "curves"
-    write_grid(folder)
-    for seed in (0, 1):
-        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
-        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)
-    return folder
+    """The folder of two arms."""
+    write_two_arms(tmp_path / "curves")
+    return tmp_path / "curves"
 
 
 def test_returns_stand_beside_published_ones(results: Path) -> None:

@@ -4,29 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from results_for_tests import CURE, RAE, write_cell, write_grid
+from results_for_tests import RAE, TASK, curve, write_cell, write_grid, write_two_arms
 
 from sb3_cure.experiments import statistics
 from sb3_cure.experiments.results import ResultsError, read_results
 from sb3_cure.experiments.visit_statistics import state_coverage
 
-TASK = "cartpole-swingup"
-
-
-def curve(*values: float) -> dict[int, float]:
-    """Evaluations that divide 100 000 environment steps evenly."""
-    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
-
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """Two arms and two seeds, all done: areas 50, 100 (baseline) and 100, 200; finals 100, 200 and 200, 400."""
-    folder = tmp_path / "curves"
-    write_grid(folder)
-    for seed in (0, 1):
-        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
-        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)
-    return folder
+    """The folder of two arms."""
+    write_two_arms(tmp_path / "curves")
+    return tmp_path / "curves"
 
 
 def test_cells_not_run_are_told(tmp_path: Path) -> None:
@@ -85,14 +74,14 @@ def test_lost_evaluations_are_refused(tmp_path: Path) -> None:
     """Else what lies between is made up; but evaluations are no denser than rollouts, and fall after them."""
     settings = {"budget": 1000, "eval_every": 100}
     long = {**settings, "n_envs": 8, "arguments": {**RAE, "train_freq": 5}}  # 8 * 8 * 5 = 320 steps per rollout
-    for curve, config in (({0: 1, 104: 1, 200: 2, **dict.fromkeys(range(300, 1001, 100), 3)}, settings),
+    for points, config in (({0: 1, 104: 1, 200: 2, **dict.fromkeys(range(300, 1001, 100), 3)}, settings),
                           ({0: 1, 320: 2, 640: 3, 960: 4, 1280: 5}, long)):  # fmt: skip
         write_grid(tmp_path, budget=1000)
-        path = write_cell(tmp_path, TASK, "sac_ae", 0, curve, **config)
-        assert len(read_results(tmp_path)[0].done(TASK, "sac_ae")[0].curve()[0]) == len(curve)
-        lost, *_ = [step for step in curve if step > 0]
+        path = write_cell(tmp_path, TASK, "sac_ae", 0, points, **config)
+        assert len(read_results(tmp_path)[0].done(TASK, "sac_ae")[0].curve()[0]) == len(points)
+        lost, *_ = [step for step in points if step > 0]
         write_cell(
-            tmp_path, TASK, "sac_ae", 0, {step: value for step, value in curve.items() if step != lost}, **config
+            tmp_path, TASK, "sac_ae", 0, {step: value for step, value in points.items() if step != lost}, **config
         )
         with pytest.raises(ResultsError, match=r"eval\.csv has no evaluation between 0 and \d+ environment steps: "):
             read_results(tmp_path)

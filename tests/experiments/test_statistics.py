@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from results_for_tests import CURE, write_cell, write_grid
+from results_for_tests import CURE, TASK, curve, write_cell, write_grid, write_two_arms
 from rliable import library, metrics
 from scipy import stats
 
@@ -17,23 +17,11 @@ from sb3_cure.experiments.tables import aggregate_table, of_tasks
 returns = st.floats(-1e3, 1e3, allow_nan=False)
 
 
-TASK = "cartpole-swingup"
-
-
-def curve(*values: float) -> dict[int, float]:
-    """Evaluations that divide 100 000 environment steps evenly."""
-    return {round(100_000 * index / (len(values) - 1)): value for index, value in enumerate(values)}
-
-
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """Two arms and two seeds, all done: areas 50, 100 (baseline) and 100, 200; finals 100, 200 and 200, 400."""
-    folder = tmp_path / "curves"
-    write_grid(folder)
-    for seed in (0, 1):
-        write_cell(folder, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 100 * (seed + 1)))
-        write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 100 * (seed + 1), 200 * (seed + 1)), arguments=CURE)
-    return folder
+    """The folder of two arms."""
+    write_two_arms(tmp_path / "curves")
+    return tmp_path / "curves"
 
 
 def test_areas_finals_and_thresholds(results: Path) -> None:

@@ -9,12 +9,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from envs_for_tests import KillNow, PixelBox, VectorBox, differences, tiny_model
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, transitions
 from sb3_cure.callbacks import ReconstructionCallback
@@ -113,20 +112,6 @@ def test_no_transition_that_spans_a_fault_is_sampled(data: st.DataObject) -> Non
             np.random.seed(1)
             batches.append(buffer.sample(200))
         assert differences(tuple(batches[0]), tuple(batches[1])) == []
-
-
-class KillNow(BaseCallback):
-    """Kills the worker of environment 1 at some steps."""
-
-    def __init__(self, *at: int) -> None:
-        super().__init__()
-        self.at, self.faults = at, 0
-
-    def _on_step(self) -> bool:
-        self.faults += sum("env_fault" in info for info in self.locals["infos"])
-        if self.n_calls in self.at:
-            os.kill(self.training_env.unwrapped.processes[1].pid, signal.SIGKILL)
-        return True
 
 
 def test_pictures_and_measurements_leave_out_marked_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from envs_for_tests import KillNow, PixelBox, VectorBox, differences, tiny_model
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -576,20 +576,6 @@ def test_unknown_way_to_treat_faults_is_refused() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- algorithms
-
-
-class KillNow(BaseCallback):
-    """Kills the worker of environment 1 at some steps."""
-
-    def __init__(self, *at: int) -> None:
-        super().__init__()
-        self.at, self.faults = at, 0
-
-    def _on_step(self) -> bool:
-        self.faults += sum("env_fault" in info for info in self.locals["infos"])
-        if self.n_calls in self.at:
-            os.kill(self.training_env.unwrapped.processes[1].pid, signal.SIGKILL)
-        return True
 
 
 def test_plain_algorithms_go_on() -> None:
