@@ -87,12 +87,12 @@ class Progress(BaseCallback):
 
     def _tell(self, seconds: float) -> None:
         left = min(self.seconds - seconds, seconds * (self.steps / self.num_timesteps - 1))
-        latest = [f"{self.rows[-1]['task_return']:.0f}"] if self.rows else []
+        minutes, rest = divmod(round(left), 60)
         recent = [info["r"] for info in list(self.model.ep_info_buffer or [])[-5:]]
         parts = [f"step {self.num_timesteps:,} of {self.steps:,}"]
         parts += [f"return of the last episodes {np.mean(recent):.0f}"] if recent else []
-        parts += [f"evaluated {latest[0]} of 1000"] if latest else []
-        parts += [f"about {left // 60:.0f} min {left % 60:02.0f} s of training left"]
+        parts += [f"evaluated {self.rows[-1]['task_return']:.0f} of 1000"] if self.rows else []
+        parts += [f"about {minutes} min {rest:02} s of training left"]
         end = "\r" if sys.stdout.isatty() else "\n"
         print("  " + ", ".join(parts) + "   ", end=end, flush=True)
 
