@@ -5,7 +5,7 @@ K = 1 for SAC (the smallest of the twin Q values), the quantiles that are kept f
 """
 
 from itertools import chain, pairwise
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from sb3_contrib.common.utils import quantile_huber_loss
@@ -59,9 +59,6 @@ class TwinQ:
     :param model: The algorithm, asked at each use for settings that may change
     """
 
-    #: Names of ``policy_kwargs`` that these critics understand besides ``n_critics``, and their defaults
-    policy_kwargs: ClassVar[dict[str, Any]] = {}
-
     def __init__(self, model: Any):
         self.model = model
 
@@ -108,8 +105,6 @@ class TwinQ:
 
 class TruncatedQuantiles(TwinQ):
     """TQC's critics: quantiles, of which the largest are dropped from the target (Kuznetsov et al. 2020)."""
-
-    policy_kwargs: ClassVar[dict[str, Any]] = {"n_quantiles": 25}
 
     @staticmethod
     def make(

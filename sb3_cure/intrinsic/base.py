@@ -110,6 +110,7 @@ class RewardScale(nn.Module):
             self.weight.copy_(
                 th.where(finite, self.weight.lerp(th.ones_like(self.weight), 1 - self.decay), self.weight)
             )
-            deviation = (self.variance / self.weight.clamp(min=1e-8)).sqrt() + 1e-8
+            # Not a number as long as no finite rewards were seen: those that are not reach no critic.
+            deviation = (self.variance / self.weight).sqrt() + 1e-8
             reward = ((reward - mean if center else reward) / deviation).clamp(-self.clip, self.clip)
         return beta * reward.unsqueeze(1)

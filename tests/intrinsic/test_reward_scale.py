@@ -169,3 +169,9 @@ def test_the_agents_reward_is_centred_the_bonus_is_not(curiosity: str, centred: 
     mean, spread = logged["train/curious_reward_mean"], logged["train/curious_reward_std"]
     assert spread > 0
     assert abs(mean) < 1e-3 if centred else 0.25 < mean < 1
+
+
+@pytest.mark.parametrize("center", [True, False])
+def test_first_rewards_that_are_not_finite_stay_so(center: bool) -> None:
+    """Clipped they would pass for rewards, and the look at the critics' loss would see nothing."""
+    assert not np.isfinite(scaled(RewardScale(), np.float32([1.0, np.inf]), center=center)).any()
