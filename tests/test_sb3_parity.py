@@ -424,7 +424,7 @@ def test_get_and_set_parameters(extras: dict[str, Any]) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     model.learn(20)
     moved = {name.split("[")[0].lstrip(".") for name in differences(before, state_of(model))}
-    critics = "q_networks" if extras is OFF else "ensemble"
+    critics = "q" if extras is OFF else "ensemble"
     for module in ("actor.mu", f"critic.{critics}", f"critic_target.{critics}"):
         assert any(module in name for name in moved), module
     assert not np.array_equal(actions, model.predict(observations, deterministic=True)[0])

@@ -5,6 +5,7 @@
 
 import inspect
 
+from sb3_cure.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
@@ -30,4 +31,4 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
     )
 
 
-__all__ = ["CURL", "RAE", "SRL_HEADS", "SRLHead", "SRLOutput", "get_srl_class"]
+__all__ = ["CURL", "RAE", "SRL_HEADS", "PixelDecoder", "SRLHead", "SRLOutput", "get_srl_class"]

@@ -220,7 +220,9 @@ class SlowBox(PixelBox):
     def step(self, action):
         time.sleep(0.005)
         if folder := os.environ.get("CARDS"):
-            (Path(folder) / str(os.getpid())).write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+            told = Path(folder) / str(os.getpid())
+            if not told.exists():  # once: a process may be killed at any later step
+                told.write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
             deadline = time.monotonic() + 120
             while len(list(Path(folder).iterdir())) < 2:
                 assert time.monotonic() < deadline, "no other process has begun"
