@@ -3,14 +3,15 @@
     git clone https://github.com/denisyarats/pytorch_sac_ae
     python -m benchmarks.public_sac_ae pytorch_sac_ae
 
-First their losses, from the same weights, batches and noise; then their times. Both get the same batches in the paper's
-setting and take turns; with and without the allocator settings of ``sb3_cure.allocator``, each in a process of its own,
-as they cannot be undone.
+First their losses, from the same weights, batches and noise; then their times, in small networks on small images and in
+the paper's setting. Both get the same batches and take turns; with and without the allocator settings of
+``sb3_cure.allocator``, each in a process of its own, as they cannot be undone.
 """
 
 import argparse
 import importlib
 import itertools
+import json
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -22,9 +23,11 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from benchmarks.harness import BATCH_SIZE, Times, interleaved, make_model, median_ratio, summary
+from benchmarks.harness import BATCH_SIZE, Times, describe_machine, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
+from benchmarks.settings import SETTINGS, Setting
 from sb3_cure.allocator import tune_allocator
+from sb3_cure.experiments.files import write_json
 from sb3_cure.layers import conv_sizes
 
 #: Of a log of the public implementation and of ``PlainSacAe.losses``
@@ -134,17 +137,26 @@ def checkout_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def compare_losses(checkout: Path, updates: int = 10) -> float:
+def _agents(checkout: Path, setting: Setting) -> tuple[Any, PlainSacAe, Any]:
+    """A filled buffer, the plain update and the public one."""
+    env = dict(image_size=setting.size, grayscale=setting.grayscale)
+    plain = PlainSacAe(setting.channels, hidden=setting.hidden, size=setting.size, filters=setting.filters)
+    shape, own = (setting.channels, setting.size, setting.size), dict(hidden_dim=setting.hidden)
+    public = public_agent(checkout, shape, n_actions=1, num_filters=setting.filters, **own)
+    return make_model(env_kwargs=env, n_steps=200).replay_buffer, plain, public
+
+
+def compare_losses(checkout: Path, setting: Setting, updates: int = 10) -> float:
     """
     :param checkout: Folder that holds the public implementation's files
+    :param setting: Images and networks
     :param updates: How many
     :return: The largest relative difference of a loss in these updates, which start from the same weights and have the
         same batches and noise
     """
-    replay_buffer = make_model().replay_buffer
+    replay_buffer, plain, public = _agents(checkout, setting)
     batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(updates)]
-    plain, buffer, log = PlainSacAe(actions=1), _Buffer(batches), Log()
-    public = public_agent(checkout, batches[0].observations.shape[1:], n_actions=1)
+    buffer, log = _Buffer(batches), Log()
     with th.no_grad():
         for name in ("actor", "critic", "critic_target", "decoder"):
             pairs = zip(getattr(plain, name).parameters(), getattr(public, name).parameters(), strict=True)
@@ -161,20 +173,20 @@ def compare_losses(checkout: Path, updates: int = 10) -> float:
     return largest
 
 
-def measure(checkout: Path, repeats: int, tuned: bool) -> Times:
+def measure(checkout: Path, setting: Setting, repeats: int, tuned: bool) -> Times:
     """
     :param checkout: Path of the public implementation's checkout
+    :param setting: Images and networks
     :param repeats: Rounds
     :param tuned: Whether to set the allocator as ``make bench`` does
     :return: Seconds per update of each round, by implementation
     """
     if tuned:
         tune_allocator()
-    replay_buffer = make_model().replay_buffer
-    batches = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)]
+    th.set_num_threads(setting.threads)
+    replay_buffer, plain, public = _agents(checkout, setting)
+    batches, log = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)], Log()
     buffers = {name: _Buffer(batches) for name in (PLAIN, PUBLIC)}
-    plain, log = PlainSacAe(actions=1), Log()
-    public = public_agent(checkout, batches[0].observations.shape[1:], n_actions=1)
     # Of two updates the first includes the actors.
     steps = itertools.count()
     variants = {
@@ -189,17 +201,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     checkout_argument(parser)
     parser.add_argument("--repeats", type=int, default=7, help="rounds (default: 7)")
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks"), help="folder to write")
     options = parser.parse_args()
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        difference = process.submit(compare_losses, options.checkout).result()
-    print(f"Largest relative difference of a loss in ten updates: {difference:.1e}")
-    for tuned in (False, True):
+    found: dict[str, Any] = {}
+    for setting in (SETTINGS[0], SETTINGS[-1]):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-            times = process.submit(measure, options.checkout, options.repeats, tuned).result()
-        print("With the allocator settings" if tuned else "As the C library allocates by default")
-        for name, seconds in times.items():
-            print(f"  {name}: {summary(seconds)}")
-        print(f"  {PLAIN} / {PUBLIC}: {median_ratio(times, PLAIN, PUBLIC):.2f}")
+            difference = process.submit(compare_losses, options.checkout, setting).result()
+        row: dict[str, Any] = {"largest_relative_difference_of_losses": difference}
+        for tuned in (False, True):
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+                times = process.submit(measure, options.checkout, setting, options.repeats, tuned).result()
+            name = "with sb3_cure.allocator" if tuned else "with the C library's allocation"
+            row[name] = {**{each: summary(seconds) for each, seconds in times.items()}}
+            row[name]["plain / public"] = round(median_ratio(times, PLAIN, PUBLIC), 3)
+        found[str(setting)] = row
+        print(f"{setting}: {json.dumps(row, indent=2)}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_json(options.out / "public_sac_ae.json", {"machine": describe_machine(), **found})
 
 
 if __name__ == "__main__":

@@ -242,7 +242,7 @@ class ReconstructionCallback(PeriodicCallback):
     """
     Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations.
 
-    For heads that do not draw (contrastive ones, say), and for SB3's own algorithms, a decoder is fitted to the latents
+    Where neither head nor intrinsic reward draws, and for SB3's own algorithms, a decoder is fitted to the latents
     for each row, anew so that rows can be compared; the agent does not learn from it. It is fitted to what the replay
     buffer holds, or without one (PPO, A2C) to the latest ``LATEST`` observations. The file is rewritten with each row.
 
