@@ -9,7 +9,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import FlattenImage, FullPrecision, Projection, conv_sizes, init_weights
+from sb3_cure.layers import Conv2dReLU, FlattenImage, FullPrecision, Projection, conv_sizes, init_weights
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -75,7 +75,7 @@ class PixelEncoder(Encoder):
         layers: list[nn.Module] = []
         for layer in range(n_layers):
             channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
-            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU(inplace=True)]
+            layers.append(Conv2dReLU(channels, n_filters, 3, stride))
         self.trunk = nn.Sequential(*layers, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)

@@ -9,9 +9,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
-from torch.nn import functional
 
-from sb3_cure.fast_ops import add_bias
+from sb3_cure.fast_ops import conv_relu
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -96,7 +95,7 @@ class FullPrecision(nn.Sequential):
 
 
 #: Weights from which on a layer of an actor or a critic is computed in bf16: below, casting costs what bf16 gains
-WIDE = 2**18
+WIDE = 2**16
 
 
 class EnsembleLinear(nn.Module):
@@ -146,9 +145,19 @@ def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
         return inputs.float()
 
 
+class Conv2dReLU(nn.Conv2d):
+    """A convolution without padding, and a ReLU."""
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: In NHWC memory order, [B, in_channels, H, W]
+        :return: [B, out_channels, H', W']
+        """
+        return conv_relu(images, self.weight, self.bias, self.stride[0])  # type: ignore[arg-type]
+
+
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
-    """torch's transposed convolution of stride 1, and a ReLU. The bias is added afterwards: inside, oneDNN's bias
-    gradient costs as much as that of the weights."""
+    """A transposed convolution of stride 1, and a ReLU."""
 
     def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
         """
@@ -156,7 +165,7 @@ class ConvTranspose2dReLU(nn.ConvTranspose2d):
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        return add_bias(functional.conv_transpose2d(images, self.weight), self.bias, relu=True)  # type: ignore[arg-type]
+        return conv_relu(images, self.weight, self.bias, transposed=True)  # type: ignore[arg-type]
 
 
 class FlattenImage(nn.Module):

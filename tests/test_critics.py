@@ -141,7 +141,7 @@ def test_bf16_tells_actions_apart_that_differ_in_the_third_digit(
     policy, env = ("CnnPolicy", PixelBox()) if pixels else ("MlpPolicy", VectorBox())
     arguments: dict[str, Any] = dict(precision="bf16", policy_kwargs={"net_arch": net_arch})
     model = tiny_model(policy, env, ALGORITHMS[algorithm], **arguments)
-    batch = 32
+    batch = 512
     latents = th.rand(batch, model.policy.encoder.features_dim, generator=seeded(0)) * 2 - 1
     near = th.full((batch, 2), 0.5), th.full((batch, 2), 0.501)
     assert th.equal(near[0].bfloat16(), near[1].bfloat16())
