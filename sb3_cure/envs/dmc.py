@@ -80,10 +80,11 @@ class DMCPixels(PixelObservation):
 
             # The same pixels as `physics.render`, which builds such a camera, and frees it, for every frame.
             self._camera = Camera(self._physics, self.image_size, self.image_size, self.camera_id)
-        # Before the frame, which lies where the camera draws next.
-        mask = None if self.background is None else self.background.mask(self._camera)
-        frame = self._camera.render(render_flag_overrides=RENDER_FLAGS[self.renderer])
-        return frame if self.background is None else self.background.behind(frame, mask)
+        flags = RENDER_FLAGS[self.renderer]
+        if self.background is None:
+            return self._camera.render(render_flag_overrides=flags)
+        mask = self.background.mask(self._camera)  # before the frame, which lies where the camera draws next
+        return self.background.behind(self._camera.render(render_flag_overrides=flags), mask)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies make a camera of their own with their first frame."""
