@@ -84,6 +84,7 @@ class Pretraining(CuRe):
         try:
             with self._run.calling("fit_representation"):
                 for done in range(0, updates, log_interval):
+                    self._current_progress_remaining = 1 - done / updates  # what schedules follow
                     self.train(min(log_interval, updates - done), self.batch_size)
                     self.logger.dump(self._n_updates)
                     self._guard.report()

@@ -161,6 +161,18 @@ def test_learn_after_fitting_begins_as_without_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(fitted.replay_buffer.actions[30:40], plain.replay_buffer.actions[:10])
 
 
+def test_schedules_follow_the_updates(tmp_path: Path) -> None:
+    """Also after a training that has come to their end."""
+    record(VectorBox, tmp_path, 30)
+    seen: list[float] = []
+    model = tiny_model("MlpPolicy", VectorBox(), learning_rate=lambda progress: seen.append(progress) or 1e-3)  # type: ignore[func-returns-value]
+    model.learn(15)
+    model.load_transitions(tmp_path)
+    seen.clear()
+    model.fit_representation(4, log_interval=1)
+    assert seen[:4] == [1, 0.75, 0.5, 0.25]
+
+
 def test_nothing_to_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="srl is None"):
         tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None).fit_representation(1)
