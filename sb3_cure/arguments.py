@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
@@ -88,10 +89,15 @@ def _check_combinations(model: Any) -> None:
             "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
             "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0."
         )
-    if model.n_steps > 1 and curious:
+    if model.n_steps > 1 and model.curiosity == "bonus":
         raise ValueError(
-            f"n_steps={model.n_steps} sums the task's rewards over steps, but the intrinsic reward is one of single "
-            "steps: set n_steps=1, or curiosity=None."
+            f"n_steps={model.n_steps} sums the task's rewards over steps, but curiosity='bonus' is a reward of single "
+            "ones: set n_steps=1, or curiosity='separate'."
+        )
+    if issubclass(model.replay_buffer_class or object, NStepReplayBuffer) and not model.everything_off:
+        raise ValueError(
+            "SB3's NStepReplayBuffer returns observations of n steps later, which heads and rewards would take for the "
+            "next ones: leave replay_buffer_class out and give n_steps."
         )
     if not model.everything_off and not issubclass(model.policy_class, CuRePolicy):
         raise ValueError(

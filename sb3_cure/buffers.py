@@ -45,8 +45,13 @@ class Samples(NamedTuple):
         the first one of the next episode
     :param dones: 1 where the episode terminated, 0 elsewhere, timeouts included, float32 [B, 1]
     :param rewards: Reward of that one step, float32 [B, 1]
-    :param discounts: gamma^n of SB3's n-step buffer, float32 [B, 1]; None: the discount factor of the agent
+    :param discounts: What a buffer of one's own says for gamma, float32 [B, 1]; None: the discount factor of the agent
     :param views: ``observations`` as the encoder saw them (shifted or cropped), in 0-255, [B, *view shape]
+    :param n_step_rewards: Discounted sum of n rewards (fewer where the episode ends), float32 [B, 1]. This and what
+        follows is for the task's critic alone, and None unless ``n_steps > 1``
+    :param n_step_next_observations: What the agent saw after these, [B, *shape]
+    :param n_step_dones: Whether the episode terminated there, float32 [B, 1]
+    :param n_step_discounts: gamma to the number of rewards, float32 [B, 1]
     """
 
     observations: th.Tensor
@@ -56,6 +61,10 @@ class Samples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | None = None
     views: th.Tensor = None  # type: ignore[assignment]
+    n_step_rewards: th.Tensor | None = None
+    n_step_next_observations: th.Tensor | None = None
+    n_step_dones: th.Tensor | None = None
+    n_step_discounts: th.Tensor | None = None
 
 
 def is_marked(info: Mapping[str, Any]) -> bool:
@@ -159,6 +168,47 @@ class SkipsMarked(ReplayBuffer):
             rows[bad], env_inds[bad] = stored[good_rows[drawn]], good_envs[drawn]
         self.last_sampled = rows, env_inds
         return transitions(self, rows, env_inds, env)
+
+    def look_ahead(self, n_steps: int, gamma: float, env: VecNormalize | None = None) -> dict[str, th.Tensor]:
+        """
+        The n-step returns of the batch that was sampled last: the numbers of SB3's ``NStepReplayBuffer``.
+
+        A sum ends with the episode and with the newest row, as SB3's does; it also ends before a marked transition, and
+        where the stored stream breaks without an end (another ``learn()``, ``set_env``). It goes on to newer rows only,
+        so that rows that were given up are in none.
+
+        :param n_steps: Rewards per sum, at most
+        :param gamma: Discount factor
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: The fields ``n_step_*`` of ``Samples``, on ``device``
+        """
+        assert self.last_sampled is not None
+        rows, env_inds = self.last_sampled
+        steps = np.arange(n_steps, dtype=np.float32)
+        window, envs = (rows[:, None] + np.arange(n_steps)) % self.buffer_size, env_inds[:, None]
+        ends = (self.dones[window, envs] > 0) | (window == (self.pos - 1) % self.buffer_size)
+        ends[:, :-1] |= self.marked[window[:, 1:], envs] | ~self._goes_on(window[:, :-1], window[:, 1:], envs)
+        ends[:, -1] = True
+        last = ends.argmax(axis=1)
+        counted = steps <= last[:, None]
+        rewards = self._normalize_reward(self.rewards[window, envs], env) * gamma**steps * counted
+        final = transitions(self, (rows + last) % self.buffer_size, env_inds, env)
+        return {
+            "n_step_rewards": self.to_torch(rewards.sum(axis=1, keepdims=True)),
+            "n_step_next_observations": final.next_observations,
+            "n_step_dones": final.dones,
+            "n_step_discounts": self.to_torch(gamma ** counted.sum(axis=1, keepdims=True).astype(np.float32)),
+        }
+
+    def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
+        """
+        :param rows: Row positions, [B, n]
+        :param next_rows: The rows after these, [B, n]
+        :param env_inds: Environments, [B, 1]
+        :return: Whether the next row begins with the observation that this one led to, bool [B, n]
+        """
+        same = self.next_observations[rows, env_inds] == self.observations[next_rows, env_inds]
+        return same.reshape(*rows.shape, -1).all(axis=2)
 
 
 class SkippingReplayBuffer(SkipsMarked):
@@ -375,6 +425,10 @@ class FrameStackReplayBuffer(SkipsMarked):
             rows = (rows + self.pos - self._n_valid) % self.buffer_size
         return self._get_samples(rows, env=env)
 
+    def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
+        # A stack that continues the stored one has its very frames.
+        return (self.frame_slots[rows, env_inds, 1] == self.frame_slots[next_rows, env_inds, 0]).all(axis=2)
+
     def slots(self, rows: ndarray, env_inds: ndarray) -> th.Tensor:
         """
         :param rows: Row positions, [n]
@@ -469,7 +523,8 @@ def _check_images(space: spaces.Space, frame_stack: int) -> None:
 def choose_replay_buffer(
     env: VecEnv | None, observation_space: spaces.Space, kwargs: dict[str, Any], plain: bool, skips: bool
 ) -> tuple[type[ReplayBuffer] | None, dict[str, Any]]:
-    """The replay buffer where the user names none: each frame once if it is known that observations are stacked frames.
+    """The replay buffer where the user names none: of images one that keeps each frame once. Images that do not tell of
+    how many frames they are count as one frame each.
 
     :param env: Environments, or None
     :param observation_space: Their observations, channels first
@@ -478,10 +533,9 @@ def choose_replay_buffer(
     :param skips: Whether transitions that are not finite will be marked
     :return: Class of the replay buffer (None: SB3's choice), and its arguments
     """
-    frame_stack = None if plain else kwargs.get("frame_stack", _stack_of(env))
     is_box = isinstance(observation_space, spaces.Box)
-    if is_box and frame_stack is not None and observation_space.dtype == np.uint8 and len(observation_space.shape) == 3:  # type: ignore[arg-type]
-        return FrameStackReplayBuffer, {"frame_stack": frame_stack, **kwargs}
+    if is_box and not plain and observation_space.dtype == np.uint8 and len(observation_space.shape) == 3:  # type: ignore[arg-type]
+        return FrameStackReplayBuffer, {"frame_stack": _stack_of(env) or 1, **kwargs}
     may_be_marked = skips or restarts_workers(env)
     return (SkippingReplayBuffer if is_box and (may_be_marked or not plain) else None), kwargs
 

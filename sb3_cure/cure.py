@@ -5,6 +5,7 @@ which each update of Algorithm 1 is a method. What differs between SAC and TQC i
 encoder they share, in ``encoder_update.py``.
 """
 
+import warnings
 from functools import partial
 from typing import Any, ClassVar
 
@@ -20,7 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 
 from sb3_cure.arguments import check_arguments
 from sb3_cure.augmentations import Augmentation
-from sb3_cure.buffers import Samples, choose_replay_buffer
+from sb3_cure.buffers import Samples, SkipsMarked, choose_replay_buffer
 from sb3_cure.critics import TwinQ
 from sb3_cure.guards import Guard, crash_report
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
@@ -226,7 +227,8 @@ class CuRe(OffPolicyAlgorithm):
         check_arguments(self)
         self._metrics, self._guard = Metrics(), Guard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
-        if self.replay_buffer_class is None and self.n_steps == 1 and not self.optimize_memory_usage:
+        sb3_sums = self.everything_off and self.n_steps > 1
+        if self.replay_buffer_class is None and not (sb3_sums or self.optimize_memory_usage):
             self.replay_buffer_class, self.replay_buffer_kwargs = choose_replay_buffer(
                 self.env,
                 self.observation_space,
@@ -241,7 +243,10 @@ class CuRe(OffPolicyAlgorithm):
             return
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_choices()}
-        super()._setup_model()
+        with warnings.catch_warnings():
+            if issubclass(self.replay_buffer_class or object, SkipsMarked):  # type: ignore[arg-type]
+                warnings.filterwarnings("ignore", "`n_steps=")  # which SB3 takes for ignored
+            super()._setup_model()
         self.policy_kwargs = user_kwargs
         self._critics = self.critics(self)
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
@@ -428,6 +433,9 @@ class CuRe(OffPolicyAlgorithm):
             for _ in range(2 if self.srl_schedule == "alternating" else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
                 batch = Samples(**sampled._asdict(), views=self.policy.views(sampled.observations))
+                if self.n_steps > 1 and self.task and learns_rl and isinstance(self.replay_buffer, SkipsMarked):
+                    ahead = self.replay_buffer.look_ahead(self.n_steps, self.gamma, self._vec_normalize_env)
+                    batch = batch._replace(**ahead)
                 self._guard.begin(self._n_updates)
                 with crash_report(self, batch):
                     self._gradient_step(batch, learns_srl, learns_rl)
@@ -451,9 +459,14 @@ class CuRe(OffPolicyAlgorithm):
         """One update on one batch: UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1."""
         policy, encoder = self.policy, self.policy.encoder_update
         with th.no_grad(), self._autocast():
-            views, next_views = policy.preprocess(batch.views), policy.augment(batch.next_observations)
-            next_latents = policy.encoder_target(next_views).float()
-        encoder.begin(views, next_views)
+            views, next_views = policy.preprocess(batch.views), {"next ": policy.augment(batch.next_observations)}
+            if batch.n_step_next_observations is not None:
+                next_views["n-step "] = policy.augment(batch.n_step_next_observations)
+            # Where each agent bootstraps: the task's after n steps, the curious one after one
+            goals = {"curious": "next ", "task": list(next_views)[-1]}
+            read = {goals[name] for name in policy.agents}
+            next_latents = {goal: policy.encoder_target(next_views[goal]).float() for goal in read}
+        encoder.begin(views, *next_views.values())
 
         srl_error, rewards, curious_rewards = None, batch.rewards, None
         if policy.srl is not None:
@@ -463,12 +476,13 @@ class CuRe(OffPolicyAlgorithm):
             if self.curiosity == "bonus":
                 rewards = rewards + curious_rewards
         if self.task and learns_rl:
-            gamma = self.gamma if batch.discounts is None else batch.discounts
-            self._update_actor_critic("task", batch, rewards, (1 - batch.dones) * gamma, next_latents)
+            goal = goals["task"]
+            self._update_actor_critic("task", batch, *self._task_return(batch, rewards), next_latents[goal], goal)
         if self._has_curious_agent and learns_rl:
             assert curious_rewards is not None
             goes_on = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            self._update_actor_critic("curious", batch, curious_rewards, goes_on * self.curiosity_gamma, next_latents)
+            discounts, goal = goes_on * self.curiosity_gamma, goals["curious"]
+            self._update_actor_critic("curious", batch, curious_rewards, discounts, next_latents[goal], goal)
         encoder.step(self._optimize)
         self._metrics.record(encoder.end())
         self._update_targets(learns_rl)
@@ -543,8 +557,15 @@ class CuRe(OffPolicyAlgorithm):
             read[name] = _read(latents, intrinsic.trains_encoder)
         return read
 
+    def _task_return(self, batch: Samples, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The task's rewards, of one step or of n, and the discount of what follows them, [B, 1] each."""
+        if batch.n_step_rewards is None:
+            return rewards, (1 - batch.dones) * (self.gamma if batch.discounts is None else batch.discounts)
+        assert batch.n_step_dones is not None and batch.n_step_discounts is not None
+        return batch.n_step_rewards, (1 - batch.n_step_dones) * batch.n_step_discounts
+
     def _update_actor_critic(
-        self, name: str, batch: Samples, rewards: th.Tensor, discounts: th.Tensor, next_latents: th.Tensor
+        self, name: str, batch: Samples, rewards: th.Tensor, discounts: th.Tensor, next_latents: th.Tensor, goal: str
     ) -> None:
         """UpdateTaskAC and UpdateCuriousAC: soft actor-critic on the latents.
 
@@ -552,11 +573,12 @@ class CuRe(OffPolicyAlgorithm):
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return goes on, else 0, [B, 1]
-        :param next_latents: Latents of the next observations by the target encoder, [B, features_dim]
+        :param next_latents: Latents by the target encoder of where the return goes on, [B, features_dim]
+        :param goal: Where that is: ``"next "`` or ``"n-step "`` observations
         """
         agent, encoder = self.policy.agents[name], self.policy.encoder_update
         with th.no_grad(), self._autocast():
-            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.next_features())
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.next_features(goal))
             next_values = self._critics.next_values(agent.critic_target, next_latents, next_actions)
         target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
 

@@ -95,15 +95,18 @@ class EncoderUpdate:
         del self.mean_squares[source], self.weights[source]
         self.parameter_norms = {}
 
-    def begin(self, views: th.Tensor, next_views: th.Tensor) -> None:
+    def begin(self, views: th.Tensor, next_views: th.Tensor, n_step_views: th.Tensor | None = None) -> None:
         """Begin an update, and forget one that was not brought to its end.
 
         :param views: What the encoder is to see of the observations, preprocessed, [B, *view shape]
         :param next_views: The same of the next observations
+        :param n_step_views: The same of those after n steps, if the task's returns are of several
         """
         self._inputs = {"": views, "next ": next_views}
+        if n_step_views is not None:
+            self._inputs["n-step "] = n_step_views
         self._runs: dict[str, Encoded] = {}
-        self._next_features: th.Tensor | None = None
+        self._next_features: dict[str, th.Tensor] = {}
         self._pulls: dict[str, list[tuple[th.Tensor, th.Tensor]]] = {}
         self.gradient_norms: dict[str, th.Tensor] = {}
         self._measured: dict[str, th.Tensor] = {}
@@ -120,16 +123,17 @@ class EncoderUpdate:
         """
         return self._run("next ")
 
-    def next_features(self) -> th.Tensor:
+    def next_features(self, which: str = "next ") -> th.Tensor:
         """
-        :return: Features alone of the next observations, which actors read, [B, trunk_dim]
+        :param which: ``"next "`` or ``"n-step "``
+        :return: Features alone of these observations, which actors read, [B, trunk_dim]
         """
-        if "next " in self._runs:
-            return self._runs["next "].features
-        if self._next_features is None:
+        if which in self._runs:
+            return self._runs[which].features
+        if which not in self._next_features:
             with th.no_grad(), self.autocast():
-                self._next_features = self.encoder.trunk(self._inputs["next "])
-        return self._next_features
+                self._next_features[which] = self.encoder.trunk(self._inputs[which])
+        return self._next_features[which]
 
     def _run(self, which: str) -> Encoded:
         if which not in self._runs:
@@ -183,7 +187,7 @@ class EncoderUpdate:
         factor = len(losses) ** 0.5 if self.mode == "joint" else 1.0
         update_learning_rate(optimizer, self.learning_rate * factor)
         optimize("encoder", th.stack(list(losses.values())).sum(), optimizer)
-        self._pulls, self._runs, self._next_features = {}, {}, None
+        self._pulls, self._runs, self._next_features = {}, {}, {}
 
     def end(self) -> dict[str, th.Tensor]:
         """End an update.

@@ -1,21 +1,29 @@
-"""Pretraining of the representation without task reward (paper, "Effect of Pretraining"), and what it undoes."""
+"""Where a representation comes from before the task is learned, and what that undoes: collected without task reward
+(paper, "Effect of Pretraining"), episodes on disk, or a model of another task (the paper's outlook)."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.utils import configure_logger
 
 from sb3_cure.cure import CuRe
+from sb3_cure.datasets import episodes_of, fill
+from sb3_cure.persistence.archive import archived_networks
 
 Self = TypeVar("Self", bound="Pretraining")
 
 
 class Pretraining(CuRe):
-    """Adds ``pretrain`` to CuRe: a ``learn`` with ``task=False``, after which the settings are what they were."""
+    """Adds ``pretrain`` to CuRe: a ``learn`` with ``task=False``, after which the settings are what they were; the same
+    from episodes on disk (``load_transitions``, ``fit_representation``), and ``transfer_from`` another model.
+    """
 
-    #: Of ``Persistence``: whether a script that is run again has nothing to do in this call
+    #: Of ``Persistence``: whether a script that is run again has nothing to do in this call, and what counts the calls
     _was_over: Callable[[str, bool], bool]
+    _run: Any
 
     @functools.wraps(CuRe.__init__)  # type: ignore[misc]  # so that help() shows the arguments
     def __init__(self, *args: Any, **kwargs: Any):
@@ -23,18 +31,106 @@ class Pretraining(CuRe):
         self._before_pretraining: dict[str, Any] | None = None
         #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
         self._is_pretrained = False
+        #: Whether encoder and head are kept as they are
+        self.representation_frozen = False
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         before, self._before_pretraining = self._before_pretraining, None
         if before is None:
             super()._setup_model()
+            self._freeze_if_asked()
             return
         # Of an archive that was saved while pretraining: its networks are those of before and what came on top of them.
         collector = "curious" if self._has_curious_agent else "random"
         self.task, self.curiosity = before["task"], before["curiosity"]
         super()._setup_model()
         self._begin_pretraining(collector)
+
+    def load_transitions(self, source: str | Path | Iterable[Any]) -> int:
+        """Fill the replay buffer from episodes on disk, see ``sb3_cure.datasets``.
+
+        ``learn`` then begins with them beside what it collects; ``learning_starts=0`` leaves its random warm-up out.
+
+        :param source: A folder of ``.npz`` files, one such file, or episodes with their attributes, such as
+            ``minari.load_dataset(...)``
+        :return: Number of transitions that were added
+        :raises ValueError: if the episodes are of other observations or actions
+        """
+        if self._was_over("load_transitions", True):
+            return 0
+        with self._run.calling("load_transitions"):
+            return fill(self.replay_buffer, episodes_of(source), self.policy.scale_action)  # type: ignore[arg-type]
+
+    def fit_representation(self: Self, updates: int, log_interval: int = 1000) -> Self:
+        """``pretrain`` without collecting: train the representation alone, on what the replay buffer holds.
+
+        Keeps what ``pretrain`` keeps, and the replay buffer as well.
+
+        :param updates: Updates of encoder and head (pairs of them where ``srl_schedule`` alternates)
+        :param log_interval: Updates between two dumps of the logger
+        :return: self
+        :raises ValueError: if there is no SRL head, or nothing in the replay buffer
+        """
+        self._check_that_srl_learns("fit_representation")
+        if self.replay_buffer is None or self.replay_buffer.size() == 0:
+            raise ValueError("fit_representation has no transitions to learn from: call load_transitions before it.")
+        if self._was_over("fit_representation", True):
+            return self
+        if not self._custom_logger:
+            self._logger = configure_logger(self.verbose, self.tensorboard_log, "fit_representation")
+        self._metrics.attach(self.logger)
+        self._begin_pretraining("random")
+        try:
+            with self._run.calling("fit_representation"):
+                for done in range(0, updates, log_interval):
+                    self._current_progress_remaining = 1 - done / updates  # what schedules follow
+                    self.train(min(log_interval, updates - done), self.batch_size)
+                    self.logger.dump(self._n_updates)
+                    self._guard.report()
+        finally:
+            self._end_pretraining(keeps_transitions=True)
+            self.policy.set_training_mode(False)
+        return self
+
+    def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
+        """Begin with encoder, head and, where both models have one, the curious agent of a model of a sibling task.
+
+        :param path: A model's archive, of which nothing is executed
+        :param freeze: Whether encoder and head then stay as they are, also when the model is saved and loaded
+        :return: self
+        :raises ArchiveError: if the file is damaged or pickled
+        :raises ValueError: if networks of the two models differ in their shapes
+        """
+        if self._was_over("transfer_from", True):
+            return self
+        networks, temperature = archived_networks(path)
+        parts = ["encoder.", "encoder_target."] + (["srl."] if self.srl is not None else [])
+        curious: Any = getattr(self.policy, "curious", None)
+        if curious is not None and any(name.startswith("curious.") for name in networks):
+            parts += ["curious.", "intrinsic.", "scale."]
+        own = self.policy.state_dict()
+        here, there = ({n: t for n, t in all_.items() if n.startswith(tuple(parts))} for all_ in (own, networks))
+        shapes = [{name: tuple(tensor.shape) for name, tensor in each.items()} for each in (here, there)]
+        for name in [name for part in parts for name in here | there if name.startswith(part)] or parts:
+            ours, theirs = (each.get(name) for each in shapes)
+            if ours is None or ours != theirs:
+                raise ValueError(
+                    f"{path} has {name} of shape {theirs}, and this model of shape {ours}: transfer needs equal "
+                    "images, encoders and heads, and for a curious agent equal actions and rewards."
+                )
+        with self._run.calling("transfer_from"):
+            self.policy.load_state_dict({**own, **there})
+            if "curious." in parts and curious.log_ent_coef is not None and temperature is not None:
+                curious.log_ent_coef.data.copy_(temperature)
+            self.representation_frozen = self.representation_frozen or freeze
+            self._freeze_if_asked()
+        return self
+
+    def _freeze_if_asked(self) -> None:
+        for part in (self.policy.encoder, self.policy.srl) if self.representation_frozen else ():
+            if part is not None:
+                part.requires_grad_(False)
 
     def pretrain(
         self: Self,
@@ -64,8 +160,7 @@ class Pretraining(CuRe):
         :return: self
         :raises ValueError: if there is no SRL head, or no such collector
         """
-        if self.srl is None:
-            raise ValueError("pretrain trains the representation alone, but srl is None: choose a head.")
+        self._check_that_srl_learns("pretrain")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector is {collector!r}: choose 'curious' or 'random'.")
         if self._was_over("pretrain", reset_num_timesteps):
@@ -106,6 +201,12 @@ class Pretraining(CuRe):
         super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
         return self
 
+    def _check_that_srl_learns(self, call: str) -> None:
+        if self.srl is None:
+            raise ValueError(f"{call} trains the representation alone, but srl is None: choose a head.")
+        if self.representation_frozen:
+            raise ValueError(f"{call} trains the representation, which transfer_from(freeze=True) keeps as it is.")
+
     def _begin_pretraining(self, collector: str) -> None:
         if self._before_pretraining is None:
             self._before_pretraining = {"task": self.task, "curiosity": self.curiosity}
@@ -128,7 +229,7 @@ class Pretraining(CuRe):
                 update.add_source(source)
         self._setup_curious_temperature()
 
-    def _end_pretraining(self) -> None:
+    def _end_pretraining(self, keeps_transitions: bool = False) -> None:
         if self._before_pretraining is None:
             return
         policy = self.policy
@@ -141,7 +242,8 @@ class Pretraining(CuRe):
             for source in policy.encoder_update.mean_squares.keys() - set(self._policy_choices()["encoder_sources"]):
                 policy.encoder_update.remove_source(source)
         policy.default_agent = self._policy_choices()["default_agent"]
-        self.replay_buffer.reset()  # type: ignore[union-attr]
+        if not keeps_transitions:
+            self.replay_buffer.reset()  # type: ignore[union-attr]
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
         self._warmed_up = False
         self._last_obs = None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.envs import SimpleMultiObsEnv
 
 from sb3_cure import CuReSAC, CuReTQC
@@ -70,7 +71,8 @@ class FromNothing(IntrinsicReward):
         (dict(srl=None, curiosity="bonus"), "srl is None"),
         (dict(task=False, curiosity="bonus"), "task=False leaves nothing to learn"),
         (dict(curiosity_gamma=0), "curiosity_gamma=0"),
-        (dict(n_steps=3), "n_steps=3"),
+        (dict(n_steps=3, curiosity="bonus"), "n_steps=3"),
+        (dict(replay_buffer_class=NStepReplayBuffer), "give n_steps"),
         (dict(use_sde=True), "use_sde=True"),
         (dict(srl="curl", augmentation=None), "augmentation is None"),
         (dict(augmentation="crop"), "cuts 84 x 84 pixels out of images of 36 x 36"),

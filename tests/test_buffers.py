@@ -523,12 +523,13 @@ def test_fewer_rows_than_environments_or_samples() -> None:
 
 
 @pytest.mark.parametrize("buffer_size", [80_000, 1_000_000])
-def test_bytes_per_transition(buffer_size: int) -> None:
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_bytes_per_transition(buffer_size: int, frame_stack: int) -> None:
     """At most 1.05 of one frame, with the largest action of the DeepMind Control suite; committed when written to."""
-    space, actions = image_space(3, 3, 84, 84), spaces.Box(-1, 1, (38,), np.float32)
+    space, actions = image_space(frame_stack, 3, 84, 84), spaces.Box(-1, 1, (38,), np.float32)
     resident = pytest.importorskip("psutil").Process().memory_info
     before = resident().rss
-    buffer = FrameStackReplayBuffer(buffer_size, space, actions, device="cpu", frame_stack=3)
+    buffer = FrameStackReplayBuffer(buffer_size, space, actions, device="cpu", frame_stack=frame_stack)
     assert resident().rss - before < 50e6
     arrays = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
     assert buffer.nbytes == sum(array.nbytes for array in arrays)
@@ -780,4 +781,4 @@ def test_samples_begin_with_sb3s_fields() -> None:
     buffer.add(*next(stream(1, 1, set(), "env_fault")))
     batch = Samples(*buffer.sample(4))
     assert batch._fields[:6] == ReplayBufferSamples._fields
-    assert batch[5:] == (None,) * 2 and batch.observations.shape == (4, 2, 3, 3)
+    assert batch[5:] == (None,) * 6 and batch.observations.shape == (4, 2, 3, 3)

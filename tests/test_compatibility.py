@@ -282,8 +282,9 @@ def test_a_chosen_buffer_beats_the_one_for_stacked_frames() -> None:
 
 @OURS
 def test_n_step_returns(agent: str) -> None:
-    """Where curiosity is off."""
-    model = agent_of(agent, vectors(), n_steps=3, curiosity=None).learn(40)
+    """Of the task, beside curiosity; with everything off they are SB3's."""
+    assert agent_of(agent, vectors(), n_steps=3).learn(40)._n_updates > 0
+    model = agent_of(agent, vectors(), n_steps=3, srl=None, curiosity=None).learn(40)
     assert type(model.replay_buffer) is NStepReplayBuffer
     assert model.replay_buffer.n_steps == 3 and model.replay_buffer.gamma == model.gamma
     assert model.replay_buffer.sample(8).discounts is not None

@@ -661,12 +661,15 @@ def test_discrete_actions_are_refused(extras: dict[str, Any], space: spaces.Spac
 
 @both_modes
 def test_n_step_returns(extras: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three-step returns with SRL alone: sampled rewards are discounted sums, bootstrapped with gamma^3."""
-    extras = OFF if extras is OFF else dict(srl="rae", curiosity=None)
+    """Sampled rewards are discounted sums, bootstrapped with gamma^3."""
     model = tiny_model("MlpPolicy", VectorBox(), n_steps=3, gamma=0.5, ent_coef=0.0, learning_rate=0.0, **extras)
     model.learn(30)
     batch = model.replay_buffer.sample(200)
-    assert set(batch.discounts.flatten().tolist()) == {0.5, 0.25, 0.125}
+    rewards, discounts = batch.rewards, batch.discounts
+    if extras is not OFF:
+        ahead = model.replay_buffer.look_ahead(3, 0.5)
+        rewards, discounts = ahead["n_step_rewards"], ahead["n_step_discounts"]
+    assert set(discounts.flatten().tolist()) == {0.5, 0.25, 0.125}
     monkeypatch.setattr(model.replay_buffer, "sample", lambda *args, **kwargs: batch)
     target = model.critic_target
     for last in [network[-1] for network in target.q_networks] if extras is OFF else [target.ensemble[-1]]:
@@ -675,7 +678,7 @@ def test_n_step_returns(extras: dict[str, Any], monkeypatch: pytest.MonkeyPatch)
     model.train(1, batch_size=200)
     with th.no_grad():
         inputs = batch.observations if extras is OFF else model.policy.encode(batch.observations)
-        target = batch.rewards + batch.discounts * 10
+        target = rewards + discounts * 10
         values = model.critic(inputs, batch.actions)
         values = values if extras is OFF else values.unbind(dim=1)
         expected = sum(0.5 * (q - target).square().mean() for q in values)

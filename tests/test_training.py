@@ -416,9 +416,10 @@ def test_rewards_of_the_critics(curiosity: str, update: str, monkeypatch: pytest
 
 
 def test_frame_stack_attribute_decides_on_the_buffer() -> None:
-    """The frame-sharing buffer is the default where the environment tells its ``frame_stack``, and only there."""
-    assert type(tiny_model("CnnPolicy", PixelBox()).replay_buffer) is FrameStackReplayBuffer
-    assert type(tiny_model("CnnPolicy", PixelBox(tells_frame_stack=False)).replay_buffer) is SkippingReplayBuffer
+    """The frame-sharing buffer is the default for images; one that tells no ``frame_stack`` is one frame."""
+    for tells, frame_stack in ((True, 2), (False, 1)):
+        buffer = tiny_model("CnnPolicy", PixelBox(tells_frame_stack=tells)).replay_buffer
+        assert type(buffer) is FrameStackReplayBuffer and buffer.frame_stack == frame_stack
     assert type(tiny_model("CnnPolicy", PixelBox(), replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
     assert type(tiny_model("MlpPolicy", VectorBox()).replay_buffer) is SkippingReplayBuffer
 

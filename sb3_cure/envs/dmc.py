@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from sb3_cure.envs.backgrounds import Background
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
 
@@ -31,14 +32,29 @@ class DMCPixels(PixelObservation):
     :param grayscale: One channel of luminance instead of three of RGB
     :param camera_id: Index of a camera of the model, -1 for its free camera
     :param renderer: ``"dmc"`` or ``"fast"``, see :func:`make_dmc_env`
-    :raises ValueError: When first reset, if the model has no such camera
+    :param background: What is seen in place of sky and floor, see :func:`make_dmc_env`
+    :param seed: Of the background
+    :raises ValueError: If there is no such background, or, when first reset, if the model has no such camera
     """
 
     def __init__(
-        self, env: gym.Env, image_size: int = 84, grayscale: bool = False, camera_id: int = 0, renderer: str = "dmc"
+        self,
+        env: gym.Env,
+        image_size: int = 84,
+        grayscale: bool = False,
+        camera_id: int = 0,
+        renderer: str = "dmc",
+        background: str | None = None,
+        seed: int | None = None,
     ) -> None:
         gym.utils.RecordConstructorArgs.__init__(
-            self, image_size=image_size, grayscale=grayscale, camera_id=camera_id, renderer=renderer
+            self,
+            image_size=image_size,
+            grayscale=grayscale,
+            camera_id=camera_id,
+            renderer=renderer,
+            background=background,
+            seed=seed,
         )
         super().__init__(env, image_size, grayscale)
         self.renderer = renderer
@@ -49,6 +65,14 @@ class DMCPixels(PixelObservation):
         buffer = self._physics.model.vis.global_
         buffer.offwidth = max(buffer.offwidth, self.image_size)
         buffer.offheight = max(buffer.offheight, self.image_size)
+        self.background = None if background is None else Background(background, self._physics, self.image_size, seed)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        if self.background is not None:
+            self.background.begin(seed)
+        return super().reset(seed=seed, options=options)
 
     def frame(self) -> np.ndarray:
         if self._camera is None:
@@ -56,7 +80,11 @@ class DMCPixels(PixelObservation):
 
             # The same pixels as `physics.render`, which builds such a camera, and frees it, for every frame.
             self._camera = Camera(self._physics, self.image_size, self.image_size, self.camera_id)
-        return self._camera.render(render_flag_overrides=RENDER_FLAGS[self.renderer])
+        flags = RENDER_FLAGS[self.renderer]
+        if self.background is None:
+            return self._camera.render(render_flag_overrides=flags)
+        mask = self.background.mask(self._camera)  # before the frame, which lies where the camera draws next
+        return self.background.behind(self._camera.render(render_flag_overrides=flags), mask)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies make a camera of their own with their first frame."""
@@ -68,14 +96,16 @@ class DMCPixels(PixelObservation):
 
     def state_dict(self) -> dict[str, Any]:
         """
-        :return: Nothing: all that frames depend on is the physics'
+        :return: The background's; all else that frames depend on is the physics'
         """
-        return {}
+        return {} if self.background is None else self.background.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """
         :param state: Result of ``state_dict``
         """
+        if self.background is not None:
+            self.background.load_state_dict(state)
 
 
 def make_dmc_env(
@@ -90,6 +120,7 @@ def make_dmc_env(
     render_mode: str | None = None,
     seed: int | None = None,
     grayscale: bool = False,
+    background: str | None = None,
 ) -> gym.Env:
     """
     Make a task of the DeepMind Control suite that is seen through pixels.
@@ -111,6 +142,9 @@ def make_dmc_env(
         the observations
     :param seed: Seed of the first ``reset`` that is given none; later ones go on with its random stream
     :param grayscale: One channel of luminance per frame instead of three of RGB
+    :param background: What is seen behind the robot in place of sky, floor and walls: ``"noise"``, random pixels that
+        are new in each frame, or a folder of images, one of which is drawn for each episode. Drawn by ``seed``, apart
+        from the task, and not shown in videos
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack``, ``action_repeat`` and
         ``renderer``
     :raises ValueError: If there is no such task or an argument is out of range
@@ -170,10 +204,11 @@ def make_dmc_env(
             render_mode=render_mode,
             seed=seed,
             grayscale=grayscale,
+            background=background,
         ),
     )
     env = ActionRepeat(NormalizeActions(env), action_repeat)
-    env = DMCPixels(env, image_size, grayscale, camera_id, renderer)
+    env = DMCPixels(env, image_size, grayscale, camera_id, renderer, background, seed)
     return StackFrames(env, frame_stack)
 
 

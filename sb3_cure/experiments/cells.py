@@ -21,6 +21,7 @@ from sb3_cure.callbacks import ExactCheckpoint, untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import run_episodes, trained_actors
+from sb3_cure.experiments.coverage import CoverageRecorder
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import ALGOS, DONE, Cell, GridError, comparable, constructor_defaults, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
@@ -118,7 +119,10 @@ class _CellRun:
         if cell.budget > 0:
             with untouched_randomness(self.model.device, EVAL_SEED):
                 drawing = watch_reconstructions(cell, record.action_repeat, self.folder) if self.pictures else []
-            self.model.learn(record.agent_steps(cell.budget), callback=[*callbacks, *drawing])
+            covers = cell.coverage
+            path = self.folder / "coverage.csv"
+            counting = [] if covers is None else [CoverageRecorder(covers.at, record.action_repeat, path)]
+            self.model.learn(record.agent_steps(cell.budget), callback=[*callbacks, *counting, *drawing])
 
     def _keep_results(self) -> None:
         cell, record = self.cell, self.record
@@ -139,7 +143,7 @@ class _CellRun:
 
     def _make_env(self) -> Any:
         # By a function: of an id SB3 asks for render_mode="rgb_array", which not every environment knows.
-        return make_vec_env(lambda: gym.make(self.cell.task, **self.cell.env_kwargs), n_envs=self.cell.n_envs)
+        return make_vec_env(self.cell.make_env, n_envs=self.cell.n_envs)
 
     def _resume(self) -> CuReSAC | None:
         """The model of the newest whole checkpoint, or None."""

@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from sb3_cure.callbacks import untouched_randomness
 from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.cure_tqc import CuReTQC
+from sb3_cure.envs.counting import TellCell
 from sb3_cure.envs.rendering import GLUnavailableError
 
 #: The file that tells that a cell is finished
@@ -82,6 +83,19 @@ class Pretraining:
     budget: PositiveInt
 
 
+@pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Coverage:
+    """How cells of the true state are counted that all collected transitions reach, in ``coverage.csv``.
+
+    :param widths: Width of a cell along each coordinate, by the names of ``physics_state_names``; other ones than those
+        by which an arm is rewarded
+    :param at: Environment steps after which they are counted
+    """
+
+    widths: dict[str, Annotated[float, Field(gt=0)]]
+    at: Annotated[list[PositiveInt], Field(min_length=1)]
+
+
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
@@ -127,6 +141,7 @@ class GridFile(_Part):
     :param seeds: How many, or which
     :param evaluation: When and how to evaluate
     :param baseline: The arm with which the others are compared, by default the first
+    :param coverage: What to count of the true states, if anything
     """
 
     experiment: _Name
@@ -137,6 +152,7 @@ class GridFile(_Part):
     seeds: _Seeds = [0]
     evaluation: Evaluation = Evaluation()
     baseline: str = ""
+    coverage: Coverage | None = None
 
     @pydantic.model_validator(mode="after")
     def _check_names(self) -> "GridFile":
@@ -171,6 +187,7 @@ class Cell:
     :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
     :param algo: A key of ``ALGOS``
+    :param coverage: What to count of the true states, if anything
     """
 
     experiment: str
@@ -186,6 +203,7 @@ class Cell:
     arguments: dict[str, Any]
     pretrain: Pretraining | None = None
     algo: str = "cure_sac"
+    coverage: Coverage | None = None
 
     @property
     def folder(self) -> Path:
@@ -200,9 +218,21 @@ class Cell:
     def build_arguments(self) -> dict[str, Any]:
         """A copy of ``arguments``, as SB3 writes into some, with the classes that are named by their modules."""
         arguments = copy.deepcopy(self.arguments)
+        arguments.pop("env_wrapper", None)
         if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
             arguments["train_freq"] = tuple(arguments["train_freq"])
         return {**arguments, **self.custom_objects()}
+
+    def make_env(self) -> gym.Env:
+        """An environment to train in: in the wrappers that ``env_wrapper`` names, as in rl-zoo's files, while the one
+        for evaluation is in none, so that it gives the task's reward.
+        """
+        env = gym.make(self.task, **self.env_kwargs)
+        wrappers = self.arguments.get("env_wrapper") or []
+        for each in wrappers if isinstance(wrappers, list) else [wrappers]:
+            [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
+            env = pkgutil.resolve_name(name)(env, **kwargs)
+        return env if self.coverage is None else TellCell(env, self.coverage.widths)
 
     def custom_objects(self) -> dict[str, Any]:
         """What loading its model needs besides the archive: classes that are named by their modules."""
@@ -357,7 +387,7 @@ def load_grid(
         Cell(
             *(file.experiment, file.kind, task, arm, chosen[0], file.budget if method.train else 0),
             *(file.evaluation.every, file.evaluation.episodes, *_settings(path, task, method)),
-            *(method.pretrain, method.algo),
+            *(method.pretrain, method.algo, file.coverage),
         )
         for task in file.tasks
         for arm, method in file.methods.items()
@@ -447,10 +477,10 @@ def check_arms(cells: Iterable[Cell]) -> None:
     """
     envs: dict[str, gym.Env] = {}
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
-        key = f"{cell.task} {cell.env_kwargs}"
+        key = f"{cell.task} {cell.env_kwargs} {cell.arguments.get('env_wrapper')}"
         try:
             if key not in envs:
-                envs[key] = gym.make(cell.task, **cell.env_kwargs)
+                envs[key] = cell.make_env()
                 _tell_time_limit(envs[key], cell.task)
             with untouched_randomness(th.device("cpu")):
                 cell.make_model(envs[key], device="cpu", compile=False, buffer_size=1)

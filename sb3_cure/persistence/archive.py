@@ -125,6 +125,19 @@ def is_pickled_model(path: PathOrFile) -> bool:
         return ModelArchive(file, name).is_pickled
 
 
+def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None]:
+    """
+    :param path: A model's file
+    :return: The tensors of its policy by name, and the logarithm of its curious agent's temperature, if it learns that
+    :raises ArchiveError: if it is damaged or pickled
+    """
+    with reading(path, "zip") as (file, name):
+        archive = ModelArchive(file, name)
+    if archive.is_pickled:
+        raise ArchiveError(f"{name} was pickled by SB3's save: load it with trusted=True, and save it again.")
+    return archive.read("parameters")["policy"], archive.read("variables").get("policy.curious.log_ent_coef")
+
+
 class SavesModels(OffPolicyAlgorithm):
     """Mixin for an algorithm of SB3: ``save``, ``load`` and ``set_parameters`` without pickle."""
 

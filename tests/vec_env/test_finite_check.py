@@ -385,7 +385,7 @@ def test_check_is_put_on_once_and_hides_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        dict(curiosity=None, n_steps=3),
+        dict(srl=None, curiosity=None, n_steps=3),
         dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
     ],
     ids=["n-step", "memory-efficient"],

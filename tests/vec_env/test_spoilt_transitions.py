@@ -149,6 +149,6 @@ def test_buffer_that_samples_faults_is_refused() -> None:
     venv = FaultTolerantSubprocVecEnv([VectorBox], on_env_fault="restart", start_method="fork")
     try:
         with pytest.raises(ValueError, match="NStepReplayBuffer cannot promise that faulty transitions are never"):
-            tiny_model("MlpPolicy", venv, curiosity=None, n_steps=3).learn(2)
+            tiny_model("MlpPolicy", venv, srl=None, curiosity=None, n_steps=3).learn(2)
     finally:
         venv.close()

@@ -1,0 +1,99 @@
+"""What is seen behind a robot in place of sky and floor: distractors, which tell nothing of the task.
+
+As in the benchmarks of Zhang et al. (2018), "Natural Environment Benchmarks for Reinforcement Learning", and Stone et
+al. (2021), "The Distracting Control Suite". Where the robot is MuJoCo's own segmentation says, so that all tasks and
+cameras are alike; it is rendered beside each frame.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
+_PLANE = 0
+
+
+class Background:
+    """Replaces the sky and the planes of the world, such as floor and walls, with the shadows on them.
+
+    :param source: ``"noise"``: random pixels, new ones in each frame; or a folder of images, one of which is drawn for
+        each episode, cut to a square
+    :param physics: The physics of a dm_control environment
+    :param size: Height and width of frames in pixels
+    :param seed: Of what is drawn, until an episode begins with another; apart from the task's random numbers, which are
+        the same with every background
+    :raises ValueError: if it is neither ``"noise"`` nor a folder with images
+    """
+
+    def __init__(self, source: str, physics: Any, size: int, seed: int | None = None):
+        self.rng = np.random.default_rng(seed)
+        self.size = size
+        self._images: list[Path] | None = None
+        if source != "noise":
+            folder = Path(source)
+            self._images = sorted(path for path in folder.glob("*") if path.suffix.lower() in _SUFFIXES)
+            if not self._images:
+                raise ValueError(
+                    f"background={str(source)!r} is neither 'noise' nor a folder with images ({', '.join(_SUFFIXES)})."
+                )
+        model = physics.model
+        self._planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == _PLANE))
+        #: Which image the episode has; None: noise
+        self.drawn: int | None = None
+        self._image = np.zeros((size, size, 3), dtype=np.uint8)
+
+    def begin(self, seed: int | None) -> None:
+        """Draw what an episode is seen before.
+
+        :param seed: As of ``reset``
+        """
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        if self._images is not None:
+            self._show(int(self.rng.integers(len(self._images))))
+
+    def _show(self, number: int | None) -> None:
+        self.drawn = number
+        if self._images is not None and number is not None:
+            with Image.open(self._images[number]) as image:
+                fitted = ImageOps.fit(image.convert("RGB"), (self.size, self.size), Image.Resampling.BOX)
+            self._image = np.asarray(fitted)
+
+    def mask(self, camera: Any) -> np.ndarray:
+        """
+        :param camera: A camera of dm_control
+        :return: Where it sees sky or planes of the world, bool [size, size]
+        """
+        seen = camera.render(segmentation=True)
+        numbers, kinds = seen[..., 0], seen[..., 1]
+        return (kinds == -1) | (kinds == _geom()) & np.isin(numbers, self._planes)
+
+    def behind(self, frame: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """
+        :param frame: uint8 [size, size, 3]
+        :param mask: Of the same state
+        :return: The frame before this background
+        """
+        image = self._image if self._images is not None else self.rng.integers(0, 256, frame.shape, dtype=np.uint8)
+        return np.where(mask[..., None], image, frame)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: What the frames to come depend on
+        """
+        return {"rng": self.rng.bit_generator.state, "drawn": self.drawn}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
+        self.rng.bit_generator.state = state["rng"]
+        self._show(state["drawn"])
+
+
+def _geom() -> int:
+    import mujoco
+
+    return int(mujoco.mjtObj.mjOBJ_GEOM)

@@ -1,0 +1,50 @@
+"""How many cells of the true state all collected transitions have reached so far."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_cure.experiments.files import Row, write_csv
+from sb3_cure.experiments.visit_statistics import entropy_bits
+
+COLUMNS = ("environment_steps", "agent_steps", "cells", "entropy_bits")
+
+
+class CoverageRecorder(BaseCallback):
+    """Counts the cells that training environments in ``TellCell`` report, and writes ``coverage.csv``.
+
+    Whoever acts: what is measured is the data that a method collects, from the first step of its random warm-up on.
+    What it has counted stands in plain attributes, which checkpoints keep.
+
+    :param at: Environment steps after which a row is written
+    :param action_repeat: Environment steps per agent step
+    :param path: The file; None: the rows are in ``rows`` alone
+    """
+
+    def __init__(self, at: Sequence[int], action_repeat: int, path: Path | None = None):
+        super().__init__()
+        self._at, self._action_repeat, self._path = sorted(at), action_repeat, path
+        #: Visits of each cell, by its numbers with commas between them
+        self.visits: dict[str, int] = {}
+        self.rows: list[Row] = []
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            cell = ",".join(map(str, info["cell"]))
+            self.visits[cell] = self.visits.get(cell, 0) + 1
+        steps = self.num_timesteps * self._action_repeat
+        while len(self.rows) < len(self._at) and steps >= self._at[len(self.rows)]:
+            counts = np.array(list(self.visits.values()))
+            values = (steps, self.num_timesteps, len(counts), entropy_bits(counts))
+            self.rows.append(dict(zip(COLUMNS, values, strict=True)))
+            self._write()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._write()
+
+    def _write(self) -> None:
+        if self._path is not None:
+            write_csv(self._path, COLUMNS, self.rows)

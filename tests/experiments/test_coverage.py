@@ -1,0 +1,94 @@
+"""Cumulative coverage of all collected transitions, as cells of a grid record it."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from grids_for_tests import DMC_TASK, method, write_grid
+
+from sb3_cure.envs import physics_state, physics_state_names, rendering
+from sb3_cure.envs.counting import TellCell
+from sb3_cure.experiments.cells import run_cell
+from sb3_cure.experiments.files import read_rows
+from sb3_cure.experiments.grid import GridError, check_arms, load_grid
+
+WIDTHS = {"slider": 0.1, "hinge_1": 0.2}
+ORACLE = {"sb3_cure.envs.counting.CountReward": {"widths": {"slider": 0.15, "hinge_1": 0.5}}}
+QUICK: dict[str, Any] = dict(train_freq=50, gradient_steps=1, learning_starts=100, warmup_updates=0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _gl() -> None:
+    try:
+        rendering.load_gl()
+    except rendering.GLUnavailableError as error:
+        pytest.skip(str(error))
+
+
+def grid(folder: Path, **changes: Any) -> Any:
+    methods = {"oracle": method(env_wrapper=[ORACLE], curiosity=None, **QUICK)}
+    coverage = dict(widths=WIDTHS, at=[400, 1200])
+    arguments = dict(tasks=[DMC_TASK], methods=methods, budget=1200, evaluation=dict(every=1200, episodes=1))
+    return load_grid(write_grid(folder, **{**arguments, "coverage": coverage, **changes}))
+
+
+def test_cells_of_all_collected_states_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the stated steps, by other cells than the oracle's, whose reward is trained on and not evaluated by."""
+    states, step = [], TellCell.step
+
+    def noted(self: TellCell, action: np.ndarray) -> Any:
+        result = step(self, action)
+        states.append(physics_state(self))
+        return result
+
+    monkeypatch.setattr(TellCell, "step", noted)
+    [cell] = grid(tmp_path).cells
+    folder = run_cell(cell, tmp_path / "out", pictures=False)
+    rows = read_rows(folder / "coverage.csv")
+    assert [(row["environment_steps"], row["agent_steps"]) for row in rows] == [(400, 50), (1200, 150)]
+    assert len(states) == 150
+    names = physics_state_names(cell.make_env())
+    seen = np.array(states)[:, [names.index(name) for name in WIDTHS]]
+    for row in rows:
+        cells = np.floor(seen[: row["agent_steps"]] / list(WIDTHS.values()))
+        assert row["cells"] == len(np.unique(cells, axis=0)) > 3
+        assert 0 < row["entropy_bits"] <= np.log2(row["cells"]) + 1e-9
+
+
+def test_oracle_rewards_training_alone(tmp_path: Path) -> None:
+    """Evaluations are of the task, whatever an arm trains on."""
+    [cell] = grid(tmp_path).cells
+    rewards = []
+    for env in (cell.make_env(), gym.make(cell.task, **cell.env_kwargs)):
+        env.reset(seed=0)
+        rewards.append(env.step(np.zeros(1, np.float32))[1])
+        env.close()
+    assert rewards[0] == 1 and rewards[1] < 0.1
+
+
+def test_coverage_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    [cell] = grid(tmp_path).cells
+    whole = run_cell(cell, tmp_path / "whole", pictures=False)
+    step, n_left = TellCell.step, [105]
+
+    def failing(self: TellCell, action: np.ndarray) -> Any:
+        n_left[0] -= 1
+        if n_left[0] == 0:
+            raise RuntimeError("the power went")
+        return step(self, action)
+
+    monkeypatch.setattr(TellCell, "step", failing)
+    with pytest.raises(RuntimeError, match="the power went"):
+        run_cell(cell, tmp_path / "killed", 0, pictures=False)
+    killed = run_cell(cell, tmp_path / "killed", 0, pictures=False)
+    for name in ("coverage.csv", "episodes.csv"):
+        assert (whole / name).read_text() == (killed / name).read_text()
+
+
+def test_unknown_coordinates_are_found_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(GridError, match="give a width > 0 for some of slider, hinge_1"):
+        check_arms(grid(tmp_path, coverage=dict(widths={"elbow": 1.0}, at=[400])).cells)
+    with pytest.raises(GridError, match=r"coverage\.at"):
+        grid(tmp_path, coverage=dict(widths=WIDTHS, at=[]))

@@ -1,0 +1,206 @@
+"""Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs_for_tests import Cliff, PixelBox, VectorBox, differences, state_of, tiny_model
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+from updates_for_tests import ALGORITHMS
+
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import SkippingReplayBuffer, transitions, unmarked
+from sb3_cure.callbacks import ExactCheckpoint
+from sb3_cure.datasets import RecordedEpisode, RecordEpisodes, load_episode, save_episode
+
+both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+
+
+def record(make: Any, folder: Path, steps: int) -> gym.Env:
+    """Random actions; the last episode has no end."""
+    env = RecordEpisodes(make(), folder)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+    env.close()
+    return env
+
+
+@both_algorithms
+@pytest.mark.parametrize(
+    ("policy", "make"),
+    [
+        ("CnnPolicy", PixelBox),
+        ("CnnPolicy", lambda: PixelBox(1, channels_last=True)),
+        ("MlpPolicy", Cliff),
+        ("MlpPolicy", lambda: VectorBox(low=-1.0, high=3.0)),
+    ],
+    ids=["stacked frames", "channels last", "terminations", "asymmetric actions"],
+)
+def test_loaded_transitions_are_those_collected(algorithm: str, policy: str, make: Any, tmp_path: Path) -> None:
+    """What a model collects, and what another one reads from the files that a wrapper wrote meanwhile, are the same."""
+    collector = tiny_model(policy, RecordEpisodes(make(), tmp_path), ALGORITHMS[algorithm], learning_starts=10**6)
+    collector.learn(45)
+    collector.env.close()
+    reader = tiny_model(policy, make(), ALGORITHMS[algorithm])
+    assert reader.load_transitions(tmp_path) == 45 and reader.num_timesteps == 0
+    rows = np.arange(45), np.zeros(45, int)
+    ours, theirs = (transitions(each.replay_buffer, *rows) for each in (reader, collector))
+    for name, value in theirs._asdict().items():
+        if value is not None:
+            np.testing.assert_allclose(getattr(ours, name), value, atol=1e-6, err_msg=name)
+    assert (ours.dones.sum() > 0) == (make is Cliff)
+
+
+def test_several_environments_share_the_episodes(tmp_path: Path) -> None:
+    """Each transition once; what fills up the shorter one is never sampled."""
+    record(VectorBox, tmp_path, 50)
+    lengths = [len(load_episode(path).rewards) for path in sorted(tmp_path.glob("*.npz"))]
+    assert sum(lengths) == 50 and len(lengths) > 2
+    model = tiny_model("MlpPolicy", make_vec_env(VectorBox, 2))
+    assert model.load_transitions(tmp_path) == 50
+    good, env_inds, _ = unmarked(model.replay_buffer)
+    assert len(good) == 50 and len(set(env_inds)) == 2
+    read = transitions(model.replay_buffer, good, env_inds).rewards.flatten().tolist()
+    written = np.concatenate([load_episode(path).rewards for path in tmp_path.glob("*.npz")])
+    np.testing.assert_allclose(sorted(read), np.sort(written), atol=1e-6)
+    model.replay_buffer = ReplayBuffer(100, model.observation_space, model.action_space, "cpu", 2)
+    with pytest.raises(ValueError, match="episodes differ in length"):
+        model.load_transitions(tmp_path)
+
+
+def test_objects_of_minari_are_read() -> None:
+    """By their attributes, in float64 as most of its datasets have them."""
+    rng = np.random.default_rng(0)
+    episode = SimpleNamespace(
+        id=0, observations=rng.uniform(-1, 1, (6, 2)), actions=rng.uniform(-1, 1, (5, 2)), rewards=rng.normal(size=5),
+        terminations=np.zeros(5, bool), truncations=np.arange(5) == 4, infos={},
+    )  # fmt: skip
+    model = tiny_model("MlpPolicy", VectorBox(), n_steps=3)
+    assert model.load_transitions([episode, episode]) == 10
+    model.learn(15)
+
+
+def test_dictionaries_keep_their_keys(tmp_path: Path) -> None:
+    make = lambda: SimpleMultiObsEnv(discrete_actions=False)  # noqa: E731
+    record(make, tmp_path, 12)
+    episode = load_episode(min(tmp_path.glob("*.npz")))
+    assert set(episode.observations) == {"img", "vec"} and len(episode.observations["vec"]) == len(episode.actions) + 1
+    model = CuReSAC("MultiInputPolicy", make(), srl=None, curiosity=None, buffer_size=20, learning_starts=5)
+    assert model.load_transitions(tmp_path) == 12
+    np.testing.assert_array_equal(model.replay_buffer.observations["vec"][0, 0], episode.observations["vec"][0])
+
+
+def test_what_does_not_fit_is_one_sentence(tmp_path: Path) -> None:
+    record(VectorBox, tmp_path / "vectors", 5)
+    model = tiny_model("CnnPolicy", PixelBox())
+    for source, sentence in (
+        (tmp_path / "vectors", "observations of an episode are float32 of shape"),
+        (tmp_path, "has no .npz files"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            model.load_transitions(source)
+    vectors = tiny_model("MlpPolicy", VectorBox(), buffer_size=3)
+    far = load_episode(min((tmp_path / "vectors").glob("*.npz")))
+    with pytest.raises(ValueError, match="actions of an episode"):
+        vectors.load_transitions([far._replace(actions=3 * np.ones_like(far.actions))])
+    with pytest.warns(UserWarning, match="make buffer_size larger"):
+        vectors.load_transitions([far])
+
+
+def test_files_are_not_unpickled(tmp_path: Path) -> None:
+    episode = RecordedEpisode(*(np.array([{"any": "object"}], dtype=object) for _ in range(5)))
+    save_episode(tmp_path / "pickled.npz", episode)
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        tiny_model("MlpPolicy", VectorBox()).load_transitions(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------ learning from them
+
+
+@both_algorithms
+def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_path: Path) -> None:
+    record(PixelBox, tmp_path, 60)
+    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm])
+    model.load_transitions(tmp_path)
+    before = state_of(model)
+    losses = []
+    step = model._update_srl
+    model._update_srl = lambda *args: losses.append(step(*args).mean().item()) or step(*args)  # type: ignore[method-assign, func-returns-value]
+    model.fit_representation(60, log_interval=25)
+    del model._update_srl  # type: ignore[attr-defined]
+    assert np.mean(losses[-10:]) < np.mean(losses[:10])
+    changed = {name.split("[")[0].split(".")[0] for name in _changed(before["policy"], state_of(model)["policy"])}
+    assert changed == {"encoder", "encoder_target", "srl"}
+    assert (model.num_timesteps, model._n_updates, model.task, model.curiosity) == (0, 0, True, "separate")
+    assert model.replay_buffer.size() == 60
+    model.learn(14)
+    assert model._n_updates == 4 and model.replay_buffer.size() == 74
+
+
+def _changed(first: Any, second: Any) -> list[str]:
+    return [name for name in first if differences(first[name], second[name])]
+
+
+def test_learn_after_fitting_begins_as_without_it(tmp_path: Path) -> None:
+    """The same random warm-up, so that runs of one seed stay paired."""
+    record(PixelBox, tmp_path, 30)
+    plain = tiny_model("CnnPolicy", PixelBox()).learn(10)
+    fitted = tiny_model("CnnPolicy", PixelBox())
+    fitted.load_transitions(tmp_path)
+    fitted.fit_representation(3).learn(10)
+    np.testing.assert_array_equal(fitted.replay_buffer.actions[30:40], plain.replay_buffer.actions[:10])
+
+
+def test_schedules_follow_the_updates(tmp_path: Path) -> None:
+    """Also after a training that has come to their end."""
+    record(VectorBox, tmp_path, 30)
+    seen: list[float] = []
+    model = tiny_model("MlpPolicy", VectorBox(), learning_rate=lambda progress: seen.append(progress) or 1e-3)  # type: ignore[func-returns-value]
+    model.learn(15)
+    model.load_transitions(tmp_path)
+    seen.clear()
+    model.fit_representation(4, log_interval=1)
+    assert seen[:4] == [1, 0.75, 0.5, 0.25]
+
+
+def test_nothing_to_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="srl is None"):
+        tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None).fit_representation(1)
+    with pytest.raises(ValueError, match="call load_transitions"):
+        tiny_model("CnnPolicy", PixelBox()).fit_representation(1)
+
+
+class Interrupt(BaseCallback):
+    """Stands in for a kill."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 25:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_calls_that_were_over_are_skipped_after_a_kill(tmp_path: Path) -> None:
+    """A script that is run again neither loads nor fits twice, and ends as one that was not killed."""
+    record(VectorBox, tmp_path / "episodes", 20)
+
+    def script(model: CuReSAC, *callbacks: BaseCallback) -> CuReSAC:
+        model.load_transitions(tmp_path / "episodes")
+        return model.fit_representation(5).learn(40, callback=list(callbacks))
+
+    checkpoint = ExactCheckpoint(10, tmp_path / "checkpoints")
+    with pytest.raises(KeyboardInterrupt):
+        script(tiny_model("MlpPolicy", VectorBox()), checkpoint, Interrupt())
+    resumed = script(CuReSAC.resume(tmp_path / "checkpoints", VectorBox(), device="cpu"))
+    whole = script(tiny_model("MlpPolicy", VectorBox()))
+    assert type(whole.replay_buffer) is SkippingReplayBuffer and whole.replay_buffer.size() == 60
+    assert differences(state_of(whole), state_of(resumed)) == []
