@@ -493,7 +493,8 @@ class CuRe(OffPolicyAlgorithm):
             srl.after_step()
         variance = runs[0].latents.detach().var(dim=0, correction=0).mean()
         self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
-        about_next = self.curiosity_target == "next_observation" and not srl.needs_next_latents
+        of_transitions = srl.needs_next_latents or srl.models_transitions
+        about_next = self.curiosity_target == "next_observation" and not of_transitions
         if about_next and self.policy.intrinsic is not None and self.policy.intrinsic.needs_srl:
             with th.no_grad(), self._autocast(srl.mixed_precision):
                 views = self.policy.augmentation(batch.next_observations)

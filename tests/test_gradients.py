@@ -154,8 +154,17 @@ def test_each_agent_sees_its_own_reward(update: str) -> None:
         ("tqc", False, {}),
         ("tqc", True, {}),
         ("tqc", False, {"curiosity": "bonus"}),
+        ("sac", True, {"srl": "curl"}),
+        ("tqc", False, {"srl": "vae"}),
+        ("sac", True, {"srl": "vae"}),
+        ("tqc", False, {"srl": "spr"}),
+        ("sac", True, {"srl": "spr"}),
+        ("tqc", False, {"srl": "forward"}),
+        ("sac", True, {"srl": "forward"}),
+        ("tqc", False, {"srl": "inverse"}),
+        ("sac", True, {"srl": "inverse", "augmentation": "shift"}),
     ],
-    ids=["sac", "sac-episodic", "sac-pixels", "tqc", "tqc-pixels", "tqc-bonus"],
+    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else str(value),
 )
 def test_whole_update_equals_straight_line_code(
     algorithm: str, pixels: bool, kwargs: dict[str, Any], update: str
