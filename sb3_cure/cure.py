@@ -54,8 +54,8 @@ class CuRe(OffPolicyAlgorithm):
     :param gamma: Discount factor of the task
     :param train_freq: Agent steps per environment between two calls of ``train``
     :param gradient_steps: Updates per call; -1: as many as agent steps were made
-    :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), a subclass of
-        ``SRLHead``, or None
+    :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), ``"vae"``, ``"spr"``,
+        ``"forward"``, ``"inverse"`` (see ``sb3_cure.srl``), a subclass of ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         agent steps, two updates per step, in turn: after whole periods both were updated as often as simultaneously

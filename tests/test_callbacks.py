@@ -34,9 +34,10 @@ from sb3_cure.callbacks import (
     PeriodicCallback,
     PolicyVideoCallback,
     ReconstructionCallback,
+    StateProbeCallback,
 )
 from sb3_cure.envs import StackFrames
-from sb3_cure.evaluation import Episode, binned_errors, most_uncomfortable, run_episodes
+from sb3_cure.evaluation import Episode, binned_errors, most_uncomfortable, run_episodes, state_probe
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.video import annotated_frames
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -105,13 +106,14 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
                 ReconstructionCallback(tmp_path, 15, probe_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
+                StateProbeCallback(env, tmp_path, 15, n_episodes=2, **MAP),
             ]
         model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12))
         models.append(model.learn(40, callback=callbacks))
     assert names(tmp_path) == sorted(
         [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
         + [f"curiosity_map_{steps}_steps.png" for steps in (15, 30)]
-        + ["reconstructions.png"]
+        + ["reconstructions.png", "state_probe.csv", "state_probe.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
 
@@ -504,6 +506,41 @@ def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"coordinates are \('pole', 'hinge_1'\).*choose of slider, hinge_1, slider_v"):
         CuriosityMapCallback(env, tmp_path, coordinates=("pole", "hinge_1"))
     env.close()
+
+
+def test_state_probe_over_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the untrained encoder, then one each time, of the same episodes; logged, written, and drawn."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(plots, "state_probe_bars", lambda path, probes, title: drawn.append(probes))
+    model = tiny_model("CnnPolicy", PixelBox())
+    callback = StateProbeCallback(PixelBox(), tmp_path, every=15, n_episodes=3, **MAP)
+    untrained = tiny_model("CnnPolicy", PixelBox())
+    model.learn(35, callback=callback, log_interval=1)
+    rows = [line.split(",") for line in (tmp_path / "state_probe.csv").read_text().splitlines()]
+    assert rows[0] == ["timesteps", "x", "y"] and [row[0] for row in rows[1:]] == ["0", "15", "30"]
+    for trained, row in ((untrained, callback.rows[0]), (model, None)):
+        episodes = list(run_episodes(trained, PixelBox(), 3, "random", states=position, seed=0))
+        expected = state_probe(trained, episodes, ["x", "y"])
+        if row is None:
+            callback.on_period()
+            row = callback.rows[-1]
+            logged = model.logger.name_to_value
+            assert (logged["probe/x"], logged["probe/y"]) == (row["x"], row["y"])
+            assert logged["probe/mean"] == pytest.approx((row["x"] + row["y"]) / 2)
+        assert [row["x"], row["y"]] == pytest.approx([expected["x"], expected["y"]])
+    assert [list(probes) for probes in drawn][-2] == ["0 agent steps", "30 agent steps"]
+    assert drawn[-2]["30 agent steps"] == {"x": callback.rows[2]["x"], "y": callback.rows[2]["y"]}
+    with pytest.raises(ValueError, match="state and names belong together"):
+        StateProbeCallback(PixelBox(), tmp_path, state=position)
+
+
+def test_bars_of_a_state_probe(tmp_path: Path) -> None:
+    """Any number of probes; what is far below zero or unknown still has its number beside it."""
+    found = {"a": 0.9, "b_velocity": -7.0, "c": np.nan}
+    plots.state_probe_bars(tmp_path / "one.png", {"now": found}, "title")
+    plots.state_probe_bars(tmp_path / "two.png", {"first": found, "now": found}, "title")
+    one, two = (np.asarray(Image.open(tmp_path / f"{name}.png").convert("L")) for name in ("one", "two"))
+    assert one.std() > 5 and two.shape[0] > one.shape[0] and two.shape[1] == one.shape[1]
 
 
 @given(

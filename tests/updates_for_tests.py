@@ -143,7 +143,12 @@ class StraightLine:
 
     def groups(self) -> list[th.Tensor]:
         """All parameters and temperatures."""
-        modules = [self.encoder, self.encoder_target, self.head, *self.agents.values()]
+        modules = [
+            self.encoder,
+            self.encoder_target,
+            *self.agents.values(),
+            *([] if self.head is None else [self.head]),
+        ]
         found = [parameter.detach() for module in modules for parameter in module.parameters()]
         return [*found, *(agent.log_ent_coef.detach() for agent in self.agents.values())]
 
@@ -208,10 +213,13 @@ class StraightLine:
                 size = th.cat(gradients).norm()
                 pulls.append([step / size for step in along])
 
-        read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
-        loss, errors = LOSSES[self.model.srl](self, batch, *read)
-        found = {"srl_loss": loss}
-        learn(loss, self.head, *read)
+        found: dict[str, th.Tensor] = {}
+        errors = th.zeros(len(obs))
+        if self.head is not None:
+            read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
+            loss, errors = LOSSES[self.model.srl](self, batch, *read)
+            found["srl_loss"] = loss
+            learn(loss, self.head, *read)
         if self.model.srl == "spr":
             self.follow(self.head.target_projection, self.head.projection, 0.05)
         errors = errors.detach()
@@ -295,7 +303,7 @@ def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor
 
 
 def vae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Squared error of what is drawn from N(latents, sigma^2), and 1e-6 times the divergence, by torch's own formula."""
+    """Squared error of what is drawn from N(latents, sigma^2), and 1e-6 times the divergence, as torch computes it."""
     sigma = (0.5 * linear(latents, line.head.log_variance)).exp()
     posterior, prior = th.distributions.Normal(latents, sigma), th.distributions.Normal(0.0, 1.0)
     divergence = th.distributions.kl_divergence(posterior, prior).sum(dim=1)

@@ -12,12 +12,11 @@ from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
 class NextLatents(SRLHead):
-    """Base class of heads that predict, from latents and action, what the momentum encoder makes of the next
-    observation.
+    """Base class of heads that predict, from latents and action, the momentum encoder's latents of the next observation.
 
-    An encoder whose latents are all alike would be the easiest to predict. Hence there is no gradient through the
-    target (Tang et al., 2023, why that helps), and the target is standardised, each of its numbers by mean and
-    variance of the batch, as BYOL's batch normalisation does: to guess the mean is then as bad for small latents as for
+    Latents that are all alike would be the easiest to predict. Two things keep the encoder from this collapse: the
+    target has no gradient (Tang et al., 2023, say why that helps), and each of its numbers is standardised by mean and
+    variance of the batch, as by BYOL's batch normalisation. To guess the mean is then as bad for small latents as for
     large ones. A subclass implements ``distance``, and may ``project`` the target.
 
     :param encoder: The shared encoder

@@ -16,11 +16,11 @@ from sb3_cure.srl.dynamics import NextLatents
 class SPR(NextLatents):
     """Predicts a projection of the next latents by the momentum encoder, with cosine similarity.
 
-    As in the paper, prediction and target are compared after a projection, behind which the prediction has a predictor
-    more; the target's projection is a moving average. Otherwise than there: K = 1, as the replay buffer gives single
-    transitions (their Atari agents predict 5 steps); the transition model is an MLP, as latents are vectors; the target
-    is standardised (see ``NextLatents``): where no critic held them apart, latents became one vector within 100 updates.
-    With ``augmentation="auto"`` images are shifted.
+    As in the paper, prediction and target are compared after a projection, and the prediction goes through a predictor
+    after it; the target's projection is a moving average. There are three differences. K = 1, as the replay buffer
+    gives single transitions (their Atari agents predict 5 steps). The transition model is an MLP, as latents are
+    vectors. The target is standardised (see ``NextLatents``), because where no critic kept them apart, all latents
+    became one vector within 100 updates. With ``augmentation="auto"`` images are shifted.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations
