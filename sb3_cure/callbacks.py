@@ -254,7 +254,7 @@ class ReconstructionCallback(PeriodicCallback):
     :param columns: How many observations to take
     :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment or
         ``VecFrameStack`` tells
-    :param probe_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
+    :param decoder_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
     :param title: Put before the picture's title, such as the names of task and method
@@ -269,14 +269,14 @@ class ReconstructionCallback(PeriodicCallback):
         observations: np.ndarray | None = None,
         columns: int = 8,
         frame_stack: int | None = None,
-        probe_updates: int = 500,
+        decoder_updates: int = 500,
         max_rows: int = 12,
         verbose: int = 0,
         title: str = "",
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.frame_stack, self.probe_updates, self.max_rows = frame_stack, probe_updates, max_rows
+        self.frame_stack, self.decoder_updates, self.max_rows = frame_stack, decoder_updates, max_rows
         self.title = title
         #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
         self.rows: list[tuple[int, np.ndarray]] = []
@@ -302,7 +302,7 @@ class ReconstructionCallback(PeriodicCallback):
                 self.on_period()
 
     def _on_step(self) -> bool:
-        if self._buffer is None and self.probe_updates > 0:
+        if self._buffer is None and self.decoder_updates > 0:
             # Not `new_obs` of the locals: the rollouts of third parties' algorithms may call it otherwise
             self._latest.extend(np.array(self.model._last_obs))
         return super()._on_step()
@@ -322,14 +322,14 @@ class ReconstructionCallback(PeriodicCallback):
         with th.no_grad():
             pair = reconstruct(observed)
         if pair is None:
-            if self.probe_updates == 0:
+            if self.decoder_updates == 0:
                 head = getattr(model.policy, "srl", None)
-                warnings.warn(f"{type(head).__name__} does not reconstruct: give probe_updates=500.", stacklevel=2)
-            if self.probe_updates == 0 or len(self._spread(1)) == 0:
+                warnings.warn(f"{type(head).__name__} does not reconstruct: give decoder_updates=500.", stacklevel=2)
+            if self.decoder_updates == 0 or len(self._spread(1)) == 0:
                 return
             title = "What a decoder fitted afterwards draws from the latents"
-            decoder = _room("probe").fit_probe(model, self._sample, self.probe_updates)
-            pair = _room("probe").draw_with_probe(model, decoder, observed)
+            decoder = _room("decoding").fit_decoder(model, self._sample, self.decoder_updates)
+            pair = _room("decoding").draw_latents(model, decoder, observed)
         observed, drawn = pair
         frame_stack = self.frame_stack or frame_stack_of(self.training_env)
         self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))

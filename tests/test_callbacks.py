@@ -96,7 +96,7 @@ def test_periods_are_counted_in_agent_steps() -> None:
 
 
 def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
-    """All callbacks, with stochastic policies, a probe and CURL's negatives chosen anew: equal bits afterwards."""
+    """All callbacks, with stochastic policies, decoders and CURL's negatives chosen anew: equal bits afterwards."""
     models = []
     for watched in (False, True):
         callbacks: list[BaseCallback] = []
@@ -104,7 +104,7 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
             env = Filmed(PixelBox())
             callbacks = [
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
-                ReconstructionCallback(tmp_path, 15, probe_updates=2),
+                ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
                 StateProbeCallback(env, tmp_path, 15, n_episodes=2, **MAP),
             ]
@@ -296,7 +296,7 @@ def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
             return True
 
     def watching(folder: str) -> ReconstructionCallback:
-        return ReconstructionCallback(tmp_path / folder, 15, observations, probe_updates=1)
+        return ReconstructionCallback(tmp_path / folder, 15, observations, decoder_updates=1)
 
     def checkpoints() -> ExactCheckpoint:
         return ExactCheckpoint(save_freq=5, path=tmp_path / "checkpoints")
@@ -312,20 +312,20 @@ def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
         np.testing.assert_array_equal(drawn, other)
 
 
-def test_heads_that_do_not_draw_get_a_probe(tmp_path: Path) -> None:
+def test_heads_that_do_not_draw_get_a_decoder(tmp_path: Path) -> None:
     """A decoder fitted to the latents draws; without it nothing is written, and that is said."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl=Silent)
-    probed = ReconstructionCallback(tmp_path / "probe", every=25, probe_updates=30)
-    refused = ReconstructionCallback(tmp_path / "none", every=5, probe_updates=0)
+    fitted = ReconstructionCallback(tmp_path / "fitted", every=25, decoder_updates=30)
+    refused = ReconstructionCallback(tmp_path / "none", every=5, decoder_updates=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model.learn(26, callback=[probed, refused])
+        model.learn(26, callback=[fitted, refused])
     said = [str(warning.message) for warning in caught if "does not reconstruct" in str(warning.message)]
     assert said and "Silent does not reconstruct" in said[0]
-    assert names(tmp_path) == ["probe"] and names(tmp_path / "probe") == ["reconstructions.png"]
-    observed = probed.observations.astype(float)
+    assert names(tmp_path) == ["fitted"] and names(tmp_path / "fitted") == ["reconstructions.png"]
+    observed = fitted.observations.astype(float)
     untouched = np.abs(observed - 128).mean()  # what an untrained decoder is off by: it draws grey
-    assert np.abs(probed.rows[-1][1] - observed).mean() < 0.75 * untouched
+    assert np.abs(fitted.rows[-1][1] - observed).mean() < 0.75 * untouched
 
 
 class Compass(gym.ActionWrapper):
@@ -356,7 +356,7 @@ PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed
 )
 def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], tmp_path: Path) -> None:
     """A decoder makes pictures of its features, another for each observation; training is as without pictures."""
-    callback = ReconstructionCallback(tmp_path, every=20, columns=5, probe_updates=30)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=5, decoder_updates=30)
     watched, alone = make().learn(48, callback=callback), make().learn(48)
     assert [steps for steps, _ in callback.rows] == [20, 40] and names(tmp_path) == ["reconstructions.png"]
     observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1]
@@ -380,7 +380,7 @@ def test_the_latest_observations_serve_where_there_is_no_replay_buffer(
 
     monkeypatch.setattr(callbacks, "LATEST", 12)
     model = Renamed("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
-    callback = ReconstructionCallback(tmp_path, every=20, columns=40, probe_updates=1)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=40, decoder_updates=1)
     seen: list[np.ndarray] = []
 
     class Note(BaseCallback):
@@ -400,7 +400,7 @@ def test_the_newest_frame_of_a_stack_is_shown(frames: int, tmp_path: Path, monke
     shown: list[np.ndarray] = []
     monkeypatch.setattr(plots, "reconstructions_over_training", lambda _, observed, *__: shown.append(observed))
     env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=frames)]), 3)
-    callback = ReconstructionCallback(tmp_path, every=20, columns=4, probe_updates=1)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=4, decoder_updates=1)
     PPO("CnnPolicy", env, **PPO_ARGUMENTS).learn(32, callback=callback)
     np.testing.assert_array_equal(shown[0], callback.observations[:, -3:])
 

@@ -25,7 +25,7 @@ from sb3_cure.evaluation import (
     state_probe,
 )
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.probe import draw_with_probe, fit_probe
+from sb3_cure.experiments.decoding import draw_latents, fit_decoder
 from sb3_cure.metrics import reconstruction_strip
 
 
@@ -160,7 +160,7 @@ def test_reconstructions_show_the_newest_frames_above_what_is_drawn() -> None:
         np.testing.assert_array_equal(cut[:, 36:], drawn[column, 3:])
 
 
-def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
+def test_decoder_draws_from_a_contrastive_encoder_without_training_it() -> None:
     """The encoder is bit-equal before and after; with more updates the drawing comes closer to the observation."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl="curl").learn(30)
     before = {key: value.clone() for key, value in model.policy.state_dict().items()}
@@ -168,19 +168,19 @@ def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
     for updates in (1, 150):
         th.manual_seed(0)
         np.random.seed(0)
-        decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, updates)
-        observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+        decoder = fit_decoder(model, lambda n: model.replay_buffer.sample(n).observations, updates)
+        observed, drawn = draw_latents(model, decoder, model.replay_buffer.sample(4).observations)
         distances.append(float((observed - drawn).abs().mean()))
     assert distances[1] < 0.5 * distances[0]
     assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
 
 
-def test_probe_draws_what_the_encoder_sees() -> None:
+def test_decoder_draws_what_the_encoder_sees() -> None:
     """Of crops, pictures of the crops' size."""
     crops: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=30))
     model = tiny_model("CnnPolicy", PixelBox(), srl="curl", **crops).learn(30)
-    decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, 1)
-    observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+    decoder = fit_decoder(model, lambda n: model.replay_buffer.sample(n).observations, 1)
+    observed, drawn = draw_latents(model, decoder, model.replay_buffer.sample(4).observations)
     assert observed.shape == drawn.shape == (4, model.observation_space.shape[0], 30, 30)
 
 

@@ -156,8 +156,8 @@ def test_each_agent_sees_its_own_reward(update: str) -> None:
         ("tqc", True, {}),
         ("tqc", False, {"curiosity": "bonus"}),
         ("sac", True, {"srl": "curl"}),
-        ("tqc", False, {"srl": "vae"}),
-        ("sac", True, {"srl": "vae"}),
+        ("tqc", False, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
+        ("sac", True, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
         ("tqc", False, {"srl": "spr"}),
         ("sac", True, {"srl": "spr"}),
         ("tqc", False, {"srl": "forward"}),
@@ -166,7 +166,7 @@ def test_each_agent_sees_its_own_reward(update: str) -> None:
         ("sac", True, {"srl": "inverse", "augmentation": "shift"}),
         ("sac", True, {"srl": None, "curiosity": None, "augmentation": "shift"}),
     ],
-    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else str(value),
+    ids=lambda value: "-".join(str(each) for each in value.values()) if isinstance(value, dict) else str(value),
 )
 def test_whole_update_equals_straight_line_code(
     algorithm: str, pixels: bool, kwargs: dict[str, Any], update: str

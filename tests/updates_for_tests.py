@@ -303,12 +303,12 @@ def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor
 
 
 def vae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Squared error of what is drawn from N(latents, sigma^2), and 1e-6 times the divergence, as torch computes it."""
+    """Squared error of what is drawn from N(latents, sigma^2), and beta times the divergence, as torch computes it."""
     sigma = (0.5 * linear(latents, line.head.log_variance)).exp()
     posterior, prior = th.distributions.Normal(latents, sigma), th.distributions.Normal(0.0, 1.0)
     divergence = th.distributions.kl_divergence(posterior, prior).sum(dim=1)
     errors = reconstruction_errors(line, batch, latents + sigma * th.randn(latents.shape))
-    return errors.mean() + 1e-6 * divergence.mean(), errors
+    return errors.mean() + line.head.beta * divergence.mean(), errors
 
 
 def curl_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -12,7 +12,7 @@ from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
 class NextLatents(SRLHead):
-    """Base class of heads that predict, from latents and action, the momentum encoder's latents of the next observation.
+    """Base class of heads that predict the next latents, as the momentum encoder has them, from latents and action.
 
     Latents that are all alike would be the easiest to predict. Two things keep the encoder from this collapse: the
     target has no gradient (Tang et al., 2023, say why that helps), and each of its numbers is standardised by mean and
