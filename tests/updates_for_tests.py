@@ -324,9 +324,9 @@ def spr_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th
     """1 - cosine of predictor(projection(transition)) and of the standardised projection by the moving averages."""
     head = line.head
     with th.no_grad():
-        target = standardised(linear(next_keys(line, batch), head.target_projection[0]))
+        target = standardised(linear(next_keys(line, batch), head.target_projection))
     predicted = mlp(th.cat([latents, batch.actions], dim=1), head.transition)
-    predicted = linear(linear(predicted, head.projection[0]), head.predictor[0])
+    predicted = linear(linear(predicted, head.projection), head.predictor)
     errors = 1 - (predicted * target).sum(dim=1) / (predicted.norm(dim=1) * target.norm(dim=1))
     return errors.mean(), errors
 

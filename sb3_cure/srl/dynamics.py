@@ -7,7 +7,7 @@ from torch import nn
 
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
-from sb3_cure.layers import FullPrecision, full_precision, init_weights
+from sb3_cure.layers import full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -17,7 +17,7 @@ class NextLatents(SRLHead):
     Latents that are all alike would be the easiest to predict. Two things keep the encoder from this collapse: the
     target has no gradient (Tang et al., 2023, say why that helps), and each of its numbers is standardised by mean and
     variance of the batch, as by BYOL's batch normalisation. To guess the mean is then as bad for small latents as for
-    large ones. A subclass implements ``distance``, and may ``project`` the target.
+    large ones. A subclass implements ``distance``, and may ``project`` the target, both in fp32.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations
@@ -74,8 +74,9 @@ class NextLatents(SRLHead):
     def _error(self, batch: Samples, latents: th.Tensor, next_views: th.Tensor, learns: bool) -> th.Tensor:
         with th.no_grad():
             following = self.target_encoder(self.preprocess(next_views)).float()
-            target = self._standardise(self.project(following), learns)
         with full_precision(latents):
+            with th.no_grad():
+                target = self._standardise(self.project(following), learns)
             return self.distance(th.cat([latents, batch.actions], dim=1), target)
 
     def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:
@@ -156,5 +157,5 @@ class Inverse(SRLHead):
 
 
 def _mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Module:
-    """One hidden layer; in fp32, as vectors and actions are."""
-    return init_weights(FullPrecision(nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, n_outputs)))
+    """One hidden layer."""
+    return init_weights(nn.Sequential(nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, n_outputs)))

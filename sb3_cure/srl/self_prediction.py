@@ -9,7 +9,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_cure.encoders import Encoder
-from sb3_cure.layers import FullPrecision, init_weights
+from sb3_cure.layers import init_weights
 from sb3_cure.srl.dynamics import NextLatents
 
 
@@ -39,9 +39,9 @@ class SPR(NextLatents):
     ):
         super().__init__(encoder, observation_space, action_space)
         size = encoder.features_dim
-        self.transition = FullPrecision(nn.Linear(self.n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, size))
-        self.projection = FullPrecision(nn.Linear(size, size))
-        self.predictor = FullPrecision(nn.Linear(size, size))
+        self.transition = nn.Sequential(nn.Linear(self.n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, size))
+        self.projection = nn.Linear(size, size)
+        self.predictor = nn.Linear(size, size)
         init_weights(self)
         self.target_projection = copy.deepcopy(self.projection).requires_grad_(False)
         self.tau = tau
