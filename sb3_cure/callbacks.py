@@ -25,7 +25,7 @@ from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation import Episode, evenly_measured, run_episodes, trained_actors
+from sb3_cure.evaluation import Episode, evenly_measured, run_episodes, state_probe, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
 from sb3_cure.persistence import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.policies import encoder_of
@@ -254,7 +254,7 @@ class ReconstructionCallback(PeriodicCallback):
     :param columns: How many observations to take
     :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment or
         ``VecFrameStack`` tells
-    :param probe_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
+    :param decoder_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
     :param max_rows: Where there are more times, rows are left out evenly
     :param verbose: 1 prints the file's name
     :param title: Put before the picture's title, such as the names of task and method
@@ -269,14 +269,14 @@ class ReconstructionCallback(PeriodicCallback):
         observations: np.ndarray | None = None,
         columns: int = 8,
         frame_stack: int | None = None,
-        probe_updates: int = 500,
+        decoder_updates: int = 500,
         max_rows: int = 12,
         verbose: int = 0,
         title: str = "",
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.frame_stack, self.probe_updates, self.max_rows = frame_stack, probe_updates, max_rows
+        self.frame_stack, self.decoder_updates, self.max_rows = frame_stack, decoder_updates, max_rows
         self.title = title
         #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
         self.rows: list[tuple[int, np.ndarray]] = []
@@ -302,7 +302,7 @@ class ReconstructionCallback(PeriodicCallback):
                 self.on_period()
 
     def _on_step(self) -> bool:
-        if self._buffer is None and self.probe_updates > 0:
+        if self._buffer is None and self.decoder_updates > 0:
             # Not `new_obs` of the locals: the rollouts of third parties' algorithms may call it otherwise
             self._latest.extend(np.array(self.model._last_obs))
         return super()._on_step()
@@ -322,14 +322,14 @@ class ReconstructionCallback(PeriodicCallback):
         with th.no_grad():
             pair = reconstruct(observed)
         if pair is None:
-            if self.probe_updates == 0:
+            if self.decoder_updates == 0:
                 head = getattr(model.policy, "srl", None)
-                warnings.warn(f"{type(head).__name__} does not reconstruct: give probe_updates=500.", stacklevel=2)
-            if self.probe_updates == 0 or len(self._spread(1)) == 0:
+                warnings.warn(f"{type(head).__name__} does not reconstruct: give decoder_updates=500.", stacklevel=2)
+            if self.decoder_updates == 0 or len(self._spread(1)) == 0:
                 return
             title = "What a decoder fitted afterwards draws from the latents"
-            decoder = _room("probe").fit_probe(model, self._sample, self.probe_updates)
-            pair = _room("probe").draw_with_probe(model, decoder, observed)
+            decoder = _room("decoding").fit_decoder(model, self._sample, self.decoder_updates)
+            pair = _room("decoding").draw_latents(model, decoder, observed)
         observed, drawn = pair
         frame_stack = self.frame_stack or frame_stack_of(self.training_env)
         self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))
@@ -372,6 +372,17 @@ class ReconstructionCallback(PeriodicCallback):
         return transitions(self._buffer, rows[chosen], env_inds[chosen]).observations.cpu().numpy()
 
 
+def _true_state(
+    eval_env: gym.Env, state: Callable[[gym.Env], np.ndarray] | None, names: Sequence[str] | None
+) -> tuple[Callable[[gym.Env], np.ndarray], list[str], list[str] | None]:
+    """What tells the true state, its names and its units: what was given, or else dm_control's."""
+    if (state is None) != (names is None):
+        raise ValueError("state and names belong together: a function of the environment, and what it returns.")
+    if state is None or names is None:
+        return physics_state, physics_state_names(eval_env), physics_state_units(eval_env)
+    return state, list(names), None
+
+
 class CuriosityMapCallback(RolloutCallback):
     """
     Map where each policy goes and what SRL error it meets there: ``curiosity_map_<steps>_steps.png``.
@@ -406,12 +417,8 @@ class CuriosityMapCallback(RolloutCallback):
         **kwargs: Any,
     ):
         super().__init__(eval_env, every, **kwargs)
-        if (state is None) != (names is None):
-            raise ValueError("state and names belong together: a function of the environment, and what it returns.")
         self.folder, self.bins = Path(folder), bins
-        self.state = state or physics_state
-        self.names = list(physics_state_names(eval_env) if names is None else names)
-        self.units = physics_state_units(eval_env) if names is None else None
+        self.state, self.names, self.units = _true_state(eval_env, state, names)
         self.coordinates = coordinates or telling_coordinates(self.names)
         check_coordinates(self.coordinates, self.names)
         #: By policy, the states of the last map, [n, d], and their SRL errors, [n]
@@ -446,6 +453,70 @@ class CuriosityMapCallback(RolloutCallback):
             left_out = f"{np.count_nonzero(~good)} of {len(states)} states of the {actor} policy"
             warnings.warn(f"CuriosityMapCallback leaves out {left_out}, which are not finite.", stacklevel=2)
         return states[good], errors[good] if len(errors) else errors
+
+
+class StateProbeCallback(RolloutCallback):
+    """
+    Measure what the latents tell of the true state, which the agent does not see: R² of each coordinate by a linear map
+    (``sb3_cure.evaluation.state_probe``).
+
+    Logs ``probe/<name>`` and their mean ``probe/mean``, and writes ``state_probe.csv``, a row per time, and
+    ``state_probe.png``, bars of the first and of the latest time. In a new training the first row is that of the
+    untrained encoder. By default all rows are of the same episodes of random actions, so that they can be compared.
+
+    :param eval_env: One (not vectorised) environment, not the training one
+    :param folder: Where to write
+    :param every: Agent steps between two rows
+    :param n_episodes: Episodes per policy, two at least
+    :param state: Function of the environment that returns its true state, [d]; by default that of dm_control:
+        positions and velocities of the joints, see ``sb3_cure.envs.physics_state``
+    :param names: Names of what ``state`` returns, [d], to be given with it; none of it is then taken for an angle
+    :param seed: Seed of the first reset and of the random actions each time
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``, whose episodes are read together
+    :param kwargs: ``deterministic``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the names of the files
+    :raises ValueError: if the environment's state is unknown, or ``state`` comes without ``names``
+    :raises ImportError: if matplotlib is not installed
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env,
+        folder: str | Path,
+        every: int = 5000,
+        n_episodes: int = 10,
+        state: Callable[[gym.Env], np.ndarray] | None = None,
+        names: Sequence[str] | None = None,
+        seed: int | None = 0,
+        actors: Sequence[str] = ("random",),
+        **kwargs: Any,
+    ):
+        super().__init__(eval_env, every, n_episodes, seed=seed, actors=actors, **kwargs)
+        self.folder = Path(folder)
+        self.state, self.names, self.units = _true_state(eval_env, state, names)
+        #: One row per time: agent steps and R² by name
+        self.rows: list[dict[str, float]] = []
+        _room("plots")  # a package that is missing is known before training starts
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        if not self.rows and self.num_timesteps == 0:
+            with untouched_randomness(self.model.device):
+                self.on_period()
+
+    def on_period(self) -> None:
+        """Measure, log and draw."""
+        episodes = (episode for actor in self.actors or () for episode in self.run(actor, states=self.state))
+        found = state_probe(self.model, episodes, self.names, self.units)
+        for name, value in {**found, "mean": float(np.nanmean(list(found.values())))}.items():
+            self.logger.record(f"probe/{name}", value)
+        self.rows.append({"timesteps": self.num_timesteps, **found})
+        _room("files").write_csv(_file(self, self.folder, "state_probe.csv"), list(self.rows[0]), self.rows)
+        shown = {f"{row['timesteps']:,} agent steps": row for row in (self.rows[0], self.rows[-1])}
+        _room("plots").state_probe_bars(
+            _file(self, self.folder, "state_probe.png"),
+            {label: {name: row[name] for name in self.names} for label, row in shown.items()},
+            "What a linear map reads of the true state in the latents",
+        )
 
 
 class DiagnosticsCallback(PeriodicCallback):

@@ -55,8 +55,8 @@ class CuRe(OffPolicyAlgorithm):
     :param gamma: Discount factor of the task
     :param train_freq: Agent steps per environment between two calls of ``train``
     :param gradient_steps: Updates per call; -1: as many as agent steps were made
-    :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), a subclass of
-        ``SRLHead``, or None
+    :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), ``"vae"``, ``"spr"``,
+        ``"forward"``, ``"inverse"`` (see ``sb3_cure.srl``), a subclass of ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         agent steps, two updates per step, in turn: after whole periods both were updated as often as simultaneously
@@ -507,7 +507,8 @@ class CuRe(OffPolicyAlgorithm):
             srl.after_step()
         variance = runs[0].latents.detach().var(dim=0, correction=0).mean()
         self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
-        about_next = self.curiosity_target == "next_observation" and not srl.needs_next_latents
+        of_transitions = srl.needs_next_latents or srl.models_transitions
+        about_next = self.curiosity_target == "next_observation" and not of_transitions
         if about_next and self.policy.intrinsic is not None and self.policy.intrinsic.needs_srl:
             with th.no_grad(), self._autocast(srl.mixed_precision):
                 views = self.policy.augmentation(batch.next_observations)

@@ -1,7 +1,7 @@
 """Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
+from sb3_cure.policies import encoder_of
 from sb3_cure.srl import CURL
 
 ACTORS = ("task", "curious", "random")
@@ -261,3 +262,73 @@ def binned_errors(
         return visits, np.full_like(visits, np.nan)
     sums = np.histogram2d(x, y, bins=edges, weights=errors)[0]  # type: ignore[call-overload]
     return visits, np.divide(sums, visits, out=np.full_like(sums, np.nan), where=visits > 0)
+
+
+def state_probe(
+    model: BaseAlgorithm,
+    episodes: Iterable[Episode],
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    ridge: float = 1e-3,
+) -> dict[str, float]:
+    """
+    What a linear map reads of the true state in the latents: R² of each coordinate, by ridge regression.
+
+    Each episode is predicted by the regression on all others, as its neighbours in time would give it away. An angle
+    is predicted as sine and cosine, of which the R² is one: as a number it would jump by a turn. R² is 1 for perfect
+    predictions, 0 for the mean of all states, and below 0 for what is worse than that.
+
+    :param model: A model of any SB3 algorithm with an encoder (``policies.encoder_of``); compare models on the same
+        episodes, such as those of random actions with a seed
+    :param episodes: Two or more, of ``run_episodes(..., states=True)``
+    :param names: Names of the state's coordinates, [d], as of ``sb3_cure.envs.physics_state_names``
+    :param units: Their units, [d], as of ``physics_state_units``: ``"rad"`` marks angles. None: there are none
+    :param ridge: Penalty of the squared weights for latents of variance 1, as a share of the number of observations
+    :return: R² by name; NaN for coordinates that never change
+    :raises ValueError: if the model has no encoder, or episodes have no states, or there is only one
+    """
+    policy: Any = model.policy
+    found = encoder_of(policy)
+    if found is None:
+        raise ValueError(f"the {type(policy).__name__} has no encoder whose latents could be read.")
+    policy.set_training_mode(False)
+    latents, states = [], []
+    for episode in episodes:
+        if len(episode.states) != len(episode.observations):
+            raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
+        seen = th.as_tensor(_as_trained(model, episode.observations), device=model.device)
+        with th.no_grad():
+            latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in seen.split(128)]))
+        states.append(episode.states)
+    if len(states) < 2:
+        raise ValueError("the probe predicts each episode from others, but there is one at most: give more.")
+
+    is_angle = [unit == "rad" for unit in units or [""] * len(names)]
+    columns = np.concatenate(states).T
+    parts = [
+        np.stack([np.sin(column), np.cos(column)], axis=1) if angle else column[:, None]
+        for column, angle in zip(columns, is_angle, strict=True)
+    ]
+    targets, inputs = np.concatenate(parts, axis=1), np.concatenate(latents)
+    owners = np.repeat(np.arange(len(states)), [len(each) for each in states])
+    errors = np.zeros(targets.shape[1])
+    for owner in range(len(states)):
+        own = owners == owner
+        predicted = _ridge(inputs[~own], targets[~own], inputs[own], ridge)
+        errors += np.square(predicted - targets[own]).sum(axis=0)
+    spread = np.square(targets - targets.mean(axis=0)).sum(axis=0)
+    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    result = {}
+    for name, error, total in zip(names, np.split(errors, ends), np.split(spread, ends), strict=True):
+        varies = total.sum() > 1e-9 * len(targets)
+        result[name] = float(1 - error.sum() / total.sum()) if varies else float("nan")
+    return result
+
+
+def _ridge(inputs: np.ndarray, targets: np.ndarray, new_inputs: np.ndarray, penalty: float) -> np.ndarray:
+    """Predictions for new inputs of a ridge regression on standardised inputs."""
+    mean, deviation, middle = inputs.mean(axis=0), inputs.std(axis=0) + 1e-12, targets.mean(axis=0)
+    design = (inputs - mean) / deviation
+    gram = design.T @ design + penalty * len(design) * np.eye(design.shape[1])
+    weights = np.linalg.solve(gram, design.T @ (targets - middle))
+    return (new_inputs - mean) / deviation @ weights + middle

@@ -238,6 +238,8 @@ class CuRePolicy(BasePolicy):
         self.srl = None
         seed = int(th.randint(2**62, ()))
         if srl_class is not None:
+            if srl_class.models_transitions:
+                srl_kwargs = {"action_space": self.action_space, **srl_kwargs}
             with _seeded(seed):
                 self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
             self.srl.bind(self.encoder_target, self.augmentation)

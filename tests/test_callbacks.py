@@ -34,9 +34,10 @@ from sb3_cure.callbacks import (
     PeriodicCallback,
     PolicyVideoCallback,
     ReconstructionCallback,
+    StateProbeCallback,
 )
 from sb3_cure.envs import StackFrames
-from sb3_cure.evaluation import Episode, binned_errors, most_uncomfortable, run_episodes
+from sb3_cure.evaluation import Episode, binned_errors, most_uncomfortable, run_episodes, state_probe
 from sb3_cure.experiments import plots
 from sb3_cure.experiments.video import annotated_frames
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -95,7 +96,7 @@ def test_periods_are_counted_in_agent_steps() -> None:
 
 
 def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
-    """All callbacks, with stochastic policies, a probe and CURL's negatives chosen anew: equal bits afterwards."""
+    """All callbacks, with stochastic policies, decoders and CURL's negatives chosen anew: equal bits afterwards."""
     models = []
     for watched in (False, True):
         callbacks: list[BaseCallback] = []
@@ -103,15 +104,16 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
             env = Filmed(PixelBox())
             callbacks = [
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
-                ReconstructionCallback(tmp_path, 15, probe_updates=2),
+                ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
+                StateProbeCallback(env, tmp_path, 15, n_episodes=2, **MAP),
             ]
         model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12))
         models.append(model.learn(40, callback=callbacks))
     assert names(tmp_path) == sorted(
         [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
         + [f"curiosity_map_{steps}_steps.png" for steps in (15, 30)]
-        + ["reconstructions.png"]
+        + ["reconstructions.png", "state_probe.csv", "state_probe.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
 
@@ -294,7 +296,7 @@ def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
             return True
 
     def watching(folder: str) -> ReconstructionCallback:
-        return ReconstructionCallback(tmp_path / folder, 15, observations, probe_updates=1)
+        return ReconstructionCallback(tmp_path / folder, 15, observations, decoder_updates=1)
 
     def checkpoints() -> ExactCheckpoint:
         return ExactCheckpoint(save_freq=5, path=tmp_path / "checkpoints")
@@ -310,20 +312,20 @@ def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
         np.testing.assert_array_equal(drawn, other)
 
 
-def test_heads_that_do_not_draw_get_a_probe(tmp_path: Path) -> None:
+def test_heads_that_do_not_draw_get_a_decoder(tmp_path: Path) -> None:
     """A decoder fitted to the latents draws; without it nothing is written, and that is said."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl=Silent)
-    probed = ReconstructionCallback(tmp_path / "probe", every=25, probe_updates=30)
-    refused = ReconstructionCallback(tmp_path / "none", every=5, probe_updates=0)
+    fitted = ReconstructionCallback(tmp_path / "fitted", every=25, decoder_updates=30)
+    refused = ReconstructionCallback(tmp_path / "none", every=5, decoder_updates=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model.learn(26, callback=[probed, refused])
+        model.learn(26, callback=[fitted, refused])
     said = [str(warning.message) for warning in caught if "does not reconstruct" in str(warning.message)]
     assert said and "Silent does not reconstruct" in said[0]
-    assert names(tmp_path) == ["probe"] and names(tmp_path / "probe") == ["reconstructions.png"]
-    observed = probed.observations.astype(float)
+    assert names(tmp_path) == ["fitted"] and names(tmp_path / "fitted") == ["reconstructions.png"]
+    observed = fitted.observations.astype(float)
     untouched = np.abs(observed - 128).mean()  # what an untrained decoder is off by: it draws grey
-    assert np.abs(probed.rows[-1][1] - observed).mean() < 0.75 * untouched
+    assert np.abs(fitted.rows[-1][1] - observed).mean() < 0.75 * untouched
 
 
 class Compass(gym.ActionWrapper):
@@ -354,7 +356,7 @@ PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed
 )
 def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], tmp_path: Path) -> None:
     """A decoder makes pictures of its features, another for each observation; training is as without pictures."""
-    callback = ReconstructionCallback(tmp_path, every=20, columns=5, probe_updates=30)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=5, decoder_updates=30)
     watched, alone = make().learn(48, callback=callback), make().learn(48)
     assert [steps for steps, _ in callback.rows] == [20, 40] and names(tmp_path) == ["reconstructions.png"]
     observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1]
@@ -378,7 +380,7 @@ def test_the_latest_observations_serve_where_there_is_no_replay_buffer(
 
     monkeypatch.setattr(callbacks, "LATEST", 12)
     model = Renamed("CnnPolicy", DummyVecEnv([PixelBox] * 2), **PPO_ARGUMENTS)
-    callback = ReconstructionCallback(tmp_path, every=20, columns=40, probe_updates=1)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=40, decoder_updates=1)
     seen: list[np.ndarray] = []
 
     class Note(BaseCallback):
@@ -398,7 +400,7 @@ def test_the_newest_frame_of_a_stack_is_shown(frames: int, tmp_path: Path, monke
     shown: list[np.ndarray] = []
     monkeypatch.setattr(plots, "reconstructions_over_training", lambda _, observed, *__: shown.append(observed))
     env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=frames)]), 3)
-    callback = ReconstructionCallback(tmp_path, every=20, columns=4, probe_updates=1)
+    callback = ReconstructionCallback(tmp_path, every=20, columns=4, decoder_updates=1)
     PPO("CnnPolicy", env, **PPO_ARGUMENTS).learn(32, callback=callback)
     np.testing.assert_array_equal(shown[0], callback.observations[:, -3:])
 
@@ -504,6 +506,41 @@ def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"coordinates are \('pole', 'hinge_1'\).*choose of slider, hinge_1, slider_v"):
         CuriosityMapCallback(env, tmp_path, coordinates=("pole", "hinge_1"))
     env.close()
+
+
+def test_state_probe_over_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A row of the untrained encoder, then one each time, of the same episodes; logged, written, and drawn."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(plots, "state_probe_bars", lambda path, probes, title: drawn.append(probes))
+    model = tiny_model("CnnPolicy", PixelBox())
+    callback = StateProbeCallback(PixelBox(), tmp_path, every=15, n_episodes=3, **MAP)
+    untrained = tiny_model("CnnPolicy", PixelBox())
+    model.learn(35, callback=callback, log_interval=1)
+    rows = [line.split(",") for line in (tmp_path / "state_probe.csv").read_text().splitlines()]
+    assert rows[0] == ["timesteps", "x", "y"] and [row[0] for row in rows[1:]] == ["0", "15", "30"]
+    for trained, row in ((untrained, callback.rows[0]), (model, None)):
+        episodes = list(run_episodes(trained, PixelBox(), 3, "random", states=position, seed=0))
+        expected = state_probe(trained, episodes, ["x", "y"])
+        if row is None:
+            callback.on_period()
+            row = callback.rows[-1]
+            logged = model.logger.name_to_value
+            assert (logged["probe/x"], logged["probe/y"]) == (row["x"], row["y"])
+            assert logged["probe/mean"] == pytest.approx((row["x"] + row["y"]) / 2)
+        assert [row["x"], row["y"]] == pytest.approx([expected["x"], expected["y"]])
+    assert [list(probes) for probes in drawn][-2] == ["0 agent steps", "30 agent steps"]
+    assert drawn[-2]["30 agent steps"] == {"x": callback.rows[2]["x"], "y": callback.rows[2]["y"]}
+    with pytest.raises(ValueError, match="state and names belong together"):
+        StateProbeCallback(PixelBox(), tmp_path, state=position)
+
+
+def test_bars_of_a_state_probe(tmp_path: Path) -> None:
+    """Any number of probes; what is far below zero or unknown still has its number beside it."""
+    found = {"a": 0.9, "b_velocity": -7.0, "c": np.nan}
+    plots.state_probe_bars(tmp_path / "one.png", {"now": found}, "title")
+    plots.state_probe_bars(tmp_path / "two.png", {"first": found, "now": found}, "title")
+    one, two = (np.asarray(Image.open(tmp_path / f"{name}.png").convert("L")) for name in ("one", "two"))
+    assert one.std() > 5 and two.shape[0] > one.shape[0] and two.shape[1] == one.shape[1]
 
 
 @given(

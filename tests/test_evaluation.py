@@ -16,9 +16,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cure.buffers import FrameStackReplayBuffer, Samples
 from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import even_negatives, evenly_measured, most_uncomfortable, run_episodes
+from sb3_cure.evaluation import (
+    Episode,
+    even_negatives,
+    evenly_measured,
+    most_uncomfortable,
+    run_episodes,
+    state_probe,
+)
 from sb3_cure.experiments import plots
-from sb3_cure.experiments.probe import draw_with_probe, fit_probe
+from sb3_cure.experiments.decoding import draw_latents, fit_decoder
 from sb3_cure.metrics import reconstruction_strip
 
 
@@ -153,7 +160,7 @@ def test_reconstructions_show_the_newest_frames_above_what_is_drawn() -> None:
         np.testing.assert_array_equal(cut[:, 36:], drawn[column, 3:])
 
 
-def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
+def test_decoder_draws_from_a_contrastive_encoder_without_training_it() -> None:
     """The encoder is bit-equal before and after; with more updates the drawing comes closer to the observation."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=1), srl="curl").learn(30)
     before = {key: value.clone() for key, value in model.policy.state_dict().items()}
@@ -161,19 +168,19 @@ def test_probe_draws_from_a_contrastive_encoder_without_training_it() -> None:
     for updates in (1, 150):
         th.manual_seed(0)
         np.random.seed(0)
-        decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, updates)
-        observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+        decoder = fit_decoder(model, lambda n: model.replay_buffer.sample(n).observations, updates)
+        observed, drawn = draw_latents(model, decoder, model.replay_buffer.sample(4).observations)
         distances.append(float((observed - drawn).abs().mean()))
     assert distances[1] < 0.5 * distances[0]
     assert all(th.equal(value, before[key]) for key, value in model.policy.state_dict().items())
 
 
-def test_probe_draws_what_the_encoder_sees() -> None:
+def test_decoder_draws_what_the_encoder_sees() -> None:
     """Of crops, pictures of the crops' size."""
     crops: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=30))
     model = tiny_model("CnnPolicy", PixelBox(), srl="curl", **crops).learn(30)
-    decoder = fit_probe(model, lambda n: model.replay_buffer.sample(n).observations, 1)
-    observed, drawn = draw_with_probe(model, decoder, model.replay_buffer.sample(4).observations)
+    decoder = fit_decoder(model, lambda n: model.replay_buffer.sample(n).observations, 1)
+    observed, drawn = draw_latents(model, decoder, model.replay_buffer.sample(4).observations)
     assert observed.shape == drawn.shape == (4, model.observation_space.shape[0], 30, 30)
 
 
@@ -287,3 +294,86 @@ def test_observations_are_normalised_as_in_training() -> None:
     first = model.predict(seen[0], deterministic=True)[0]
     moved = np.clip(episode.observations[0] + 0.3 * first, -1, 1)
     np.testing.assert_allclose(episode.observations[1], moved, atol=1e-6)
+
+
+# ---------------------------------------------------------------- what the latents tell of the true state
+
+
+def probed(latents: list[np.ndarray], states: list[np.ndarray], **kwargs: Any) -> dict[str, float]:
+    """R² from given latents: the encoder is the identity.
+
+    :param latents: Of each episode, [T, k]
+    :param states: Of each episode, [T, d]
+    """
+    model = tiny_model("MlpPolicy", VectorBox())
+    model.policy.encode = lambda observations: observations  # type: ignore[method-assign]
+    none = np.zeros(0)
+    episodes = [Episode(none, none, seen, [], state) for seen, state in zip(latents, states, strict=True)]
+    return state_probe(model, iter(episodes), [f"s{i}" for i in range(states[0].shape[1])], **kwargs)
+
+
+def test_state_probe_against_straight_line_code() -> None:
+    """Each episode by least squares on the others, the penalty as rows of its own (Tikhonov)."""
+    rng = np.random.default_rng(0)
+    latents = [rng.normal(1, [1, 5, 0.2], (n, 3)) for n in (10, 17, 25)]
+    mix = rng.normal(size=(3, 2))
+    states = [each @ mix + rng.normal(0, 2, (len(each), 2)) for each in latents]
+    sums = np.zeros((2, 2))
+    for out in range(3):
+        rest = [index for index in range(3) if index != out]
+        x, y = (np.concatenate([each[index] for index in rest]) for each in (latents, states))
+        deviation = x.std(axis=0)
+        rows = np.vstack([(x - x.mean(axis=0)) / deviation, np.sqrt(0.3 * len(x)) * np.eye(3)])
+        goal = np.vstack([y - y.mean(axis=0), np.zeros((3, 2))])
+        weights = np.linalg.lstsq(rows, goal, rcond=None)[0]
+        predicted = (latents[out] - x.mean(axis=0)) / deviation @ weights + y.mean(axis=0)
+        sums[0] += ((predicted - states[out]) ** 2).sum(axis=0)
+    sums[1] = ((np.concatenate(states) - np.concatenate(states).mean(axis=0)) ** 2).sum(axis=0)
+    expected = 1 - sums[0] / sums[1]
+    assert 0.1 < expected.min() and expected.max() < 0.9
+    assert list(probed(latents, states, ridge=0.3).values()) == pytest.approx(expected.tolist(), rel=1e-6)
+
+
+def test_state_probe_of_what_is_there_and_what_is_not() -> None:
+    """1 for a linear function of the latents, about 0 for noise; of a constant there is nothing to tell."""
+    rng = np.random.default_rng(0)
+    latents = [rng.normal(size=(200, 4)) for _ in range(4)]
+    states = [np.column_stack([each @ [1, 2, 3, 4], rng.normal(size=200), np.full(200, 3.0)]) for each in latents]
+    found = probed(latents, states)
+    assert found["s0"] > 0.999 and abs(found["s1"]) < 0.05 and np.isnan(found["s2"])
+    states[1][7, 1] = np.nan  # which is no reason to lose the others
+    assert probed(latents, states)["s0"] > 0.999
+
+
+def test_state_probe_does_not_know_an_episode_from_itself() -> None:
+    """Latents that only tell which episode it is tell nothing of another one, however alike its own steps are."""
+    rng = np.random.default_rng(0)
+    latents = [np.eye(8)[[index] * 50] for index in range(8)]
+    states = [np.full((50, 1), rng.normal()) + rng.normal(0, 0.01, (50, 1)) for _ in range(8)]
+    assert probed(latents, states)["s0"] < 0.1
+
+
+def test_angles_are_probed_as_directions() -> None:
+    """A latent that turns with the joint tells the angle, also where its number jumps from pi to -pi."""
+    rng = np.random.default_rng(0)
+    turns = [rng.uniform(-np.pi, np.pi, (100, 1)) for _ in range(4)]
+    latents = [np.hstack([np.cos(each), np.sin(each)]) for each in turns]
+    assert probed(latents, turns, units=["rad"])["s0"] > 0.999
+    assert probed(latents, turns, units=["m"])["s0"] < 0.8
+
+
+def test_probe_reads_the_latents_of_the_acting_encoder() -> None:
+    """Of any algorithm with an encoder, changing nothing; what cannot be probed is one sentence."""
+    env = PixelBox()
+    for model in (tiny_model("CnnPolicy", env, srl="curl").learn(12), SAC("CnnPolicy", env, buffer_size=10)):
+        episodes = list(run_episodes(model, env, 3, "random", states=lambda env: env.unwrapped.position, seed=1))
+        before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+        found = state_probe(model, episodes, ["x", "y"])
+        assert found.keys() == {"x", "y"} and np.isfinite(list(found.values())).all()
+        assert not differences(before, dict(model.policy.state_dict()))
+    with pytest.raises(ValueError, match="one at most"):
+        state_probe(model, episodes[:1], ["x", "y"])
+    with pytest.raises(ValueError, match="no true states"):
+        state_probe(model, run_episodes(model, env, 2, "random"), ["x", "y"])
+    with pytest.raises(ValueError, match="no encoder whose latents"):
+        state_probe(SAC("MlpPolicy", VectorBox()), episodes, ["x", "y"])

@@ -20,8 +20,9 @@ from updates_for_tests import (
 )
 
 from sb3_cure import CuReSAC
+from sb3_cure.augmentations import Augmentation
 from sb3_cure.buffers import Samples
-from sb3_cure.srl import CURL, RAE, SRLOutput
+from sb3_cure.srl import CURL, RAE, SRL_HEADS, SRLOutput
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS)
@@ -68,7 +69,7 @@ def test_who_moves_what(name: str, update: str) -> None:
 
 
 @UPDATES
-@pytest.mark.parametrize("algorithm, srl", [("sac", "curl"), ("sac", "rae"), ("tqc", "curl")])
+@pytest.mark.parametrize("algorithm, srl", [("tqc", "curl"), *(("sac", srl) for srl in SRL_HEADS)])
 def test_who_moves_what_from_images(algorithm: str, srl: str, update: str) -> None:
     model = filled_model(algorithm, pixels=True, srl=srl, update=update)
     check_moves(model, *TABLE["all"][1:])
@@ -107,7 +108,7 @@ def test_actors_touch_neither_encoder_critics_nor_head(update: str, task: bool) 
 
 
 @UPDATES
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", SRL_HEADS)
 def test_head_learns_from_its_own_loss_alone(srl: str, update: str) -> None:
     """Its step is the same bit for bit, whether or not there are critics."""
     heads = []
@@ -154,15 +155,26 @@ def test_each_agent_sees_its_own_reward(update: str) -> None:
         ("tqc", False, {}),
         ("tqc", True, {}),
         ("tqc", False, {"curiosity": "bonus"}),
+        ("sac", True, {"srl": "curl"}),
+        ("tqc", False, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
+        ("sac", True, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
+        ("tqc", False, {"srl": "spr"}),
+        ("sac", True, {"srl": "spr"}),
+        ("tqc", False, {"srl": "forward"}),
+        ("sac", True, {"srl": "forward"}),
+        ("tqc", False, {"srl": "inverse"}),
+        ("sac", True, {"srl": "inverse", "augmentation": "shift"}),
+        ("sac", True, {"srl": None, "curiosity": None, "augmentation": "shift"}),
     ],
-    ids=["sac", "sac-episodic", "sac-pixels", "tqc", "tqc-pixels", "tqc-bonus"],
+    ids=lambda value: "-".join(str(each) for each in value.values()) if isinstance(value, dict) else str(value),
 )
 def test_whole_update_equals_straight_line_code(
     algorithm: str, pixels: bool, kwargs: dict[str, Any], update: str
 ) -> None:
     """Every loss, and every parameter, target and temperature after it; nothing of the two agents is equal.
 
-    Of a sequential update each part reads the encoder as the former part has left it.
+    Of a sequential update each part reads the encoder as the former part has left it. Without a head, on shifted
+    images, this is DrQ (Yarats et al., 2021) with one view for the target and one for the critics (K = M = 1).
     """
     model = filled_model(
         algorithm,
@@ -183,6 +195,7 @@ def test_whole_update_equals_straight_line_code(
     prepare(model)
     batch = sampled(model)
     assert 0 < float(batch.dones.sum()) < BATCH
+    assert th.equal(batch.views, batch.observations) == (type(model.policy.augmentation) is Augmentation)
     written_out = StraightLine(model)
     expected = written_out.update(batch, update == "sequential")
     before = StraightLine(model).groups()
@@ -223,7 +236,7 @@ def test_dropped_quantiles_are_read_from_the_model_at_use() -> None:
     assert losses[0] != losses[1]
 
 
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", SRL_HEADS)
 def test_joint_losses_equal_sequential_ones_where_nothing_moves(srl: str) -> None:
     """With learning rate 0 and equal seeds all that is logged is equal to the last bit, but for the shares."""
     logged = []

@@ -25,7 +25,7 @@ from sb3_cure.cure import CuRe
 from sb3_cure.evaluation import run_episodes
 from sb3_cure.metrics import Metrics
 from sb3_cure.policies import CnnPolicy, TrunkActor
-from sb3_cure.srl import SRLHead, SRLOutput
+from sb3_cure.srl import SRL_HEADS, SRLHead, SRLOutput
 
 both_updates = pytest.mark.parametrize("update", ["sequential", "joint"])
 
@@ -178,13 +178,13 @@ def test_actors_and_targets_keep_to_the_clock_of_updates(update: str) -> None:
 
 
 @both_updates
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", SRL_HEADS)
 def test_zero_learning_rate_freezes_everything(srl: str, update: str) -> None:
     """A schedule that is zero moves no parameter, no target and no temperature."""
     model = tiny_model("CnnPolicy", PixelBox(), srl=srl, update=update, learning_rate=lambda _: 0.0)
     names = moved(model, lambda: model.learn(16))
-    # CURL's bank of negatives is stored data.
-    assert names - STATISTICS == ({"srl"} if srl == "curl" else set())
+    # CURL's bank of negatives is stored data; targets are standardised by running statistics.
+    assert names - STATISTICS == ({"srl"} if srl in ("curl", "spr", "forward") else set())
     before = dict(tiny_model("CnnPolicy", PixelBox(), srl=srl, update=update).policy.named_parameters())
     assert differences(before, dict(model.policy.named_parameters())) == []
 
@@ -639,7 +639,7 @@ def test_metrics(update: str) -> None:
     assert sum(last[f"train/encoder_share_{source}"] for source in ("srl", "task", "curious")) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", SRL_HEADS)
 def test_metrics_of_batches_of_one(srl: str) -> None:
     """The smallest batch is legal, and leaves no NaN in the logs."""
     model = tiny_model("CnnPolicy", PixelBox(), srl=srl, batch_size=1)

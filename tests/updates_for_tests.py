@@ -126,9 +126,9 @@ def critic_values(critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[t
 
 
 class StraightLine:
-    """One update of the autoencoder and of both agents under plain gradient descent, written out from the papers.
+    """One update of the head and of both agents under plain gradient descent, written out from the papers.
 
-    :param model: Copied as it is; its head is RAE, its reward the standardised error
+    :param model: Copied as it is; its head is one of ``LOSSES``, its reward the standardised error
     """
 
     def __init__(self, model: CuReSAC):
@@ -143,12 +143,22 @@ class StraightLine:
 
     def groups(self) -> list[th.Tensor]:
         """All parameters and temperatures."""
-        modules = [self.encoder, self.encoder_target, self.head, *self.agents.values()]
+        modules = [
+            self.encoder,
+            self.encoder_target,
+            *self.agents.values(),
+            *([] if self.head is None else [self.head]),
+        ]
         found = [parameter.detach() for module in modules for parameter in module.parameters()]
         return [*found, *(agent.log_ent_coef.detach() for agent in self.agents.values())]
 
+    @th.no_grad()
+    def follow(self, target: nn.Module, online: nn.Module, rate: float) -> None:
+        for old, new in zip(target.parameters(), online.parameters(), strict=True):
+            old.copy_((1 - rate) * old + rate * new)
+
     def descend(self, loss: th.Tensor, module: nn.Module, rate: float) -> None:
-        parameters = list(module.parameters())
+        parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
         gradients = th.autograd.grad(loss, parameters, retain_graph=True)
         with th.no_grad():
             for parameter, gradient in zip(parameters, gradients, strict=True):
@@ -156,12 +166,6 @@ class StraightLine:
 
     def scaled(self, observations: th.Tensor) -> th.Tensor:
         return observations.float() / 255 if observations.dtype == th.uint8 else observations
-
-    def goal(self, observations: th.Tensor) -> th.Tensor:
-        """What the decoder is to draw, its noise drawn in the order in which pixels are."""
-        if observations.dim() != 4:
-            return self.head.target(observations, dither=True)
-        return from_cells(self.head.target(to_cells(observations), dither=True))
 
     def values(self, critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
         return critic_values(critic, latents, actions)
@@ -190,32 +194,34 @@ class StraightLine:
         :param sequential: Whether the encoder steps after each loss, or once on their normalised gradients
         :return: Losses by their logged names
         """
-        obs, next_obs = self.scaled(batch.observations), self.scaled(batch.next_observations)
+        obs = self.scaled(batch.views)
+        self.next_obs = next_obs = self.scaled(self.model.policy.augmentation(batch.next_observations))
         with th.no_grad():
             next_latents = self.encoder_target(next_obs)
-        shared = self.encoder(obs)
-        pulls: list[th.Tensor] = []
+        shared, next_shared = self.encoder(obs), self.encoder(next_obs)
+        pulls: list[list[th.Tensor]] = []
 
-        def learn(loss: th.Tensor, owner: nn.Module, latents: th.Tensor) -> None:
-            (gradient,) = th.autograd.grad(loss, latents, retain_graph=True)
-            along = th.autograd.grad(latents, list(self.encoder.parameters()), gradient, retain_graph=True)
+        def learn(loss: th.Tensor, owner: nn.Module, *read: th.Tensor) -> None:
+            gradients = th.autograd.grad(loss, read, retain_graph=True)
+            along = th.autograd.grad(read, list(self.encoder.parameters()), gradients, retain_graph=True)
             self.descend(loss, owner, self.lr)
             if sequential:
                 with th.no_grad():
                     for parameter, step in zip(self.encoder.parameters(), along, strict=True):
                         parameter.sub_(self.lr * step)
             else:
-                pulls.append(gradient / gradient.norm())
+                size = th.cat(gradients).norm()
+                pulls.append([step / size for step in along])
 
-        latents = shared
-        if batch.observations.dtype == th.uint8:
-            drawn, goal = self.head.decoder(latents), self.goal(batch.observations)
-        else:
-            drawn, goal = self.head.decoder(latents), obs
-        errors = ((drawn - goal) ** 2).flatten(1).mean(dim=1)
-        loss = errors.mean() + 1e-6 * 0.5 * (latents**2).sum(dim=1).mean()
-        found = {"srl_loss": loss}
-        learn(loss, self.head, latents)
+        found: dict[str, th.Tensor] = {}
+        errors = th.zeros(len(obs))
+        if self.head is not None:
+            read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
+            loss, errors = LOSSES[self.model.srl](self, batch, *read)
+            found["srl_loss"] = loss
+            learn(loss, self.head, *read)
+        if self.model.srl == "spr":
+            self.follow(self.head.target_projection, self.head.projection, 0.05)
         errors = errors.detach()
         curious = ((errors - errors.mean()) / errors.std(unbiased=False)).clamp(-5, 5) * self.model.curiosity_beta
         ends = batch.dones[:, 0]
@@ -228,16 +234,12 @@ class StraightLine:
             discounts = self.model.curiosity_gamma * (1 - curious_ends)
             self.learn_agent("curious", batch, curious, discounts, next_latents, learn, found)
         if not sequential:
-            direction = th.autograd.grad(shared, list(self.encoder.parameters()), sum(pulls))
             with th.no_grad():
-                for parameter, step in zip(self.encoder.parameters(), direction, strict=True):
-                    parameter.sub_(self.lr * len(pulls) ** 0.5 * step)
-        with th.no_grad():
-            follow = [(self.encoder_target, self.encoder, self.model.encoder_tau)]
-            follow += [(agent.critic_target, agent.critic, self.model.tau) for agent in self.agents.values()]
-            for target, online, rate in follow:
-                for old, new in zip(target.parameters(), online.parameters(), strict=True):
-                    old.copy_((1 - rate) * old + rate * new)
+                for parameter, *steps in zip(self.encoder.parameters(), *pulls, strict=True):
+                    parameter.sub_(self.lr * len(pulls) ** 0.5 * sum(steps))
+        self.follow(self.encoder_target, self.encoder, self.model.encoder_tau)
+        for agent in self.agents.values():
+            self.follow(agent.critic_target, agent.critic, self.model.tau)
         return {name: float(value.detach()) for name, value in found.items()}
 
     def learn_agent(
@@ -252,7 +254,7 @@ class StraightLine:
     ) -> None:
         """Critic, actor and temperature, with the encoder as it is by now."""
         agent, prefix = self.agents[name], "" if name == "task" else "curious_"
-        obs, next_obs = self.scaled(batch.observations), self.scaled(batch.next_observations)
+        obs, next_obs = self.scaled(batch.views), self.next_obs
         alpha = agent.log_ent_coef.detach().exp()
         with th.no_grad():
             next_actions, next_log_prob = agent.actor.action_log_prob(self.encoder.trunk(next_obs))
@@ -282,3 +284,92 @@ class StraightLine:
         with th.no_grad():  # the first step of any Adam is as long as its learning rate
             agent.log_ent_coef.add_(self.lr * self.model.ent_coef_lr_factor * surplus.sign())
         found[f"{prefix}ent_coef"] = alpha
+
+
+# What each head minimises, written out: its loss, and the error of each sample
+
+
+def rae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Squared error of the dithered image (its noise drawn in the order in which pixels are) and latent penalty."""
+    errors = reconstruction_errors(line, batch, latents)
+    return errors.mean() + 1e-6 * 0.5 * (latents**2).sum(dim=1).mean(), errors
+
+
+def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor) -> th.Tensor:
+    goal = line.scaled(batch.views)
+    if batch.views.dtype == th.uint8:
+        goal = from_cells(line.head.target(to_cells(batch.views), dither=True))
+    return ((line.head.decoder(latents) - goal) ** 2).flatten(1).mean(dim=1)
+
+
+def vae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Squared error of what is drawn from N(latents, sigma^2), and beta times the divergence, as torch computes it."""
+    sigma = (0.5 * linear(latents, line.head.log_variance)).exp()
+    posterior, prior = th.distributions.Normal(latents, sigma), th.distributions.Normal(0.0, 1.0)
+    divergence = th.distributions.kl_divergence(posterior, prior).sum(dim=1)
+    errors = reconstruction_errors(line, batch, latents + sigma * th.randn(latents.shape))
+    return errors.mean() + line.head.beta * divergence.mean(), errors
+
+
+def curl_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Eq. 3 of the paper: -log of exp(q W k+) over the sum of exp(q W k) of all keys."""
+    with th.no_grad():
+        keys = line.encoder_target(line.scaled(line.model.policy.augmentation(batch.observations)))
+    scores = (latents @ line.head.W @ keys.T).exp()
+    errors = -(scores.diagonal() / scores.sum(dim=1)).log()
+    return errors.mean(), errors
+
+
+def spr_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """1 - cosine of predictor(projection(transition)) and of the standardised projection by the moving averages."""
+    head = line.head
+    with th.no_grad():
+        target = standardised(linear(next_keys(line, batch), head.target_projection))
+    predicted = mlp(th.cat([latents, batch.actions], dim=1), head.transition)
+    predicted = linear(linear(predicted, head.projection), head.predictor)
+    errors = 1 - (predicted * target).sum(dim=1) / (predicted.norm(dim=1) * target.norm(dim=1))
+    return errors.mean(), errors
+
+
+def forward_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Squared distance from the standardised next latents of the moving average."""
+    with th.no_grad():
+        target = standardised(next_keys(line, batch))
+    errors = ((mlp(th.cat([latents, batch.actions], dim=1), line.head.model) - target) ** 2).mean(dim=1)
+    return errors.mean(), errors
+
+
+def inverse_loss(
+    line: StraightLine, batch: Samples, latents: th.Tensor, next_latents: th.Tensor
+) -> tuple[th.Tensor, th.Tensor]:
+    """Squared distance from the executed action, with a gradient through both latents."""
+    errors = ((mlp(th.cat([latents, next_latents], dim=1), line.head.model) - batch.actions) ** 2).mean(dim=1)
+    return errors.mean(), errors
+
+
+def linear(inputs: th.Tensor, layer: Any) -> th.Tensor:
+    return inputs @ layer.weight.T + layer.bias
+
+
+def mlp(inputs: th.Tensor, layers: Any) -> th.Tensor:
+    return linear(linear(inputs, layers[0]).clamp(min=0), layers[2])
+
+
+def next_keys(line: StraightLine, batch: Samples) -> th.Tensor:
+    """Latents of another view of the next observations, by the moving average."""
+    return line.encoder_target(line.scaled(line.model.policy.augmentation(batch.next_observations)))
+
+
+def standardised(target: th.Tensor) -> th.Tensor:
+    centred = target - target.mean(dim=0)
+    return centred / ((centred**2).mean(dim=0) + 1e-5) ** 0.5
+
+
+LOSSES: dict[Any, Any] = {
+    "rae": rae_loss,
+    "vae": vae_loss,
+    "curl": curl_loss,
+    "spr": spr_loss,
+    "forward": forward_loss,
+    "inverse": inverse_loss,
+}

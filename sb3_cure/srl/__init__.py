@@ -1,6 +1,6 @@
 """State-representation-learning heads, by name.
 
-``SRLHead`` is the contract; ``"rae"`` and ``"curl"`` are built in; any subclass can be passed as ``srl=``.
+``SRLHead`` is the contract, ``SRL_HEADS`` has the names of what is built in; any subclass can be passed as ``srl=``.
 """
 
 import inspect
@@ -9,8 +9,18 @@ from sb3_cure.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
+from sb3_cure.srl.dynamics import Forward, Inverse
+from sb3_cure.srl.self_prediction import SPR
+from sb3_cure.srl.variational import VAE
 
-SRL_HEADS: dict[str, type[SRLHead]] = {"rae": RAE, "curl": CURL}
+SRL_HEADS: dict[str, type[SRLHead]] = {
+    "rae": RAE,
+    "curl": CURL,
+    "vae": VAE,
+    "spr": SPR,
+    "forward": Forward,
+    "inverse": Inverse,
+}
 
 
 def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
@@ -31,4 +41,16 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
     )
 
 
-__all__ = ["CURL", "RAE", "SRL_HEADS", "PixelDecoder", "SRLHead", "SRLOutput", "get_srl_class"]
+__all__ = [
+    "CURL",
+    "RAE",
+    "SPR",
+    "SRL_HEADS",
+    "VAE",
+    "Forward",
+    "Inverse",
+    "PixelDecoder",
+    "SRLHead",
+    "SRLOutput",
+    "get_srl_class",
+]

@@ -37,6 +37,9 @@ class SRLHead(nn.Module):
     warmup_updates: ClassVar[int] = 0
     #: Whether ``loss`` gets the latents of the next observations, with their gradient, as a third argument
     needs_next_latents: ClassVar[bool] = False
+    #: Whether the error is one of the transition (s, a, s'), whatever ``curiosity_target`` says. Such a head's
+    #: constructor gets the action space, too, as ``action_space=``
+    models_transitions: ClassVar[bool] = False
     #: Whether ``loss`` runs under autocast where the agent computes in bf16. A head that says so computes its error in
     #: fp32 (``sb3_cure.layers.full_precision``): of bf16's eight bits little would be left once it is standardised
     mixed_precision: ClassVar[bool] = False

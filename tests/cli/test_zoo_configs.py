@@ -20,6 +20,9 @@ FOLDER = Path(__file__).parents[2] / "zoo_configs"
 METHODS = {
     "sac_ae": {"srl": "rae", "curiosity": None},
     "curl": {"srl": "curl", "curiosity": None},
+    "vae": {"srl": "vae", "curiosity": None},
+    "spr": {"srl": "spr", "curiosity": None},
+    "drq_single_view": {"srl": None, "curiosity": None},
     "cure_sac_ae": {"srl": "rae", "curiosity": "separate"},
     "cure_curl": {"srl": "curl", "curiosity": "separate"},
 }
@@ -93,13 +96,16 @@ def test_every_entry_is_the_papers_table(method: str, task: str, tmp_path: Path)
     """rl-zoo3 builds each entry: the paper's numbers, action repeats, image sizes, and 500k environment steps."""
     path = FOLDER / f"{method}.yml"
     model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
+    draws = model.srl in ("rae", "vae")
     table = dict(
         **METHODS[method], batch_size=128, buffer_size=80_000, gamma=0.99, learning_starts=1000, tau=0.01,
         encoder_tau=0.05, target_update_interval=2, actor_update_interval=2, ent_coef="auto_0.1", gradient_steps=-1,
-        warmup_updates=1000 if model.srl == "rae" else 0, curiosity_prob=0.2, curiosity_gamma=0.99, curiosity_beta=1.0,
+        warmup_updates=1000 if draws else 0, curiosity_prob=0.2, curiosity_gamma=0.99, curiosity_beta=1.0,
     )  # fmt: skip
     assert {name: getattr(model, name) for name in table} == table
     assert model.lr_schedule(1) == 1e-3
+    if model.srl != "curl":  # whose images are larger
+        assert model.augmentation == ("auto" if draws else "shift")
     assert entry_of(path, task)["policy_kwargs"] == {"net_arch": [1024, 1024]}
     repeat = model.env.get_attr("action_repeat")[0]  # type: ignore[union-attr]
     assert repeat == SIX_TASKS.get(task, 4)
@@ -116,7 +122,7 @@ def test_every_fast_entry_is_the_demos_settings(method: str, task: str, tmp_path
     model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
     own_reward = ("intrinsic", "intrinsic_kwargs", "curiosity_encoder_grad")
     expected = {**{name: value for name, value in SETTINGS.items() if name not in own_reward}, **METHODS[method]}
-    if model.srl == "rae":
+    if model.srl in ("rae", "vae"):
         expected.update(augmentation="auto", augmentation_kwargs={}, warmup_updates=1000)
     assert entry_of(path, task)["policy_kwargs"] == expected.pop("policy_kwargs")
     assert {name: getattr(model, name) for name in expected} == expected
@@ -124,6 +130,8 @@ def test_every_fast_entry_is_the_demos_settings(method: str, task: str, tmp_path
     assert manager.n_timesteps * model.env.get_attr("action_repeat")[0] == 100_000  # type: ignore[union-attr]
 
 
+#: What tells that something was learned: with a head, without one
+LOSS_OF = ("train/srl_loss", "train/critic_loss")
 FILES = [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS]
 TRAINED = [("cure_sac", path) for path in FILES]
 TRAINED += [(algorithm, "cure_sac_ae.yml") for algorithm in zoo.ALGORITHMS if algorithm != "cure_sac"]
@@ -141,7 +149,7 @@ def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
     assert type(model) is zoo.ALGORITHMS[algorithm] and model.num_timesteps == 18
     # The burst, then an update per agent step.
     assert model._n_updates == burst + 8
-    assert float(model.logger.name_to_value["train/srl_loss"]) > 0
+    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
     evaluation = manager.create_envs(1, eval_env=True, no_log=True)
     assert evaluation.observation_space == model.observation_space
     assert evaluation.get_attr("renderer") == ["fast" if "fast/" in path else "dmc"]
@@ -157,7 +165,7 @@ def test_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypa
     manager.learn(model)
     assert (model.num_timesteps, model._n_updates) == (25, 2 + 5)
     assert model.srl == METHODS[path.removeprefix("fast/").removesuffix(".yml")]["srl"]
-    assert float(model.logger.name_to_value["train/srl_loss"]) > 0
+    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))

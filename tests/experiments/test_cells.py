@@ -17,7 +17,7 @@ from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
-from sb3_cure.experiments import cells, media, plots, probe, run, visitation
+from sb3_cure.experiments import cells, decoding, media, plots, run, visitation
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
@@ -364,8 +364,8 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
 def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reconstructed observations are those of all arms, so that their errors compare; and a cell that is drawn is
     trained as one that is not."""
-    fit = probe.fit_probe
-    monkeypatch.setattr(probe, "fit_probe", lambda model, sample, updates: fit(model, sample, 1))  # not 500
+    fit = decoding.fit_decoder
+    monkeypatch.setattr(decoding, "fit_decoder", lambda model, sample, updates: fit(model, sample, 1))  # not 500
     observed, rows, titles = [], [], []
 
     def keep(path: Path, shown: np.ndarray, drawn: Any, title: str) -> None:

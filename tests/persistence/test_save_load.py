@@ -59,7 +59,9 @@ def srl_errors(model: CuReSAC) -> th.Tensor | None:
     if policy.srl is None:
         return None
     images = th.as_tensor(IMAGES)
-    batch = Samples(images, *[None] * 4, views=policy.augmentation.center(images))  # type: ignore[arg-type]
+    actions = th.linspace(-1, 1, 2 * len(images)).view(-1, 2)
+    views = policy.augmentation.center(images)
+    batch = Samples(images, actions, images.flip(0), None, None, views=views)  # type: ignore[arg-type]
     with th.no_grad():
         return policy.srl.error(batch, policy.encode(batch.observations))
 
@@ -111,6 +113,10 @@ def check_save_load(
         ("curl", "separate", "joint"),
         ("curl", "bonus", "sequential"),
         ("curl", "random", "joint"),
+        ("vae", "separate", "sequential"),
+        ("spr", "separate", "joint"),
+        ("forward", "bonus", "sequential"),
+        ("inverse", "separate", "joint"),
         (Denoising, "separate", "joint"),
         (Denoising, "random", "sequential"),
     ],

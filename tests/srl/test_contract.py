@@ -13,7 +13,7 @@ from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_o
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
-from sb3_cure.srl import RAE, SRLHead, SRLOutput, get_srl_class
+from sb3_cure.srl import RAE, SRL_HEADS, SRLHead, SRLOutput, get_srl_class
 
 UPDATES = pytest.mark.parametrize("update", ["joint", "sequential"])
 ENCODER = {"trunk", "projection"}
@@ -240,7 +240,7 @@ def test_after_step_follows_each_update_of_the_head(schedule: str, update: str) 
 # ---------------------------------------------------------------- what belongs to whom
 
 
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", SRL_HEADS)
 def test_head_does_not_own_the_encoder(srl: str) -> None:
     """Its parameters and its state are its own: nothing is trained or saved twice."""
     policy = tiny_model("CnnPolicy", PixelBox(), srl=srl).policy

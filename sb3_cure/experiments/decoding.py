@@ -12,7 +12,7 @@ from sb3_cure.decoders import PixelDecoder
 from sb3_cure.policies import CuRePolicy, encoder_of
 
 
-def fit_probe(model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000) -> nn.Module:
+def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates: int = 1000) -> nn.Module:
     """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
 
     :param model: A model of any SB3 algorithm that learns from images with an encoder (``policies.encoder_of``)
@@ -36,10 +36,10 @@ def fit_probe(model: BaseAlgorithm, sample: Callable[[int], th.Tensor], updates:
 
 
 @th.no_grad()
-def draw_with_probe(model: BaseAlgorithm, decoder: nn.Module, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def draw_latents(model: BaseAlgorithm, decoder: nn.Module, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
     :param model: The model whose latents are drawn
-    :param decoder: Its decoder, of ``fit_probe``
+    :param decoder: Its decoder, of ``fit_decoder``
     :param observations: Observations as stored, 0-255, [B, C, H, W]
     :return: What the encoder sees of them (a crop, say) and what is drawn from its latents, both 0-255, [B, C, h, w]
     """

@@ -1,0 +1,161 @@
+"""Dynamics in the latent space: a forward and an inverse model (Pathak et al., 2017; Lesort et al., 2018, survey)."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
+from torch import nn
+
+from sb3_cure.buffers import Samples
+from sb3_cure.encoders import Encoder
+from sb3_cure.layers import full_precision, init_weights
+from sb3_cure.srl.base import SRLHead, SRLOutput
+
+
+class NextLatents(SRLHead):
+    """Base class of heads that predict the next latents, as the momentum encoder has them, from latents and action.
+
+    Latents that are all alike would be the easiest to predict. Two things keep the encoder from this collapse: the
+    target has no gradient (Tang et al., 2023, say why that helps), and each of its numbers is standardised by mean and
+    variance of the batch, as by BYOL's batch normalisation. To guess the mean is then as bad for small latents as for
+    large ones. A subclass implements ``distance``, and may ``project`` the target, both in fp32.
+
+    :param encoder: The shared encoder
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    """
+
+    mixed_precision = True
+    models_transitions = True
+
+    def __init__(self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box):
+        super().__init__(encoder, observation_space)
+        #: Size of latents and action together
+        self.n_inputs = encoder.features_dim + get_action_dim(action_space)
+        # Running statistics of the target, by which `error` standardises it: within a batch they would change with the
+        # batch.
+        self.register_buffer("mean", th.zeros(encoder.features_dim))
+        self.register_buffer("variance", th.ones(encoder.features_dim))
+
+    def project(self, latents: th.Tensor) -> th.Tensor:
+        """
+        :param latents: Of the next observations, by the momentum encoder, [B, features_dim]
+        :return: What of them is to be predicted, [B, features_dim]
+        """
+        return latents
+
+    def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: Latents and action, [B, n_inputs]
+        :param target: What is to be predicted, standardised, [B, features_dim]
+        :return: Error of each prediction, >= 0, [B]
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement distance(inputs, target)")
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        """
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :param next_latents: Unused
+        :return: Mean error, and the error of each prediction, [B]
+        """
+        error = self._error(batch, latents, self.augment(batch.next_observations), learns=True)
+        return SRLOutput(error.mean(), error.detach())
+
+    @th.no_grad()
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
+        """The same of centred views, with the running statistics of the target.
+
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :return: [B]
+        """
+        return self._error(batch, latents, self.augment.center(batch.next_observations), learns=False)
+
+    def _error(self, batch: Samples, latents: th.Tensor, next_views: th.Tensor, learns: bool) -> th.Tensor:
+        with th.no_grad():
+            following = self.target_encoder(self.preprocess(next_views)).float()
+        with full_precision(latents):
+            with th.no_grad():
+                target = self._standardise(self.project(following), learns)
+            return self.distance(th.cat([latents, batch.actions], dim=1), target)
+
+    def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:
+        """By the batch's statistics, which the running ones follow; or else by these."""
+        mean: th.Tensor = self.mean  # type: ignore[assignment]
+        variance: th.Tensor = self.variance  # type: ignore[assignment]
+        if learns:
+            of_batch = target.mean(dim=0), target.var(dim=0, correction=0)
+            mean.lerp_(of_batch[0], 0.1)
+            variance.lerp_(of_batch[1], 0.1)
+            mean, variance = of_batch
+        return (target - mean) / (variance + 1e-5).sqrt()
+
+
+class Forward(NextLatents):
+    """Forward model: predicts the next latents, with squared error.
+
+    :param encoder: The shared encoder
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    :param hidden_dim: Width of the hidden layer
+    """
+
+    def __init__(
+        self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
+    ):
+        super().__init__(encoder, observation_space, action_space)
+        self.model = _mlp(self.n_inputs, hidden_dim, encoder.features_dim)
+
+    def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: Latents and action, [B, n_inputs]
+        :param target: The next latents, standardised, [B, features_dim]
+        :return: Mean squared error of each prediction: 1 is that of guessing the mean, [B]
+        """
+        return (self.model(inputs) - target).square().mean(dim=1)
+
+
+class Inverse(SRLHead):
+    """Inverse model: predicts the executed action from the latents before and after it, both of which it trains.
+
+    :param encoder: The shared encoder
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    :param hidden_dim: Width of the hidden layer
+    """
+
+    needs_next_latents = True
+    models_transitions = True
+
+    def __init__(
+        self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
+    ):
+        super().__init__(encoder, observation_space)
+        self.model = _mlp(2 * encoder.features_dim, hidden_dim, get_action_dim(action_space))
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        """
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :param next_latents: Those of the next observations, [B, features_dim]
+        :return: Loss, and the mean squared error of each action (scaled to [-1, 1]), [B]
+        """
+        assert next_latents is not None
+        error = (self.model(th.cat([latents, next_latents], dim=1)) - batch.actions).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+    @th.no_grad()
+    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
+        """The same of centred views.
+
+        :param batch: Samples of the replay buffer
+        :param latents: [B, features_dim]
+        :return: [B]
+        """
+        next_views = self.augment.center(batch.next_observations)
+        return self.loss(batch, latents, self.encoder(self.preprocess(next_views)).float()).error
+
+
+def _mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Module:
+    """One hidden layer."""
+    return init_weights(nn.Sequential(nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, n_outputs)))

@@ -1,0 +1,220 @@
+"""What all built-in heads have in common, and what those of transitions need. Losses: ``tests/test_gradients.py``."""
+
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import VectorBox, differences, samples_of, tiny_model
+from gymnasium.wrappers import TimeLimit
+from torch import nn
+from updates_for_tests import filled_model, standardised, train_once
+
+from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.buffers import Samples
+from sb3_cure.envs import physics_state_names, physics_state_units
+from sb3_cure.evaluation import Episode, run_episodes, srl_errors, state_probe
+from sb3_cure.srl import SRL_HEADS, SRLHead, SRLOutput
+
+HEADS = pytest.mark.parametrize("srl", SRL_HEADS)
+OF_TRANSITIONS = pytest.mark.parametrize("srl", ["spr", "forward", "inverse"])
+
+
+def as_in_training(head: SRLHead) -> th.autocast:
+    """As updates with ``precision="bf16"`` run this head."""
+    return th.autocast("cpu", th.bfloat16, enabled=head.mixed_precision)
+
+
+# ---------------------------------------------------------------- the error
+
+
+@HEADS
+@pytest.mark.parametrize("pixels", [True, False])
+def test_error_is_finite_and_not_negative(srl: str, pixels: bool) -> None:
+    """Of every built-in head, in training and where it is measured, in fp32 also where convolutions are not."""
+    if srl == "curl" and not pixels:
+        pytest.skip("compares views of images")
+    model = filled_model(pixels=pixels, srl=srl, precision="bf16", curiosity=None)
+    train_once(model, rl=False)
+    head, batch = model.policy.srl, samples_of(model, 16)
+    latents = model.policy.encode(batch.observations)
+    with as_in_training(head):
+        output = head.loss(batch, latents, *([latents.flip(0)] if head.needs_next_latents else []))
+        measured = head.error(batch, latents)
+    for error in (output.error, measured):
+        assert error.shape == (16,) and error.dtype == th.float32 and not error.requires_grad
+        assert error.isfinite().all() and (error >= 0).all() and error.std() > 0
+
+
+@pytest.mark.parametrize("srl", ["vae", "spr", "forward", "inverse"])
+def test_measured_error_is_that_of_a_transition_alone(srl: str) -> None:
+    """It draws nothing, changes nothing, and does not depend on the other samples."""
+    model = filled_model(pixels=True, srl=srl, augmentation="shift", curiosity=None)
+    train_once(model, rl=False)
+    head, batch = model.policy.srl, samples_of(model, 16)
+    latents = model.policy.encode(batch.observations).detach()
+    before, drawn = copy.deepcopy(model.policy.state_dict()), th.get_rng_state()
+    errors = head.error(batch, latents)
+    assert th.equal(th.get_rng_state(), drawn) and not differences(before, model.policy.state_dict())
+    part = Samples(*(None if column is None else column[3:5] for column in batch))  # type: ignore[arg-type]
+    th.testing.assert_close(head.error(part, latents[3:5]), errors[3:5], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(srl_errors(model, batch), errors, rtol=1e-4, atol=1e-5)
+
+
+class FixedKeys(nn.Module):
+    """A target encoder whose latents do not depend on the images, and hence not on their precision."""
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        return th.rand((len(images), 50), generator=th.Generator().manual_seed(len(images))) - 0.5
+
+
+@pytest.mark.parametrize("srl", ["spr", "forward"])
+def test_predictions_are_computed_in_fp32(srl: str) -> None:
+    """The same within autocast as outside: of bf16 they would differ in the third digit."""
+    model = filled_model(pixels=True, srl=srl, augmentation=None, curiosity=None)
+    head, batch = model.policy.srl, samples_of(model, 16)
+    head.bind(FixedKeys(), model.policy.augmentation)  # type: ignore[arg-type]
+    latents = FixedKeys()(th.zeros(16)).flip(0)
+    exact = head.loss(batch, latents).error
+    with as_in_training(head):
+        within = head.loss(batch, latents).error
+    th.testing.assert_close(within, exact, rtol=1e-6, atol=1e-6)
+
+
+def test_noise_of_the_vae_is_that_of_its_own_variance() -> None:
+    """Measured, it draws from the mean; trained, from N(mean, sigma^2): what is drawn varies as much as that."""
+    model = filled_model(srl="vae", curiosity=None)
+    head: Any = model.policy.srl
+    head.decoder = drawn = nn.Identity()
+    batch = Samples(*[None] * 6, views=th.zeros(20_000, 8))  # type: ignore[arg-type]
+    head.preprocess = lambda views: views
+    with th.no_grad():
+        head.log_variance.bias.copy_(th.linspace(-6, 1, 8))
+    latents = th.full((20_000, 8), 0.5)
+    seen: list[th.Tensor] = []
+    drawn.register_forward_hook(lambda _, inputs, output: seen.append(output))
+    head.loss(batch, latents)
+    head.error(batch, latents)
+    in_training, measured = seen
+    th.testing.assert_close(in_training.mean(dim=0), latents[0], rtol=0, atol=0.05)
+    th.testing.assert_close(in_training.var(dim=0), th.linspace(-6, 1, 8).exp(), rtol=0.05, atol=0)
+    assert th.equal(measured, latents)
+
+
+# ---------------------------------------------------------------- heads of transitions
+
+
+@OF_TRANSITIONS
+def test_error_is_about_the_true_transition(srl: str) -> None:
+    """``curiosity_target`` shows the head nothing else; its error pays the curious agent."""
+    model = filled_model(srl=srl, curiosity_target="next_observation", learning_rate=0.0)
+    shown: list[Samples] = []
+    loss = model.policy.srl.loss
+    model.policy.srl.loss = lambda batch, *given: (shown.append(batch), loss(batch, *given))[1]  # type: ignore
+    logged = train_once(model)
+    ((batch,), sampled) = shown, model.replay_buffer
+    np.random.seed(1)
+    for ours, stored in zip(batch[:4], sampled.sample(len(batch.actions))[:4], strict=True):
+        assert th.equal(ours, stored)
+    assert logged["curious_reward_raw_mean"] == logged["srl_error"]
+
+
+def test_users_head_of_transitions_knows_the_actions() -> None:
+    """It declares what it is, and is given the action space; other heads are built as ever."""
+
+    class Model(SRLHead):
+        models_transitions = True
+
+        def __init__(self, encoder: Any, observation_space: Any, action_space: gym.spaces.Box, width: int):
+            super().__init__(encoder, observation_space)
+            self.layer = nn.Linear(encoder.features_dim, width * action_space.shape[0])
+
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            error = self.layer(latents).square().mean(dim=1)
+            return SRLOutput(error.mean(), error.detach())
+
+    model = tiny_model("MlpPolicy", VectorBox(), srl=Model, srl_kwargs={"width": 3}).learn(12)
+    assert model.policy.srl.layer.out_features == 6 and model.srl_kwargs == {"width": 3}
+
+
+@pytest.mark.parametrize("srl", ["spr", "forward"])
+def test_targets_get_no_gradient(srl: str) -> None:
+    """Neither the momentum encoder nor the moving average of the projection is trained by gradients."""
+    model = filled_model(pixels=True, srl=srl, curiosity=None)
+    head, batch = model.policy.srl, samples_of(model, 8)
+    target = head.target_encoder.requires_grad_(True)
+    latents = model.policy.encode(batch.observations).detach().requires_grad_()
+    head.loss(batch, latents).loss.backward()
+    assert latents.grad is not None and latents.grad.any()
+    frozen = [*target.parameters(), *(getattr(head, "target_projection", nn.Module()).parameters())]
+    assert frozen and all(parameter.grad is None for parameter in frozen)
+
+
+@pytest.mark.parametrize("size", [1e-2, 1.0])
+@pytest.mark.parametrize("srl", ["spr", "forward"])
+def test_small_latents_are_no_easier_to_predict(srl: str, size: float) -> None:
+    """The target is standardised; else a collapsed encoder would be the best one. By the batch, or as was seen."""
+    model = filled_model(srl=srl, curiosity=None)
+    head: Any = model.policy.srl
+    head.project = lambda latents: latents
+    seen: list[th.Tensor] = []
+    head.distance = lambda inputs, target: (seen.append(target), target.square().mean(dim=1))[1]
+    latents = 0.3 + size * th.randn(64, 8, generator=th.Generator().manual_seed(0))
+    head.target_encoder.forward = lambda views: latents
+    batch = samples_of(model, 64)
+    for _ in range(200):
+        head.loss(batch, latents)
+    th.testing.assert_close(seen[0], standardised(latents))
+    assert float(seen[0].var()) > 0.8
+    head.error(batch, latents)
+    th.testing.assert_close(seen[-1], seen[0], rtol=1e-3, atol=1e-3)
+
+
+# ---------------------------------------------------------------- what they learn
+
+#: Updates, batch and learning rate after which latents tell the positions
+LEARNS = {"vae": (700, 32, 2e-3), "spr": (400, 48, 1e-3), "forward": (300, 32, 2e-3), "inverse": (200, 32, 2e-3)}
+
+
+def cups() -> gym.Env:
+    """Short episodes, so that there are many starts."""
+    return TimeLimit(make_dmc_env("ball_in_cup", "catch", image_size=36, grayscale=True, renderer="fast"), 25)
+
+
+def model_of_cups(env: gym.Env, srl: str, **kwargs: Any) -> CuReSAC:
+    small = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=8))
+    return tiny_model("CnnPolicy", env, srl=srl, curiosity=None, policy_kwargs=small, buffer_size=1000, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def real_frames() -> Iterator[tuple[gym.Env, Any, list[Episode]]]:
+    """An environment of DeepMind Control, 1000 random transitions of it, and other episodes with their states."""
+    env = cups()
+    model = model_of_cups(env, "rae", learning_starts=1000).learn(1000)
+    yield env, model.replay_buffer, list(run_episodes(model, env, 20, "random", states=True, seed=7))
+    env.close()
+
+
+@pytest.mark.parametrize("srl", LEARNS)
+def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[Episode]]) -> None:
+    """The positions of cup and ball, from images, by a linear map: far better than those of the untrained encoder.
+
+    Trained by the head alone, in which a collapse of the latents would show, too.
+    """
+    env, buffer, episodes = real_frames
+    updates, batch_size, learning_rate = LEARNS[srl]
+    model = model_of_cups(env, srl, learning_rate=learning_rate).learn(1)
+    model.replay_buffer = buffer
+    model._phase = lambda: (True, False)  # type: ignore[method-assign]
+
+    def r2_of_positions() -> float:
+        found = state_probe(model, episodes, physics_state_names(env), physics_state_units(env))
+        return float(np.mean([found[name] for name in ("cup_x", "cup_z", "ball_x", "ball_z")]))
+
+    untrained = r2_of_positions()
+    model.train(updates, batch_size)
+    trained = r2_of_positions()
+    assert untrained < 0.15 and trained > 0.4, (untrained, trained)
