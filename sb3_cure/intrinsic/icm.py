@@ -9,7 +9,7 @@ from torch import nn
 
 from sb3_cure.buffers import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
-from sb3_cure.intrinsic.networks import make_mlp, make_network, scaled
+from sb3_cure.intrinsic.networks import MLP, make_network, scaled
 from sb3_cure.layers import full_precision
 
 
@@ -46,8 +46,8 @@ class ICM(IntrinsicReward):
             raise ValueError(f"encoder is {encoder!r} in intrinsic_kwargs: choose 'shared' or 'own'.")
         self.observation_space = observation_space
         action_dim = get_action_dim(action_space)
-        self.forward_model = make_mlp([features_dim + action_dim, hidden_dim, features_dim])
-        self.inverse_model = make_mlp([2 * features_dim, hidden_dim, action_dim])
+        self.forward_model = MLP([features_dim + action_dim, hidden_dim, features_dim])
+        self.inverse_model = MLP([2 * features_dim, hidden_dim, action_dim])
         self.encoder: nn.Sequential | None = None
         if encoder == "own":
             self.reads, self.trains_encoder, self.mixed_precision = (), False, True

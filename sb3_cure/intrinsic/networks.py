@@ -27,17 +27,27 @@ def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
     return preprocess(observations, space).flatten(1)
 
 
-def make_mlp(sizes: Iterable[int]) -> nn.Sequential:
-    """
+class MLP(FullPrecision):
+    """Linear maps with ReLUs in between, in fp32, whatever convolutions before them compute in.
+
     :param sizes: Of the input, the hidden layers and the output
-    :return: Linear maps with ReLUs in between, in fp32
     """
-    layers = [layer for pair in itertools.pairwise(sizes) for layer in (nn.Linear(*pair), nn.ReLU())]
-    return init(FullPrecision(*layers[:-1]))
+
+    def __init__(self, sizes: Iterable[int]):
+        layers = [layer for pair in itertools.pairwise(sizes) for layer in (nn.Linear(*pair), nn.ReLU())]
+        super().__init__(*layers[:-1])
+        init(self)
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [B, n]
+        :return: fp32, [B, m]
+        """
+        return super().forward(inputs.float())
 
 
 def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 32, n_layers: int = 3) -> nn.Sequential:
-    """A network of what ``scaled`` returns: convolutions of stride 2 if these are images, then ``make_mlp``.
+    """A network of what ``scaled`` returns: convolutions of stride 2 if these are images, then ``MLP``.
 
     :param space: Space of the observations
     :param sizes: Of the hidden layers and the output
@@ -46,14 +56,14 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 32,
     :return: The network
     """
     if not is_image_space(space, check_channels=False):
-        return make_mlp([get_flattened_obs_dim(space), *sizes])
+        return MLP([get_flattened_obs_dim(space), *sizes])
     channels, *size = space.shape  # type: ignore[misc]
     layers: list[nn.Module] = []
     for _ in range(n_layers):
         layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
         channels, size = n_filters, [(side + 1) // 2 for side in size]
     network = init(nn.Sequential(*layers, FlattenImage()))
-    network.append(make_mlp([n_filters * math.prod(size), *sizes]))
+    network.append(MLP([n_filters * math.prod(size), *sizes]))
     return network.to(memory_format=th.channels_last)  # type: ignore[call-overload, no-any-return]
 
 

@@ -22,6 +22,10 @@ METHODS = {
     "curl": {"srl": "curl", "curiosity": None},
     "cure_sac_ae": {"srl": "rae", "curiosity": "separate"},
     "cure_curl": {"srl": "curl", "curiosity": "separate"},
+    **{
+        name: {"srl": "rae", "curiosity": "separate", "intrinsic": name}
+        for name in ("rnd", "icm", "disagreement", "particle")
+    },
 }
 # Task: action repeat
 SIX_TASKS = {

@@ -132,6 +132,19 @@ def test_trains_without_a_task_and_in_pretraining(arm: str, pixels: bool) -> Non
     model.learn(14)
 
 
+@every_reward
+def test_bf16_changes_rewards_by_its_rounding(arm: str) -> None:
+    """What reads images may run in it; the reward is fp32."""
+    found = []
+    for precision in ("fp32", "bf16"):
+        model = filled_model(pixels=True, precision=precision, learning_rate=0.0, **ARMS[arm])
+        found.append(captured(model))
+        train_once(model)
+    (exact,), (rounded,) = found
+    assert rounded.dtype == th.float32 and not th.equal(exact, rounded)
+    th.testing.assert_close(rounded.mean(), exact.mean(), rtol=0.1, atol=1e-4)
+
+
 def test_rewards_draw_from_no_common_stream() -> None:
     """So that arms of one seed are paired: torch and NumPy go on alike after the same number of updates."""
     nexts = []
