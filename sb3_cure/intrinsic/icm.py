@@ -38,7 +38,7 @@ class ICM(IntrinsicReward):
         action_space: spaces.Box,
         features_dim: int,
         encoder: str = "shared",
-        n_filters: int = 32,
+        n_filters: int = 16,
         hidden_dim: int = 256,
     ):
         super().__init__(observation_space, action_space, features_dim)

@@ -46,7 +46,7 @@ class MLP(FullPrecision):
         return super().forward(inputs.float())
 
 
-def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 32, n_layers: int = 3) -> nn.Sequential:
+def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16, n_layers: int = 3) -> nn.Sequential:
     """A network of what ``scaled`` returns: convolutions of stride 2 if these are images, then ``MLP``.
 
     :param space: Space of the observations

@@ -46,7 +46,7 @@ class Particle(IntrinsicReward):
         space: str = "random",
         n_neighbours: int = 12,
         memory: int = 512,
-        n_filters: int = 32,
+        n_filters: int = 16,
     ):
         super().__init__(observation_space, action_space, features_dim)
         if space not in ("random", "latents"):

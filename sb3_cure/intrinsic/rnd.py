@@ -46,7 +46,7 @@ class RND(IntrinsicReward):
         action_space: spaces.Box,
         features_dim: int,
         frame_stack: int = 1,
-        n_filters: int = 32,
+        n_filters: int = 16,
         n_outputs: int = 128,
         hidden_dim: int = 256,
     ):

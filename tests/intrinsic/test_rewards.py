@@ -34,6 +34,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "particle, latents": dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents", memory=20)),
     "shuffled rnd": dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="rnd", n_filters=4)),
 }
+BOUTS: dict[str, Any] = {"coin": 1, "long": 10, "whole": "episode"}
 every_reward = pytest.mark.parametrize("arm", ARMS)
 
 
@@ -175,10 +176,11 @@ def test_optimiser_has_what_is_trained_and_the_encoder_what_is_declared(arm: str
 def test_grids_pass_rewards_and_bouts_on(tmp_path: Path) -> None:
     """Arguments of a YAML file reach the mixer and the reward."""
     kwargs = {"of": "rnd", "hidden_dim": 8}
-    arm = method(intrinsic="shuffled", intrinsic_kwargs=kwargs, curiosity_bout=10)
-    (cell,) = load_grid(write_grid(tmp_path, methods={"arm": arm})).cells
-    model = cell.make_model(PixelBox())
-    assert model.curiosity_bout == 10
+    arms = {name: method(intrinsic="shuffled", intrinsic_kwargs=kwargs, curiosity_bout=L) for name, L in BOUTS.items()}
+    cells = load_grid(write_grid(tmp_path, methods=arms)).cells
+    models = {cell.method: cell.make_model(PixelBox()) for cell in cells}
+    assert {name: model.curiosity_bout for name, model in models.items()} == BOUTS
+    model = models["long"]
     assert type(reward_of(model).of) is INTRINSIC_REWARDS["rnd"]
     assert reward_of(model).of.predictor[-1][-1].in_features == 8
 
