@@ -175,7 +175,8 @@ def visits(arm: str, seed: int, steps: int) -> dict[str, float]:
 
 
 def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
-    """
+    """A part of ``make bench``, in the first of the small settings there.
+
     :param repeats: Rounds that count
     :return: By reward: milliseconds of an update, and how many more these are than with the error of the same head
     """
@@ -228,7 +229,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=2, help="seeds of each reward (default: 2)")
     parser.add_argument("--updates", type=int, default=300, help="updates before rewards are compared (default: 300)")
     parser.add_argument("--steps", type=int, default=1000, help="agent steps of each visit (default: 1000)")
-    parser.add_argument("--costs", action="store_true", help="measure milliseconds, too: leave the machine alone")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     measures = {"paid": partial(paid, updates=options.updates), "visits": partial(visits, steps=options.steps)}
@@ -242,8 +242,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         (options.out / "table.md").write_text("\n".join([*table(rows), ""]))
     settings = {"seeds": options.seeds, "updates": options.updates, "steps": options.steps}
     write_json(options.out / "run.json", {**describe_run(), "settings": settings})
-    if options.costs:
-        write_json(options.out / "costs.json", {**describe_run(), "milliseconds": costs()})
     return 0
 
 

@@ -238,6 +238,11 @@ def test_rnd_is_the_error_on_the_whitened_newest_frame(pixels: bool) -> None:
     for _ in range(20):
         train_once(model)
     assert float(found[-1].mean()) < 0.8 * float(found[0].mean())
+    space: Any = model.observation_space
+    for _ in range(10):  # unlike any before
+        new = space.sample()[None]
+        buffer.add(new, new, np.zeros((1, 2)), np.zeros(1), np.ones(1), [{}])  # type: ignore[union-attr]
+    train_once(model)
     assert th.equal(reward.mean, mean)
 
 
