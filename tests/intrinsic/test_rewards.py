@@ -493,6 +493,12 @@ def test_shuffled_is_the_other_reward_for_the_wrong_samples(of: str) -> None:
     assert not th.equal(*orders)
 
 
+def test_shuffled_draws_apart_from_what_it_shuffles() -> None:
+    model = filled_model(intrinsic="shuffled", intrinsic_kwargs=dict(of="disagreement"))
+    generators = [reward_of(model).random.generator, reward_of(model).of.random.generator]
+    assert not th.equal(*(th.rand(4, generator=each) for each in generators))
+
+
 # ---------------------------------------------------------------- what they seek
 
 
