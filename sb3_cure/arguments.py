@@ -72,7 +72,8 @@ def check_arguments(model: Any) -> None:
 
 def _check_combinations(model: Any) -> None:
     """What would train something else than what was asked for, without a word."""
-    reward, curious = get_intrinsic_class(model.intrinsic), model.curiosity in ("separate", "bonus")
+    reward = get_intrinsic_class(model.intrinsic).configured(**model.intrinsic_kwargs)
+    curious = model.curiosity in ("separate", "bonus")
     if model.srl is None and model.srl_kwargs:
         raise ValueError(f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.")
     if model.srl is not None:

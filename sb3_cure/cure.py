@@ -62,7 +62,8 @@ class CuRe(OffPolicyAlgorithm):
         agent steps, two updates per step, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Updates of the counter per phase when alternating
     :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), ``"reconstruction"`` (what
-        the latents do not hold of the image, for any head), or a subclass of ``IntrinsicReward``
+        the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"disagreement"``, ``"particle"``,
+        ``"shuffled"`` (another one without its information, as a control), or a subclass of ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
         task's; ``"random"``: the second actor draws uniform actions (control); None: off
@@ -262,9 +263,12 @@ class CuRe(OffPolicyAlgorithm):
     def _policy_choices(self) -> dict[str, Any]:
         """What this algorithm's own arguments ask of the policy."""
         intrinsic = get_intrinsic_class(self.intrinsic) if self.curiosity in ("separate", "bonus") else None
+        declared = IntrinsicReward if intrinsic is None else intrinsic.configured(**self.intrinsic_kwargs)
+        frame_stack = self.replay_buffer_kwargs.get("frame_stack", 1)
+        told = {"frame_stack": frame_stack, "curiosity_target": self.curiosity_target}
         sources = {
             "srl": self.srl is not None,
-            "intrinsic": intrinsic is not None and intrinsic.trains_encoder,
+            "intrinsic": declared.trains_encoder,
             "task": self.task,
             "curious": self._has_curious_agent and self.curiosity_encoder_grad,
         }
@@ -274,7 +278,7 @@ class CuRe(OffPolicyAlgorithm):
             augmentation=self.augmentation,
             augmentation_kwargs=self.augmentation_kwargs,
             intrinsic_class=intrinsic,
-            intrinsic_kwargs=self.intrinsic_kwargs,
+            intrinsic_kwargs={**{name: told[name] for name in declared.asks}, **self.intrinsic_kwargs},
             curious=self._has_curious_agent,
             encoder_sources=tuple(name for name, trains in sources.items() if trains),
             update=self.update,
@@ -525,6 +529,7 @@ class CuRe(OffPolicyAlgorithm):
 
         :return: Scaled reward, [B, 1]
         """
+        intrinsic.attach(self.replay_buffer, self._vec_normalize_env, self._encode_centred)  # type: ignore[arg-type]
         read = self._read_centred(batch, intrinsic)
         latents, next_latents = [read[name][1] if name in read else None for name in ("latents", "next_latents")]
         with self._autocast(intrinsic.mixed_precision):
@@ -547,16 +552,20 @@ class CuRe(OffPolicyAlgorithm):
 
     def _read_centred(self, batch: Samples, intrinsic: IntrinsicReward) -> dict[str, Read]:
         """The latents that a reward reads, of centred views, by the online encoder."""
-        encoder, policy, read = self.policy.encoder_update, self.policy, {}
+        encoder, read = self.policy.encoder_update, {}
         for name in intrinsic.reads:
-            if type(policy.augmentation) is Augmentation:  # then the views that all others see are the centred ones
+            if type(self.policy.augmentation) is Augmentation:  # then all others see the centred views, too
                 latents = (encoder.run() if name == "latents" else encoder.next_run()).latents
             else:
                 observations = batch.observations if name == "latents" else batch.next_observations
-                with th.set_grad_enabled(intrinsic.trains_encoder), self._autocast():
-                    latents = policy.encode(observations).float()
+                latents = self._encode_centred(observations, intrinsic.trains_encoder)
             read[name] = _read(latents, intrinsic.trains_encoder)
         return read
+
+    def _encode_centred(self, observations: th.Tensor, gradient: bool = False) -> th.Tensor:
+        """Latents of centred views by the online encoder, fp32, [n, features_dim]."""
+        with th.set_grad_enabled(gradient), self._autocast():
+            return self.policy.encode(observations).float()
 
     def _task_return(self, batch: Samples, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """The task's rewards, of one step or of n, and the discount of what follows them, [B, 1] each."""

@@ -259,7 +259,8 @@ class CuRePolicy(BasePolicy):
                 self.encoder.features_dim,
                 **kwargs,
             )
-        parameters = list(self.intrinsic.parameters())
+        self.intrinsic.bind(self.srl)
+        parameters = [parameter for parameter in self.intrinsic.parameters() if parameter.requires_grad]
         self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
 
     def _make_actor_critic(self) -> ActorCritic:

@@ -219,12 +219,13 @@ class Pretraining(CuRe):
     def _add_curious_agent(self) -> None:
         """For this pretraining alone."""
         policy = self.policy
-        policy.add_curious_agent(self._policy_choices()["intrinsic_class"], self.intrinsic_kwargs)
+        choices = self._policy_choices()
+        policy.add_curious_agent(choices["intrinsic_class"], choices["intrinsic_kwargs"])
         policy.to(self.device)
         if self._compiles:
             policy.compile_networks()
         update = policy.encoder_update
-        for source in self._policy_choices()["encoder_sources"]:
+        for source in choices["encoder_sources"]:
             if source not in update.mean_squares:
                 update.add_source(source)
         self._setup_curious_temperature()

@@ -97,6 +97,22 @@ def test_curious_stretches_average_their_bout(bout: float, p: float) -> None:
     assert chosen.mean() == pytest.approx(p, abs=5 * np.sqrt(p * (1 - p) * 2 * bout / chosen.size))
 
 
+@pytest.mark.parametrize("n_envs", [1, 4])
+@pytest.mark.parametrize("bout", [1, 10, 60, "episode"])
+@pytest.mark.parametrize("p", [0.2, 0.5])
+def test_share_of_steps_is_the_probability_in_short_episodes(p: float, bout: Any, n_envs: int) -> None:
+    """Of 125 steps, in which long bouts are cut off: within binomial bounds for as many draws as are independent."""
+    episodes = 400
+    chosen = choices(CuriousMixer(seed=4), 125 * episodes, n_envs, p, bout, length=125)
+    # Neighbouring steps are alike with probability 1 - 1/L: 2 L - 1 of them count as one, but no more than an episode.
+    alike = 125 if bout == "episode" else min(2 * bout - 1, 125)
+    for environment in chosen.T:
+        draws = 125 * episodes / alike
+        assert_binomial(environment.mean() * draws, draws, p)
+    first = chosen[::125]  # the share does not depend on how far an episode is
+    assert_binomial(first.sum(), first.size, p)
+
+
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0, 1), st.integers(2, 9))
 @settings(deadline=None, max_examples=30)
 def test_bouts_of_episodes_change_at_resets_only(seed: int, n_envs: int, p: float, length: int) -> None:
@@ -228,3 +244,17 @@ def test_episode_bouts_in_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
     first, rest = curious[:10], curious[10:].reshape(10, 20, 3)
     assert (first == first[0]).all() and (rest == rest[:, :1]).all()
     assert 0 < rest[:, 0].mean() < 1
+
+
+@pytest.mark.parametrize("bout", [1, 6, "episode"])
+def test_logged_bout_is_the_mean_as_it_happened(bout: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the stretches of each environment, which resets cut: after 10 steps, then every 20."""
+    model, curious, _ = rollout(210, monkeypatch, curiosity_prob=0.4, curiosity_bout=bout)
+    episodes = np.split(curious, range(10, 210, 20))
+    runs = [len(run) for each in episodes for env in each.T for run in "".join(map(str, env.astype(int))).split("0")]
+    lengths = [length for length in runs if length > 0]
+    written: dict[str, float] = {}
+    monkeypatch.setattr(model.logger, "record", lambda key, value, *rest, **kwargs: written.update({key: value}))
+    model.dump_logs()
+    assert written["rollout/curious_bout"] == pytest.approx(np.mean(lengths))
+    assert written["rollout/curious_share"] == pytest.approx(curious.mean())

@@ -1,20 +1,25 @@
 """The contract between the agent and an intrinsic reward, and how rewards are scaled."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cure.buffers import Samples
+from sb3_cure.srl.base import SRLHead
 
 
 class IntrinsicReward(nn.Module):
     """What the curious agent is rewarded for. Subclass it, implement ``loss``, and pass the class as ``intrinsic=``.
 
     The reward is computed afresh for each sampled batch, so that it is never stale. Targets, statistics and memories
-    belong into buffers, which are saved; random numbers come from a generator of its own, so that runs of one seed
-    that differ in their reward alone draw alike elsewhere.
+    belong into buffers, which are saved; random numbers come from a generator of its own (``OwnGenerator``), so that
+    runs of one seed that differ in their reward alone draw alike elsewhere. What is declared below may depend on
+    arguments: set it on ``self``, and let ``configured`` tell it before there is an object.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
@@ -22,20 +27,48 @@ class IntrinsicReward(nn.Module):
     """
 
     #: Whether the reward is made of the SRL error, so that ``srl=None`` is refused
-    needs_srl: ClassVar[bool] = False
+    needs_srl: bool = False
     #: Which of ``"latents"`` and ``"next_latents"`` the reward reads; the other ones are None
-    reads: ClassVar[tuple[str, ...]] = ()
+    reads: tuple[str, ...] = ()
     #: Whether the latents keep their graph, so that this loss trains the encoder, too
-    trains_encoder: ClassVar[bool] = False
+    trains_encoder: bool = False
     #: Whether ``loss`` runs under autocast where the agent computes in bf16; the reward itself is fp32
-    mixed_precision: ClassVar[bool] = False
+    mixed_precision: bool = False
     #: Whether policies are measured by ``error`` rather than by the SRL error
-    measures: ClassVar[bool] = False
+    measures: bool = False
+    #: What the constructor is told of the agent unless ``intrinsic_kwargs`` says otherwise: ``"frame_stack"`` (frames
+    #: per image that the replay buffer knows of, else 1), ``"curiosity_target"``
+    asks: ClassVar[tuple[str, ...]] = ()
     #: Optimiser of the reward's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, features_dim: int):
         super().__init__()
+
+    @classmethod
+    def configured(cls, **kwargs: Any) -> "type[IntrinsicReward]":
+        """
+        :param kwargs: The reward's arguments
+        :return: The class whose ``needs_srl``, ``trains_encoder`` and ``asks`` hold with them
+        """
+        return cls
+
+    def bind(self, srl: SRLHead | None) -> None:
+        """Called once by the policy.
+
+        :param srl: The SRL head, if there is one
+        :raises ValueError: if it is not one that the reward can be made of
+        """
+
+    def attach(
+        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
+    ) -> None:
+        """Called by the algorithm before each ``loss``, for rewards that look beyond the batch.
+
+        :param replay_buffer: The replay buffer, which has just drawn the batch
+        :param env: What it normalises with
+        :param encode: The online encoder: latents, [n, features_dim], of centred views of stored observations
+        """
 
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
@@ -65,6 +98,30 @@ class IntrinsicReward(nn.Module):
         :return: Observations as drawn (images in 0-255), or None if nothing is drawn
         """
         return None
+
+
+class OwnGenerator(nn.Module):
+    """Random numbers of a reward's own; their state is saved with its parameters.
+
+    :param stream: Number of the stream, so that two rewards that work together draw differently
+    """
+
+    def __init__(self, stream: int = 0):
+        super().__init__()
+        # While a reward is built, torch's seed is one that is the same under every reward.
+        self.generator = th.Generator().manual_seed(th.initial_seed() + stream)
+
+    def get_extra_state(self) -> th.Tensor:
+        """
+        :return: State of the generator
+        """
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        """
+        :param state: Of ``get_extra_state``
+        """
+        self.generator.set_state(state.cpu())
 
 
 class RewardScale(nn.Module):

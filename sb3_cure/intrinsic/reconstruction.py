@@ -1,7 +1,5 @@
 """What the latents do not hold of the image: the paper's idea for heads that do not draw."""
 
-from typing import ClassVar
-
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
@@ -9,7 +7,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from sb3_cure.buffers import Samples
 from sb3_cure.decoders import PixelDecoder, VectorDecoder, squared_error
 from sb3_cure.intrinsic.base import IntrinsicReward
-from sb3_cure.layers import preprocess
+from sb3_cure.intrinsic.networks import scaled
 
 
 class Reconstruction(IntrinsicReward):
@@ -25,7 +23,7 @@ class Reconstruction(IntrinsicReward):
     :param n_layers: Its transposed convolutions; small images allow fewer
     """
 
-    reads: ClassVar[tuple[str, ...]] = ("next_latents",)
+    reads = ("next_latents",)
     mixed_precision = True
     measures = True
 
@@ -82,6 +80,6 @@ class Reconstruction(IntrinsicReward):
         return squared_error(self.decoder, latents, observations, self._target)
 
     def _target(self, observations: th.Tensor) -> th.Tensor:
-        if observations.dim() == 4:
+        if observations.dim() == 4:  # in the order in which it is drawn
             return observations.float().div_(255).sub_(0.5)
-        return preprocess(observations, self.observation_space).flatten(1)
+        return scaled(observations, self.observation_space)

@@ -29,13 +29,18 @@ class CURL(SRLHead):
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images
     :param bank_size: How many stored observations serve as fixed negatives in ``error``
-    :raises ValueError: if observations are no images
+    :param error: What the SRL error is: ``"infonce"``, the loss of each anchor, which is high where others of the batch
+        look alike; ``"positive"``, the mean squared difference between the latents of the two views alone
+    :raises ValueError: if observations are no images, or for another error
     """
 
     mixed_precision = True
 
-    def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64):
+    def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64, error: str = "infonce"):
         super().__init__(encoder, observation_space)
+        if error not in ("infonce", "positive"):
+            raise ValueError(f"error is {error!r} in srl_kwargs: choose 'infonce' or 'positive'.")
+        self.positive = error == "positive"
         # CURL starts W uniform in [0, 1).
         self.W = nn.Parameter(th.rand(encoder.features_dim, encoder.features_dim))
         # The first observations of training, kept as the negatives of `error`: within a batch they would change with
@@ -82,7 +87,7 @@ class CURL(SRLHead):
         :param batch: Samples of the replay buffer
         :param latents: Anchors q, [B, features_dim]
         :param next_latents: Unused
-        :return: Loss, and the cross-entropy of each anchor, [B]
+        :return: Loss, and the cross-entropy (or the distance of the two views) of each anchor, [B]
         """
         self._fill_bank(batch.observations)
         keys = self._keys(self.augment(batch.observations))
@@ -90,11 +95,15 @@ class CURL(SRLHead):
         with full_precision(keys):
             # Row maxima are subtracted inside cross_entropy.
             error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
-        return SRLOutput(error.mean(), error.detach())
+            loss = error.mean()
+            if self.positive:
+                error = _distance(latents, keys)
+        return SRLOutput(loss, error.detach())
 
     @th.no_grad()
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """Cross-entropy of each anchor against its own key and the fixed bank; crops from a fixed seed.
+        """Cross-entropy of each anchor against its own key and the fixed bank, or its distance from its own key; crops
+        from a fixed seed.
 
         Does not depend on the other samples of the batch. A head that has not been trained has an empty bank: the
         error is then 0.
@@ -103,10 +112,12 @@ class CURL(SRLHead):
         :param latents: Anchors q, [B, features_dim]
         :return: [B]
         """
-        negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         # The same offset for all, drawn for them as one image of many channels: neither batch size nor order matters.
         views = self.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
+        if self.positive:
+            return _distance(latents, own)
+        negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
         with full_precision(own):
             weighted = latents.float() @ self.W
@@ -151,3 +162,7 @@ class CURL(SRLHead):
         self._n_banked = start + len(observations)
         self.bank[start : self._n_banked] = observations  # type: ignore[index, operator]
         self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
+
+
+def _distance(latents: th.Tensor, keys: th.Tensor) -> th.Tensor:
+    return (latents.float() - keys).square().mean(dim=1)

@@ -25,6 +25,10 @@ METHODS = {
     "drq_single_view": {"srl": None, "curiosity": None},
     "cure_sac_ae": {"srl": "rae", "curiosity": "separate"},
     "cure_curl": {"srl": "curl", "curiosity": "separate"},
+    **{
+        name: {"srl": "rae", "curiosity": "separate", "intrinsic": name}
+        for name in ("rnd", "icm", "disagreement", "particle")
+    },
 }
 # Task: action repeat
 SIX_TASKS = {

@@ -124,6 +124,7 @@ CASES = {
             "srl_period": 5,
         },
     ),
+    "bouts": Case(pixels(2), {"curiosity_prob": 0.5, "curiosity_bout": 6}),
     "normalized rewards": Case(normalized_rewards, {"curiosity": "bonus"}),
     "plain SAC": Case(pixels(), {"srl": None, "curiosity": None}),
     "pretraining": Case(pixels(), {"curiosity": None}, pretrain=25),

@@ -1,0 +1,155 @@
+"""Particle entropy: how far a state is from those that were seen in other episodes."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy import ndarray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from sb3_cure.buffers import Samples, SkipsMarked, transitions
+from sb3_cure.intrinsic.base import IntrinsicReward
+from sb3_cure.intrinsic.networks import make_network, scaled
+from sb3_cure.layers import full_precision
+
+
+class Particle(IntrinsicReward):
+    """log(1 + mean distance to the k nearest neighbours) of where the step leads (Liu & Abbeel, 2021, eq. 5).
+
+    Neighbours are sought in the batch and in a memory of what was sampled last. States of the same episode, the state
+    itself among them, are no neighbours: else most of them would be the steps before and after it.
+
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    :param features_dim: Size of the features
+    :param space: Where distances are measured: ``"random"``, features of a random network that is never trained (RE3,
+        Seo et al., 2021), which the memory keeps; or ``"latents"``, the encoder's (APT), for which the memory is
+        encoded anew in each update, as stored latents go stale
+    :param n_neighbours: k
+    :param memory: How many transitions are remembered, by their places in the replay buffer
+    :param n_filters: Channels of the random network
+    :raises ValueError: for another space
+    """
+
+    features: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        features_dim: int,
+        space: str = "random",
+        n_neighbours: int = 12,
+        memory: int = 512,
+        n_filters: int = 16,
+    ):
+        super().__init__(observation_space, action_space, features_dim)
+        if space not in ("random", "latents"):
+            raise ValueError(f"space is {space!r} in intrinsic_kwargs: choose 'random' or 'latents'.")
+        self.observation_space, self.n_neighbours = observation_space, n_neighbours
+        self.encoder: nn.Sequential | None = None
+        if space == "random":
+            self.mixed_precision = True
+            self.encoder = make_network(observation_space, [features_dim], n_filters)
+            self.encoder.append(nn.LayerNorm(features_dim, elementwise_affine=False)).requires_grad_(False)
+            self.register_buffer("features", th.zeros(memory, features_dim))
+        else:
+            self.reads = ("next_latents",)
+        # Rows and environments of the memory, [memory, 2]; a row of -1: nothing yet, or overwritten since
+        self.places = np.full((memory, 2), -1)
+        self._remembered: th.Tensor | None = None
+        # Where the next ones go, and where the replay buffer was in the last update
+        self.cursor = self.last_pos = 0
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """
+        :return: The memory
+        """
+        counters = th.tensor([self.cursor, self.last_pos])
+        return {"places": th.from_numpy(self.places.copy()), "counters": counters}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Of ``get_extra_state``
+        """
+        self.places = state["places"].cpu().numpy().copy()
+        self.cursor, self.last_pos = state["counters"].tolist()
+
+    def attach(
+        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
+    ) -> None:
+        """Forget what the replay buffer has overwritten; find out who may be whose neighbour; encode what is to be.
+
+        :param replay_buffer: The replay buffer
+        :param env: What it normalises with
+        :param encode: The online encoder
+        :raises ValueError: if the buffer does not tell which transitions it has drawn
+        """
+        if not isinstance(replay_buffer, SkipsMarked) or replay_buffer.last_sampled is None:
+            raise ValueError(
+                f"intrinsic='particle' needs to know the episodes of a batch, but {type(replay_buffer).__name__} does "
+                "not tell what it has drawn: leave out replay_buffer_class and optimize_memory_usage."
+            )
+        rows, env_inds = self.places.T
+        size, pos, n_rows = replay_buffer.buffer_size, replay_buffer.pos, replay_buffer.size()
+        overwritten = (rows - self.last_pos) % size < (pos - self.last_pos) % size
+        rows[overwritten | ((pos - 1 - rows) % size >= n_rows)] = -1
+        self.last_pos = pos
+        self._sampled = np.stack(replay_buffer.last_sampled, axis=1)
+        known = np.flatnonzero(rows >= 0)
+        episodes = _episodes(replay_buffer)
+        own, others = episodes[*self._sampled.T], episodes[rows[known], env_inds[known]]
+        self._may_be_near = own[:, None] != np.concatenate([own, others])
+        if self.encoder is not None:
+            self._remembered = self.features[th.from_numpy(known).to(self.features.device)]
+        elif len(known) > 0:
+            self._remembered = encode(transitions(replay_buffer, rows[known], env_inds[known], env).next_observations)
+        else:
+            self._remembered = None
+
+    @th.no_grad()
+    def loss(
+        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
+    ) -> tuple[None, th.Tensor]:
+        """
+        :param batch: Its next observations are read
+        :param latents: Unused
+        :param next_latents: [B, features_dim], in the space of latents
+        :param srl_error: Unused
+        :return: None, and the reward; 0 where there is no state of another episode, [B]
+        """
+        if self.encoder is not None:
+            next_latents = self.encoder(scaled(batch.next_observations, self.observation_space))
+        assert next_latents is not None
+        with full_precision(next_latents):
+            others = next_latents if self._remembered is None else th.cat([next_latents, self._remembered])
+            # Differences, as the products that torch prefers lose the small ones.
+            distances = th.cdist(next_latents, others, compute_mode="donot_use_mm_for_euclid_dist")
+            distances[~th.from_numpy(self._may_be_near).to(distances.device)] = math.inf
+            nearest = distances.topk(min(self.n_neighbours, len(others)), largest=False).values
+            found = nearest.isfinite()
+            mean = th.where(found, nearest, 0).sum(dim=1) / found.sum(dim=1).clamp(min=1)
+        self._remember(next_latents)
+        return None, mean.log1p()
+
+    def _remember(self, features: th.Tensor) -> None:
+        n = min(len(features), len(self.places))
+        where = (self.cursor + np.arange(n)) % len(self.places)
+        self.places[where] = self._sampled[-n:]
+        if self.encoder is not None:
+            self.features[th.from_numpy(where).to(features.device)] = features[-n:]
+        self.cursor = (self.cursor + n) % len(self.places)
+
+
+def _episodes(buffer: ReplayBuffer) -> ndarray:
+    """Number of the episode of each stored transition, of no two environments alike, [buffer_size, n_envs]."""
+    oldest_first = (buffer.pos - buffer.size() + np.arange(buffer.size())) % buffer.buffer_size
+    ends = buffer.dones[oldest_first].astype(int)
+    numbers = np.zeros((buffer.buffer_size, buffer.n_envs), dtype=int)
+    numbers[oldest_first] = (ends.cumsum(axis=0) - ends) * buffer.n_envs + np.arange(buffer.n_envs)
+    return numbers

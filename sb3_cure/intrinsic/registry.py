@@ -1,0 +1,32 @@
+"""Intrinsic rewards by name: each has a line here."""
+
+from sb3_cure.intrinsic.base import IntrinsicReward
+from sb3_cure.intrinsic.disagreement import Disagreement
+from sb3_cure.intrinsic.icm import ICM
+from sb3_cure.intrinsic.particle import Particle
+from sb3_cure.intrinsic.reconstruction import Reconstruction
+from sb3_cure.intrinsic.rnd import RND
+from sb3_cure.intrinsic.srl_error import SRLError
+
+INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
+    "srl_error": SRLError,
+    "reconstruction": Reconstruction,
+    "rnd": RND,
+    "icm": ICM,
+    "disagreement": Disagreement,
+    "particle": Particle,
+}
+
+
+def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[IntrinsicReward]:
+    """
+    :param intrinsic: Name of a built-in reward, or a subclass of ``IntrinsicReward``
+    :return: The class
+    :raises ValueError: if it is neither
+    """
+    if isinstance(intrinsic, str) and intrinsic in INTRINSIC_REWARDS:
+        return INTRINSIC_REWARDS[intrinsic]
+    if isinstance(intrinsic, type) and issubclass(intrinsic, IntrinsicReward):
+        return intrinsic
+    names = ", ".join(map(repr, INTRINSIC_REWARDS))
+    raise ValueError(f"intrinsic is {intrinsic!r}: choose one of {names}, or a subclass of IntrinsicReward.")

@@ -1,0 +1,537 @@
+"""Every intrinsic reward: as its paper writes it, in every mode, saved and resumed exactly, and what it seeks."""
+
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, VectorBox, differences, samples_of, state_of, tiny_model
+from grids_for_tests import method, write_grid
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
+from updates_for_tests import filled_model, groups, moved, sampled, train_once
+
+from benchmarks import rewards as world
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import transitions
+from sb3_cure.callbacks import CuriosityMapCallback, ExactCheckpoint
+from sb3_cure.experiments.grid import load_grid
+from sb3_cure.intrinsic import INTRINSIC_REWARDS, IntrinsicReward
+from sb3_cure.intrinsic.networks import make_network
+
+#: Every reward by its name, and variants of some
+ARMS: dict[str, dict[str, Any]] = {
+    **{name: dict(intrinsic=name) for name in INTRINSIC_REWARDS},
+    "per pixel": dict(intrinsic_kwargs=dict(per_pixel=True)),
+    "icm, own encoder": dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="own")),
+    "particle": dict(intrinsic="particle", intrinsic_kwargs=dict(memory=20)),
+    "particle, latents": dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents", memory=20)),
+    "shuffled rnd": dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="rnd", n_filters=4)),
+}
+BOUTS: dict[str, Any] = {"coin": 1, "long": 10, "whole": "episode"}
+every_reward = pytest.mark.parametrize("arm", ARMS)
+
+
+def reward_of(model: CuReSAC) -> Any:
+    assert model.policy.intrinsic is not None
+    return model.policy.intrinsic
+
+
+def captured(model: CuReSAC) -> list[th.Tensor]:
+    """Raw rewards of the updates to come."""
+    found: list[th.Tensor] = []
+    model.policy.scale.register_forward_pre_hook(lambda _, args: found.append(args[0].clone()))
+    return found
+
+
+def layer_by_layer(network: nn.Sequential, inputs: th.Tensor) -> th.Tensor:
+    """A network of ``make_network`` without its own code."""
+    for layer in network:
+        if isinstance(layer, nn.Conv2d):
+            inputs = nn.functional.conv2d(inputs, layer.weight, layer.bias, stride=2, padding=1)
+        elif isinstance(layer, nn.ReLU):
+            inputs = inputs.clamp(min=0)
+        elif isinstance(layer, nn.Sequential):
+            inputs = layer_by_layer(layer, inputs)
+        elif isinstance(layer, nn.Linear):
+            inputs = inputs @ layer.weight.T + layer.bias
+        elif isinstance(layer, nn.LayerNorm):
+            centred = inputs - inputs.mean(dim=1, keepdim=True)
+            inputs = centred / (centred.square().mean(dim=1, keepdim=True) + layer.eps).sqrt()
+            inputs = inputs if layer.weight is None else inputs * layer.weight + layer.bias
+        else:
+            inputs = th.stack([image.permute(1, 2, 0).flatten() for image in inputs])
+    return inputs
+
+
+# ---------------------------------------------------------------- in every mode
+
+
+class Killed(Exception):
+    """Stands in for a kill."""
+
+
+class KillAt(BaseCallback):
+    def __init__(self, step: int):
+        super().__init__()
+        self._left = step  # not public: it is not kept
+
+    def _on_step(self) -> bool:
+        self._left -= 1
+        if self._left == 0:
+            raise Killed
+        return True
+
+
+@pytest.fixture
+def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("files", "generations", "checkpoints"):
+        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
+
+
+@pytest.mark.usefixtures("_no_waiting_for_the_disk")
+@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
+@every_reward
+def test_resumed_training_is_the_uninterrupted_one(arm: str, curiosity: str, tmp_path: Path) -> None:
+    """Bit for bit, with a replay buffer and memories that have gone round, from a model that was loaded."""
+    arguments: dict[str, Any] = dict(curiosity=curiosity, buffer_size=25, **ARMS[arm])
+
+    def env() -> DummyVecEnv:
+        return make_vec_env(PixelBox, 1, env_kwargs=dict(episode_length=7, size=24))
+
+    whole = tiny_model("CnnPolicy", env(), **arguments).learn(45)
+    with pytest.raises(Killed):
+        tiny_model("CnnPolicy", env(), **arguments).learn(45, callback=[ExactCheckpoint(6, tmp_path), KillAt(35)])
+    np.random.seed(99)
+    th.manual_seed(99)
+    resumed = CuReSAC.resume(tmp_path, env(), device="cpu").learn(45, callback=ExactCheckpoint(100, tmp_path))
+    assert any("intrinsic" in name for name in state_of(whole)["policy"]) or arm == "srl_error"
+    assert differences(state_of(whole), state_of(resumed)) == []
+    assert whole._mixer.state_dict()["rng"] == resumed._mixer.state_dict()["rng"]
+
+
+@pytest.mark.parametrize("pixels", [True, False])
+@every_reward
+def test_trains_without_a_task_and_in_pretraining(arm: str, pixels: bool) -> None:
+    """A reward that is finite and differs between samples pays the curious critics, and the head still learns."""
+    policy, env = ("CnnPolicy", PixelBox(size=24)) if pixels else ("MlpPolicy", VectorBox())
+    model = tiny_model(policy, env, task=False, **ARMS[arm]).learn(50)
+    latest = model._metrics.latest
+    assert all(math.isfinite(value) for value in map(float, latest.values()))
+    assert float(latest["train/curious_reward_std"]) > 0
+    model = tiny_model(policy, env, curiosity=None, **ARMS[arm])
+    before, sources = groups(model), set(model.policy.encoder_update.weights)
+    model.pretrain(20)
+    assert "head" in moved(before, groups(model)) and "actor" not in moved(before, groups(model))
+    assert set(model.policy.encoder_update.weights) == sources and model.policy.intrinsic is None
+    model.learn(14)
+
+
+@every_reward
+def test_bf16_changes_rewards_by_its_rounding(arm: str) -> None:
+    """What reads images may run in it; the reward is fp32."""
+    found = []
+    for precision in ("fp32", "bf16"):
+        model = filled_model(pixels=True, precision=precision, learning_rate=0.0, **ARMS[arm])
+        found.append(captured(model))
+        train_once(model)
+    (exact,), (rounded,) = found
+    assert rounded.dtype == th.float32 and not th.equal(exact, rounded)
+    th.testing.assert_close(rounded.mean(), exact.mean(), rtol=0.1, atol=1e-4)
+
+
+def test_rewards_draw_from_no_common_stream() -> None:
+    """So that arms of one seed are paired: torch and NumPy go on alike after the same number of updates."""
+    nexts = []
+    for arm in ARMS.values():
+        model = tiny_model("MlpPolicy", VectorBox(), task=False, **arm).learn(20)
+        np.random.seed(1)
+        th.manual_seed(1)
+        model.train(3, 8)
+        nexts.append((float(th.rand(())), np.random.random()))
+    assert len(set(nexts)) == 1
+
+
+@every_reward
+def test_optimiser_has_what_is_trained_and_the_encoder_what_is_declared(arm: str) -> None:
+    """Frozen networks are not stepped; a source of the encoder is there exactly where the reward trains it."""
+    model = filled_model(pixels=True, curiosity_encoder_grad=False, **ARMS[arm])
+    reward = reward_of(model)
+    assert ("intrinsic" in model.policy.encoder_update.weights) == reward.trains_encoder == (arm == "icm")
+    trained = [p for p in reward.parameters() if p.requires_grad]
+    held = [] if reward.optimizer is None else reward.optimizer.param_groups[0]["params"]
+    assert set(map(id, held)) == set(map(id, trained))
+    before = {name: p.clone() for name, p in reward.named_parameters()}
+    train_once(model)
+    changed = {name for name, p in reward.named_parameters() if not th.equal(p, before[name])}
+    assert changed == {name for name, p in reward.named_parameters() if p.requires_grad}
+
+
+def test_grids_pass_rewards_and_bouts_on(tmp_path: Path) -> None:
+    """Arguments of a YAML file reach the mixer and the reward."""
+    kwargs = {"of": "rnd", "hidden_dim": 8}
+    arms = {name: method(intrinsic="shuffled", intrinsic_kwargs=kwargs, curiosity_bout=L) for name, L in BOUTS.items()}
+    cells = load_grid(write_grid(tmp_path, methods=arms)).cells
+    models = {cell.method: cell.make_model(PixelBox()) for cell in cells}
+    assert {name: model.curiosity_bout for name, model in models.items()} == BOUTS
+    model = models["long"]
+    assert type(reward_of(model).of) is INTRINSIC_REWARDS["rnd"]
+    assert reward_of(model).of.predictor[-1][-1].in_features == 8
+
+
+@pytest.mark.parametrize("arm", ["per pixel", "rnd"])
+def test_curiosity_map_is_drawn(arm: str, tmp_path: Path) -> None:
+    """With the reward's own measure where it has one; where nothing measures, visits alone."""
+    pytest.importorskip("matplotlib")
+    srl = None if arm == "rnd" else "rae"
+    model = tiny_model("MlpPolicy", VectorBox(), srl=srl, **ARMS[arm])
+    state: Any = dict(state=lambda env: env.unwrapped.position, names=("x", "y"))
+    drawn = CuriosityMapCallback(VectorBox(), tmp_path, every=20, n_episodes=1, **state)
+    model.learn(21, callback=drawn)
+    assert (tmp_path / "curiosity_map_20_steps.png").exists()
+    assert len(drawn.visits["curious"][1]) == (0 if srl is None else 20)
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (dict(srl="curl", intrinsic_kwargs=dict(per_pixel=True)), "CURL does not draw"),
+        (dict(srl=None, intrinsic="shuffled"), "srl is None"),
+        (dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="novelty")), "choose one of"),
+        (dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="mine")), "encoder is 'mine'"),
+        (dict(intrinsic="particle", intrinsic_kwargs=dict(space="pixels")), "space is 'pixels'"),
+        (dict(srl="curl", srl_kwargs=dict(error="negative")), "error is 'negative'"),
+    ],
+)
+def test_what_cannot_be_computed_is_refused(arguments: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        tiny_model("CnnPolicy", PixelBox(), **arguments)
+
+
+# ---------------------------------------------------------------- rnd
+
+
+@pytest.mark.parametrize("pixels", [True, False])
+def test_rnd_is_the_error_on_the_whitened_newest_frame(pixels: bool) -> None:
+    """By the statistics of the warm-up's newest frames, clipped; they are frozen, and so is the target."""
+    model = filled_model(pixels=pixels, srl=None, intrinsic="rnd", learning_rate=0.01 if pixels else 0.2)
+    reward, found, buffer = reward_of(model), captured(model), model.replay_buffer
+    everything: Any = transitions(buffer, np.arange(40), np.zeros(40, int))  # type: ignore[arg-type]
+
+    def newest(images: th.Tensor) -> th.Tensor:
+        return images[:, 3:].float() / 255 - 0.5 if pixels else images.float()
+
+    warm_up, batch = newest(everything.next_observations), sampled(model)
+    deviation = (warm_up.var(dim=0, correction=0) + (8.1e-5 if pixels else 1e-6)).sqrt()
+    whitened = ((newest(batch.next_observations) - warm_up.mean(dim=0)) / deviation).clamp(-5, 5)
+    with th.no_grad():
+        guess, goal = (layer_by_layer(net, whitened) for net in (reward.predictor, reward.target))
+    train_once(model)
+    th.testing.assert_close(found[0], (guess - goal).square().mean(dim=1), rtol=1e-4, atol=1e-6)
+    mean = reward.mean.clone()
+    for _ in range(20):
+        train_once(model)
+    assert float(found[-1].mean()) < 0.8 * float(found[0].mean())
+    space: Any = model.observation_space
+    for _ in range(10):  # unlike any before
+        new = space.sample()[None]
+        buffer.add(new, new, np.zeros((1, 2)), np.zeros(1), np.ones(1), [{}])  # type: ignore[union-attr]
+    train_once(model)
+    assert th.equal(reward.mean, mean)
+
+
+def test_rnd_whitens_normalised_observations() -> None:
+    """Of a ``VecNormalize`` it sees what the networks see."""
+    env = VecNormalize(DummyVecEnv([lambda: VectorBox()]), norm_reward=False)
+    model = tiny_model("MlpPolicy", env, srl=None, intrinsic="rnd", learning_starts=40).learn(40)
+    env.training = False
+    model.train(1, 8)
+    seen = env.normalize_obs(model.replay_buffer.next_observations[:40, 0])  # type: ignore[union-attr]
+    th.testing.assert_close(reward_of(model).mean, th.as_tensor(seen).float().mean(dim=0))
+
+
+# ---------------------------------------------------------------- icm
+
+
+@pytest.mark.parametrize("encoder", ["shared", "own"])
+def test_icm_is_the_forward_error_in_features_of_the_inverse_model(encoder: str) -> None:
+    """Features learn from the inverse model alone; the forward model learns on them detached."""
+    kwargs = dict(intrinsic="icm", intrinsic_kwargs=dict(encoder=encoder))
+    model = filled_model(pixels=True, srl=None, task=False, curiosity_encoder_grad=False, **kwargs)
+    reward, found, batch = reward_of(model), captured(model), sampled(model)
+    before = groups(model)
+    trained = model.policy.encoder if encoder == "shared" else reward.encoder
+
+    def features(observations: th.Tensor) -> th.Tensor:
+        if encoder == "shared":
+            return trained(observations.float() / 255)
+        return layer_by_layer(nn.Sequential(*trained, reward.norm), observations.float() / 255 - 0.5)
+
+    here, there = features(batch.observations), features(batch.next_observations)
+    told = layer_by_layer(reward.inverse_model, th.cat([here, there], dim=1))
+    inverse = (told - batch.actions).square().mean()
+    gradients = th.autograd.grad(inverse, list(trained.parameters()), retain_graph=True)
+    expected = layer_by_layer(reward.forward_model, th.cat([here, batch.actions], dim=1))
+    error = (expected - there).square().mean(dim=1).detach()
+    old = [p.detach().clone() for p in trained.parameters()]
+    train_once(model, actors=False)
+    th.testing.assert_close(found[0], error, rtol=1e-4, atol=1e-6)
+    if encoder == "own":
+        for parameter, start, gradient in zip(trained.parameters(), old, gradients, strict=True):
+            th.testing.assert_close(parameter.detach(), start - 0.1 * gradient, rtol=1e-3, atol=1e-5)
+    steps = [(start - p.detach()).flatten() for start, p in zip(old, trained.parameters(), strict=True)]
+    direction, gradient = th.cat(steps), th.cat([each.flatten() for each in gradients])
+    # The joint update normalises the length of a source's gradient, not its direction.
+    assert float(nn.functional.cosine_similarity(direction, gradient, dim=0)) > 0.999
+    assert ("trunk" in moved(before, groups(model))) == (encoder == "shared")
+
+
+# ---------------------------------------------------------------- disagreement
+
+
+def test_disagreement_is_the_variance_of_members_that_learn_apart() -> None:
+    """One member after the other, each on its part of the batch by a generator of its own."""
+    model = filled_model(srl=None, intrinsic="disagreement", intrinsic_kwargs=dict(n_members=3), learning_rate=0.05)
+    reward, found, batch = reward_of(model), captured(model), sampled(model)
+    generator = th.Generator()
+    generator.set_state(reward.random.generator.get_state())
+    parts = th.rand(3, 8, generator=generator) < 0.5
+    first, second = reward.members[0], reward.members[2]
+    with th.no_grad():
+        here, there = model.policy.encode(batch.observations), model.policy.encode(batch.next_observations)
+    inputs = th.cat([here, batch.actions], dim=1)
+    hidden = [(inputs @ first.weight[i] + first.bias[i, 0]).clamp(min=0) for i in range(3)]
+    guesses = [h @ second.weight[i] + second.bias[i, 0] for i, h in enumerate(hidden)]
+    mean = sum(guesses) / 3
+    variance = sum((guess - mean) ** 2 for guess in guesses) / 3
+    losses = [((g - there)[part] ** 2).mean() for g, part in zip(guesses, parts, strict=True)]
+    (gradient,) = th.autograd.grad(sum(losses), second.weight)  # type: ignore[arg-type]
+    old = second.weight.detach().clone()
+    train_once(model)
+    th.testing.assert_close(found[0], variance.mean(dim=1).detach(), rtol=1e-4, atol=1e-7)  # type: ignore[union-attr]
+    th.testing.assert_close(second.weight.detach(), old - 0.05 * gradient, rtol=1e-4, atol=1e-6)
+    assert not any(th.equal(first.weight[i], first.weight[j]) for i, j in itertools.combinations(range(3), 2))
+    assert not th.equal(parts[0], parts[1])
+
+
+# ---------------------------------------------------------------- particle
+
+
+def nearest_mean(own: th.Tensor, others: list[th.Tensor], k: int) -> float:
+    distances = sorted(float((own - other).norm()) for other in others)[:k]
+    return math.log(1 + sum(distances) / len(distances)) if distances else 0.0
+
+
+@pytest.mark.parametrize("space", ["random", "latents"])
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_envs: int) -> None:
+    """Over batch and memory, update after update, while the replay buffer overwrites its oldest rows."""
+    env = DummyVecEnv([lambda: VectorBox(episode_length=4)] * n_envs)
+    kwargs = dict(space=space, n_neighbours=3, memory=20)
+    arguments: dict[str, Any] = dict(intrinsic="particle", intrinsic_kwargs=kwargs, buffer_size=24 * n_envs)
+    model = tiny_model("MlpPolicy", env, srl=None, task=False, learning_starts=24 * n_envs, **arguments)
+    model.learn(24 * n_envs)
+    reward, found, buffer = reward_of(model), captured(model), model.replay_buffer
+    assert buffer is not None
+    episode, step = np.arange(24) // 4, 24  # of each row; of the next one
+    memory: list[Any] = [None] * 20  # row, environment and features of each place
+
+    def encode(row: int, env_ind: int) -> th.Tensor:
+        with th.no_grad():
+            seen = th.as_tensor(buffer.next_observations[row, env_ind])[None]  # type: ignore[union-attr]
+            return (model.policy.encode(seen) if space == "latents" else layer_by_layer(reward.encoder, seen))[0]
+
+    for update in range(7):
+        for _ in range(3):  # the oldest rows go
+            row, following = buffer.pos, np.random.randn(n_envs, 2)
+            done = np.full(n_envs, step % 4 == 3)
+            buffer.add(following, following, np.zeros((n_envs, 2)), np.zeros(n_envs), done, [{}] * n_envs)
+            episode[row], step = step // 4, step + 1
+            memory = [None if place is None or place[0] == row else place for place in memory]
+        if space == "latents":  # stored ones would be stale
+            memory = [None if place is None else (*place[:2], encode(*place[:2])) for place in memory]
+        state = np.random.get_state()
+        buffer.sample(8)
+        np.random.set_state(state)
+        batch = [(*place, encode(*place)) for place in zip(*buffer.last_sampled, strict=True)]  # type: ignore[attr-defined]
+        candidates = batch + [place for place in memory if place is not None]
+        expected = [
+            nearest_mean(own, [f for r, e, f in candidates if e != env_ind or episode[r] != episode[row]], 3)
+            for row, env_ind, own in batch
+        ]
+        model.train(1, 8)
+        np.testing.assert_allclose(found[-1], expected, rtol=1e-3, atol=1e-5)
+        for i, place in enumerate(batch):
+            memory[(8 * update + i) % 20] = place
+    assert found[-1].min() > 0 and len({float(value) for value in found[-1]}) > 2
+
+
+def test_particle_forgets_rows_whose_frames_were_lost() -> None:
+    """Streams that break in every step leave the ring of frames room for few transitions."""
+    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents", memory=40), buffer_size=24)
+    model = tiny_model("CnnPolicy", PixelBox(size=24), srl=None, task=False, **kwargs).learn(24)
+    buffer, found = model.replay_buffer, captured(model)
+    assert buffer is not None
+    for _ in range(12):
+        stacks = np.random.randint(0, 256, (2, 1, 6, 24, 24), np.uint8)
+        buffer.add(*stacks, np.zeros((1, 2)), np.zeros(1), np.ones(1), [{}])
+        model.train(1, 8)
+    assert buffer.size() < 20 and len(found) == 12 and found[-1].min() > 0
+
+
+def test_particle_of_a_single_episode_earns_nothing() -> None:
+    model = filled_model(srl=None, intrinsic="particle")
+    found = captured(model)
+    model.replay_buffer.dones[:] = 0  # type: ignore[union-attr]
+    train_once(model)
+    assert not found[0].any()
+
+
+def test_particle_needs_a_buffer_that_tells_what_it_drew() -> None:
+    model = tiny_model("MlpPolicy", VectorBox(), srl=None, intrinsic="particle", replay_buffer_class=ReplayBuffer)
+    with pytest.raises(ValueError, match="ReplayBuffer does not tell what it has drawn"):
+        model.learn(14)
+
+
+# ---------------------------------------------------------------- srl_error per pixel, positive
+
+
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_error_per_pixel_is_in_units_of_the_pixels_deviation(target: str) -> None:
+    """Squared difference over running variance and dither; frozen where policies are measured."""
+    kwargs = dict(curiosity_target=target, intrinsic_kwargs=dict(per_pixel=True), learning_rate=0.0)
+    model = filled_model(pixels=True, **kwargs)
+    reward, found, batch = reward_of(model), captured(model), sampled(model)
+    about = batch.observations if target == "observation" else batch.next_observations
+    with th.no_grad():
+        drawn = model.policy.srl.reconstruct(model.policy.encode(about)).float() / 255  # type: ignore[union-attr]
+    seen = about.float() / 255
+    expected = ((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1)
+    train_once(model)
+    th.testing.assert_close(found[0], expected, rtol=1e-4, atol=1e-6)
+    train_once(model)  # of the same batch, so are the variances
+    th.testing.assert_close(found[1], expected, rtol=1e-4, atol=1e-6)
+    before = reward.variance.clone()
+    measured = samples_of(model, 8)
+    th.testing.assert_close(
+        model.policy.error(measured), reward.error(measured.observations, model.policy.encode(measured.observations))
+    )
+    assert th.equal(reward.variance, before)
+
+
+def test_small_things_count_per_pixel() -> None:
+    """A dot that the decoder leaves out is most of what a pixel's own scale sees, and little of the mean."""
+    model = filled_model(pixels=True, intrinsic_kwargs=dict(per_pixel=True), learning_rate=0.0)
+    reward, head = reward_of(model), model.policy.srl
+    images = th.full((64, 6, 36, 36), 100, dtype=th.uint8)
+    for i in range(64):
+        images[i, :, i % 6 : i % 6 + 3, 5:8] = 255
+    blank, coarse = images.clone().fill_(100), images.clone().fill_(100)
+    coarse[:] = 104  # everywhere a little wrong
+    batch = sampled(model)._replace(observations=images)
+    scores = {}
+    for name, drawn in {"no dot": blank, "tinted": th.where(images == 100, coarse, images)}.items():
+        head.reconstruct = lambda latents, drawn=drawn: drawn[: len(latents)]  # type: ignore[union-attr, method-assign]
+        _, error = reward.loss(batch, th.zeros(64, 8), None, None)
+        scores[name] = float(error.mean()), float(((drawn.float() - images.float()) / 255).square().mean())
+    assert scores["no dot"][0] / scores["tinted"][0] < scores["no dot"][1] / scores["tinted"][1]
+
+
+def test_positive_error_is_the_distance_of_the_two_views() -> None:
+    """It does not depend on the rest of the batch; the loss, and what is learned, are InfoNCE's."""
+    arguments: dict[str, Any] = dict(pixels=True, srl="curl")
+    usual = filled_model(**arguments)
+    model = filled_model(srl_kwargs=dict(error="positive"), **arguments)
+    assert train_once(usual)["srl_loss"] == train_once(model)["srl_loss"]
+    assert all(th.equal(a, b) for a, b in zip(groups(usual)["head"], groups(model)["head"], strict=True))
+    head, batch = model.policy.srl, samples_of(model, 8)
+    assert head is not None
+    latents = model.policy.encode(batch.observations)
+    th.manual_seed(5)
+    error = head.loss(batch, latents).error
+    th.manual_seed(5)
+    keys = head.target_encoder(head.augment(batch.observations).float() / 255)
+    th.testing.assert_close(error, (latents - keys).square().mean(dim=1).detach(), rtol=1e-4, atol=1e-6)
+    alone = [head.error(samples, latents[i : i + 1]) for i, samples in enumerate(singles(batch))]
+    th.testing.assert_close(th.cat(alone), head.error(batch, latents), rtol=1e-4, atol=1e-6)
+
+
+def singles(batch: Any) -> list[Any]:
+    fields = batch._asdict()
+    return [
+        type(batch)(**{name: None if f is None else f[i : i + 1] for name, f in fields.items()})
+        for i in range(len(batch.observations))
+    ]
+
+
+# ---------------------------------------------------------------- shuffled
+
+
+@pytest.mark.parametrize("of", ["rnd", "icm", "srl_error"])
+def test_shuffled_is_the_other_reward_for_the_wrong_samples(of: str) -> None:
+    """The same numbers in another order, in each update another one; the reward's networks learn the same."""
+    plain = filled_model(pixels=True, intrinsic=of)
+    shuffled = filled_model(pixels=True, intrinsic="shuffled", intrinsic_kwargs=dict(of=of))
+    ours, theirs = captured(plain), captured(shuffled)
+    for model in (plain, shuffled):
+        train_once(model, actors=False)
+    assert not th.equal(ours[0], theirs[0])
+    assert th.equal(ours[0].sort().values, theirs[0].sort().values)
+    for own, other in zip(plain.policy.intrinsic.parameters(), reward_of(shuffled).of.parameters(), strict=True):  # type: ignore[union-attr]
+        assert th.equal(own, other)
+    orders = []
+    for _ in range(2):
+        value = th.arange(8.0)
+        reward_of(shuffled).of.loss = lambda *args, value=value: (None, value)
+        orders.append(reward_of(shuffled).loss(sampled(shuffled), None, None, None)[1])
+    assert not th.equal(*orders)
+
+
+def test_shuffled_draws_apart_from_what_it_shuffles() -> None:
+    model = filled_model(intrinsic="shuffled", intrinsic_kwargs=dict(of="disagreement"))
+    generators = [reward_of(model).random.generator, reward_of(model).of.random.generator]
+    assert not th.equal(*(th.rand(4, generator=each) for each in generators))
+
+
+# ---------------------------------------------------------------- what they seek
+
+
+def test_what_is_new_pays_and_shuffled_does_not_know() -> None:
+    """In a room that was never entered rnd pays much more than in the known one; its permutation the same."""
+    pays = world.paid("rnd", seed=0, updates=40)
+    assert pays["new"] > 2 * pays["known"]
+    chance = world.paid("shuffled (of rnd)", seed=0, updates=0)
+    assert 0.7 < chance["new"] / chance["known"] < 1.4
+
+
+def test_world_has_the_rooms_that_it_says() -> None:
+    """Closed, nobody enters the new room; the television alone is noise."""
+    env = world.Rooms(closed=True)
+    env.reset(seed=0)
+    rooms = {env.step(np.array([1.0, 0.0], np.float32))[4]["room"] for _ in range(20)}
+    assert rooms <= {0, 1} and 1 in rooms
+    for room in world.ROOMS:
+        env.put(room)
+        env.position = np.array([np.mean(world.WALLS[world.ROOMS.index(room) :][:2]), 0.0])
+        again = [env._draw() for _ in range(2)]
+        assert np.array_equal(*again) == (room != "television")
+
+
+def test_networks_see_every_pixel() -> None:
+    """Whatever the size: the outputs depend on each of them."""
+    space = PixelBox(size=13).observation_space
+    images = th.randn(1, *space.shape, requires_grad=True)  # type: ignore[misc]
+    make_network(space, [16, 4])(images).square().sum().backward()
+    assert images.grad is not None and (images.grad != 0).all()
+
+
+def test_declarations_default_to_the_classes_own() -> None:
+    assert IntrinsicReward.configured(anything=1) is IntrinsicReward
+    assert INTRINSIC_REWARDS["icm"].configured(encoder="own").trains_encoder is False
+    assert INTRINSIC_REWARDS["shuffled"].configured(of="icm").trains_encoder is True
