@@ -26,6 +26,7 @@ from sb3_cure.guards import Guard, crash_report
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.metrics import Metrics
 from sb3_cure.mixers import CuriousMixer
+from sb3_cure.observations import rows_of
 from sb3_cure.policies import ActorCritic, CuRePolicy
 from sb3_cure.precision import resolve_compile, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -44,7 +45,8 @@ class CuRe(OffPolicyAlgorithm):
     With ``srl=None, curiosity=None``, no augmentation and no ``policy_kwargs=dict(share_encoder=True)`` everything is
     off: policies, replay buffer and ``train`` are the base class's, bit for bit.
 
-    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
+    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for dictionaries of
+        both, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
     :param learning_rate: Of everything but the temperatures; a number or a schedule of the remaining progress
     :param buffer_size: Transitions in the replay buffer
@@ -357,7 +359,7 @@ class CuRe(OffPolicyAlgorithm):
         if self.num_timesteps >= learning_starts:
             second = self._second_actor_acts(n_envs)
             if second.any():
-                actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
+                actions[second] = self._second_actor_actions(second)
         if action_noise is not None:
             actions = np.clip(actions + action_noise(), -1, 1)
         return self.policy.unscale_action(actions), actions
@@ -370,12 +372,12 @@ class CuRe(OffPolicyAlgorithm):
             return np.full(n_envs, self.curiosity == "random")
         return self._mixer.choose(n_envs, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
 
-    def _second_actor_actions(self, observations: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1], [n, action_dim]."""
+    def _second_actor_actions(self, where: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1] in the environments where it acts, [n, action_dim]."""
         if self.curiosity == "random":
-            actions = np.array([self.action_space.sample() for _ in observations])
+            actions = np.array([self.action_space.sample() for _ in np.flatnonzero(where)])
         else:
-            actions, _ = self.predict_curious(observations)
+            actions, _ = self.predict_curious(rows_of(self._last_obs, where))
         return self.policy.scale_action(actions)
 
     def _store_transition(
@@ -427,7 +429,7 @@ class CuRe(OffPolicyAlgorithm):
             learns_srl, learns_rl = self._phase()
             for _ in range(2 if self.srl_schedule == "alternating" else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                batch = Samples(**sampled._asdict(), views=self.policy.views(sampled.observations))
+                batch = self.policy.samples(sampled)
                 self._guard.begin(self._n_updates)
                 with crash_report(self, batch):
                     self._gradient_step(batch, learns_srl, learns_rl)
@@ -483,7 +485,8 @@ class CuRe(OffPolicyAlgorithm):
         read = [_read(run.latents, trains) for run in runs]
         with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
             loss, error = srl.loss(batch, *(latents for _, latents in read))
-        if error.shape != (len(batch.views),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
+        latents = runs[0].latents.detach()
+        if error.shape != (len(latents),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
             raise ValueError(
                 f"{type(srl).__name__}.loss returned an error of shape {tuple(error.shape)} in {error.dtype} "
                 f"(requires_grad={error.requires_grad}), but it is one number per sample, detached, in fp32."
@@ -491,7 +494,7 @@ class CuRe(OffPolicyAlgorithm):
         if trains:
             self._learn_from("srl", loss.float(), srl.optimizer, "srl", read)
             srl.after_step()
-        variance = runs[0].latents.detach().var(dim=0, correction=0).mean()
+        variance = latents.var(dim=0, correction=0).mean()
         self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
         about_next = self.curiosity_target == "next_observation" and not srl.needs_next_latents
         if about_next and self.policy.intrinsic is not None and self.policy.intrinsic.needs_srl:
@@ -573,7 +576,7 @@ class CuRe(OffPolicyAlgorithm):
         """Policy improvement and the temperature's step; neither trains the encoder."""
         run, temperature = self.policy.encoder_update.run(), agent.temperature()
         with self._autocast():
-            actions, log_prob = agent.actor.action_log_prob(run.features.detach())
+            actions, log_prob = agent.actor.action_log_prob(run.features)
             value = self._critics.value(agent.critic, run.latents.detach(), actions)
         loss = (temperature * log_prob - value).mean()
         self._optimize(f"{name} actor", loss, agent.actor.optimizer)

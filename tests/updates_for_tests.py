@@ -163,6 +163,13 @@ class StraightLine:
             return self.head.target(observations, dither=True)
         return from_cells(self.head.target(to_cells(observations), dither=True))
 
+    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Loss of the autoencoder, and the error of each sample."""
+        seen, drawn = batch.observations, self.head.decoder(latents)
+        goal = self.goal(seen) if seen.dtype == th.uint8 else self.scaled(seen)
+        errors = ((drawn - goal) ** 2).flatten(1).mean(dim=1)
+        return errors.mean() + 1e-6 * 0.5 * (latents**2).sum(dim=1).mean(), errors.detach()
+
     def values(self, critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
         return critic_values(critic, latents, actions)
 
@@ -207,16 +214,9 @@ class StraightLine:
             else:
                 pulls.append(gradient / gradient.norm())
 
-        latents = shared
-        if batch.observations.dtype == th.uint8:
-            drawn, goal = self.head.decoder(latents), self.goal(batch.observations)
-        else:
-            drawn, goal = self.head.decoder(latents), obs
-        errors = ((drawn - goal) ** 2).flatten(1).mean(dim=1)
-        loss = errors.mean() + 1e-6 * 0.5 * (latents**2).sum(dim=1).mean()
+        loss, errors = self.srl(batch, shared)
         found = {"srl_loss": loss}
-        learn(loss, self.head, latents)
-        errors = errors.detach()
+        learn(loss, self.head, shared)
         curious = ((errors - errors.mean()) / errors.std(unbiased=False)).clamp(-5, 5) * self.model.curiosity_beta
         ends = batch.dones[:, 0]
         curious_ends = ends if self.model.curiosity_episodic else th.zeros_like(ends)

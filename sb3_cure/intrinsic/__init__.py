@@ -4,6 +4,7 @@
 """
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardScale
+from sb3_cure.intrinsic.dictionary import DictReward
 from sb3_cure.intrinsic.reconstruction import Reconstruction
 from sb3_cure.intrinsic.srl_error import SRLError
 
@@ -24,4 +25,12 @@ def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[Intrinsi
     raise ValueError(f"intrinsic is {intrinsic!r}: choose one of {names}, or a subclass of IntrinsicReward.")
 
 
-__all__ = ["INTRINSIC_REWARDS", "IntrinsicReward", "Reconstruction", "RewardScale", "SRLError", "get_intrinsic_class"]
+__all__ = [
+    "INTRINSIC_REWARDS",
+    "DictReward",
+    "IntrinsicReward",
+    "Reconstruction",
+    "RewardScale",
+    "SRLError",
+    "get_intrinsic_class",
+]

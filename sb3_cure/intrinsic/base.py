@@ -31,6 +31,9 @@ class IntrinsicReward(nn.Module):
     mixed_precision: ClassVar[bool] = False
     #: Whether policies are measured by ``error`` rather than by the SRL error
     measures: ClassVar[bool] = False
+    #: Whether the reward reads observations as one image or vector: of a dictionary, each image then has a reward of
+    #: its own (``DictReward``). Else a reward that reads observations gets the dictionary
+    per_image: ClassVar[bool] = False
     #: Optimiser of the reward's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
 

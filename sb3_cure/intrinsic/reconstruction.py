@@ -28,6 +28,7 @@ class Reconstruction(IntrinsicReward):
     reads: ClassVar[tuple[str, ...]] = ("next_latents",)
     mixed_precision = True
     measures = True
+    per_image = True
 
     def __init__(
         self,

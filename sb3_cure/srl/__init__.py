@@ -9,6 +9,7 @@ from sb3_cure.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
+from sb3_cure.srl.dictionary import DictHead, heads_by_key
 
 SRL_HEADS: dict[str, type[SRLHead]] = {"rae": RAE, "curl": CURL}
 
@@ -31,4 +32,14 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
     )
 
 
-__all__ = ["CURL", "RAE", "SRL_HEADS", "PixelDecoder", "SRLHead", "SRLOutput", "get_srl_class"]
+__all__ = [
+    "CURL",
+    "RAE",
+    "SRL_HEADS",
+    "DictHead",
+    "PixelDecoder",
+    "SRLHead",
+    "SRLOutput",
+    "get_srl_class",
+    "heads_by_key",
+]
