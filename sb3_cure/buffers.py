@@ -307,12 +307,7 @@ class FrameStackReplayBuffer(SkipsMarked):
         self._tails = np.zeros((n_envs, frame_stack), dtype=np.int64)
         self.reset()
 
-        if psutil is not None and self.nbytes > (available := psutil.virtual_memory().available):
-            warnings.warn(
-                f"The full replay buffer needs {self.nbytes / 1e9:.2f} GB of memory, but {available / 1e9:.2f} GB are "
-                "available: make buffer_size smaller, or keep the frames on a disk (frames_dir).",
-                stacklevel=2,
-            )
+        _warn_of_memory(self.nbytes)
 
     @property
     def nbytes(self) -> int:
@@ -547,6 +542,7 @@ class DictFrameStackReplayBuffer(SkipsMarked):
         self.rewards, self.dones, self.timeouts = (np.zeros(rows, dtype=np.float32) for _ in range(3))
         self.marked = np.zeros(rows, dtype=bool)
         self._share_rows()
+        _warn_of_memory(self.nbytes)
 
     def _share_rows(self) -> None:
         """Actions and the like are there once, not once per image."""
@@ -648,6 +644,15 @@ class DictFrameStackReplayBuffer(SkipsMarked):
         for name in ("observations", "next_observations"):
             setattr(self, name, {key: _grown(array, self.buffer_size) for key, array in state[name].items()})
         self._share_rows()
+
+
+def _warn_of_memory(nbytes: int) -> None:
+    if psutil is not None and nbytes > (available := psutil.virtual_memory().available):
+        warnings.warn(
+            f"The full replay buffer needs {nbytes / 1e9:.2f} GB of memory, but {available / 1e9:.2f} GB are "
+            "available: make buffer_size smaller, or keep the frames on a disk (frames_dir).",
+            stacklevel=3,
+        )
 
 
 def _grown(array: ndarray, length: int) -> ndarray:

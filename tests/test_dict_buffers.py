@@ -1,6 +1,7 @@
 """A replay buffer of dictionaries equals SB3's, bit for bit, in a fraction of its memory."""
 
 import pickle
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import DictReplayBuffer
 
+from sb3_cure import buffers
 from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer, transitions, unmarked
 
 ACTIONS = spaces.Box(-1, 1, (2,), np.float32)
@@ -188,8 +190,13 @@ def test_without_images() -> None:
             np.random.seed(number)
             batches.append(buffer.sample(20))
         same_batch(*batches)
-    ours.add({**obs}, {**successor}, np.ones((1, 2)), np.array([99]), np.array([False]), [{"bad_transition": "x"}])
-    assert 99 not in ours.sample(300).rewards and ours.actions[ours.pos - 1].sum() == 0
+    obs, successor = {"a": np.ones((1, 2)), "b": np.array([2])}, {"a": np.ones((1, 2)), "b": np.array([1])}
+    ours.add(obs, successor, np.ones((1, 2)), np.array([99]), np.array([False]), [{"bad_transition": "x"}])
+    row = ours.pos - 1
+    assert 99 not in ours.sample(300).rewards
+    # Nothing of it is kept, which might not be a number.
+    kept = [ours.actions, ours.rewards, *ours.observations.values(), *ours.next_observations.values()]
+    assert not any(array[row].any() for array in kept)
 
 
 def test_images_are_those_of_single_buffers() -> None:
@@ -198,3 +205,12 @@ def test_images_are_those_of_single_buffers() -> None:
     assert all(type(image) is FrameStackReplayBuffer for image in buffer.images.values())
     for copied in (buffer, pickle.loads(pickle.dumps(buffer))):
         assert all(image.rewards is copied.rewards for image in copied.images.values())
+
+
+def test_warns_where_memory_will_not_suffice_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of images each of which would fit."""
+    pytest.importorskip("psutil")
+    monkeypatch.setattr(buffers.psutil, "virtual_memory", lambda: SimpleNamespace(available=100_000))
+    with pytest.warns(UserWarning, match=r"0.00 GB are available") as caught:
+        DictFrameStackReplayBuffer(1000, SPACE, ACTIONS, frame_stack=FRAMES)
+    assert len(caught) == 1
