@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from gymnasium import spaces
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
@@ -103,14 +104,16 @@ def _check_combinations(model: Any) -> None:
     if not model.everything_off and not issubclass(model.policy_class, CuRePolicy):
         raise ValueError(
             f"the policy is {model.policy_class.__name__}, but SRL and curiosity need a kind of CuRePolicy: use "
-            "'CnnPolicy' or 'MlpPolicy', or set srl=None and curiosity=None, which is the base class."
+            "'CnnPolicy', 'MlpPolicy' or 'MultiInputPolicy', or set srl=None and curiosity=None, which is the base "
+            "class."
         )
     if model.use_sde and not model.everything_off:
         raise ValueError("use_sde=True explores by noise of one actor's own features: it needs srl=curiosity=None.")
     space = model.observation_space
-    shape = space.shape or ()
-    if len(shape) == 3 and not is_image_space(space, check_channels=False) and not model.everything_off:
-        raise ValueError(
-            f"images arrive as {space.dtype}, but the encoder and the replay buffer take uint8 in [0, 255]: return "
-            f"(255 * image).astype({np.uint8.__name__}), and use VecNormalize with norm_obs=False."
-        )
+    for part in space.spaces.values() if isinstance(space, spaces.Dict) else [space]:
+        if len(part.shape or ()) == 3 and not is_image_space(part) and not model.everything_off:
+            raise ValueError(
+                f"images arrive as {part.dtype}, but the encoder and the replay buffer take uint8 in [0, 255]: return "
+                f"(255 * image).astype({np.uint8.__name__}), and use VecNormalize with norm_obs=False (or with "
+                "norm_obs_keys)."
+            )

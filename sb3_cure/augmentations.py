@@ -1,11 +1,14 @@
 """What the encoder sees of an observation: a random view to learn from, a centred one to act and to measure."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_cure.observations import image_spaces
 
 
 class Augmentation:
@@ -35,6 +38,13 @@ class Augmentation:
         :return: The view without randomness, [B, *view shape]
         """
         return observations
+
+    def of(self, key: str) -> "Augmentation":
+        """
+        :param key: Of an image in a dictionary
+        :return: What is done to that image
+        """
+        return Augmentation(self.observation_space[key])  # type: ignore[index]
 
 
 class RandomShift(Augmentation):
@@ -105,16 +115,62 @@ class RandomCrop(Augmentation):
         return observations[:, :, top : top + self.size, left : left + self.size]
 
 
+class DictAugmentation(Augmentation):
+    """Each image of a dictionary is augmented by itself; vectors stay as they are.
+
+    :param observation_space: Dictionary of images and vectors
+    :param images: Augmentation of each image, by key
+    """
+
+    def __init__(self, observation_space: spaces.Dict, images: dict[str, Augmentation]):
+        super().__init__(observation_space)
+        self.images = images
+        views = {key: images[key].view_space if key in images else observation_space[key] for key in observation_space}
+        self.view_space = spaces.Dict(list(views.items()))
+
+    def __call__(self, observations: Any, generator: th.Generator | None = None) -> Any:
+        """
+        :param observations: Observations as stored, by key
+        :param generator: Source of the randomness (default: torch's global one)
+        :return: Random views, by key
+        """
+        return observations | {key: image(observations[key], generator) for key, image in self.images.items()}
+
+    def center(self, observations: Any) -> Any:
+        """
+        :param observations: Observations as stored, by key
+        :return: Views without randomness, by key
+        """
+        return observations | {key: image.center(observations[key]) for key, image in self.images.items()}
+
+    def of(self, key: str) -> Augmentation:
+        """
+        :param key: Of an image
+        :return: What is done to that image
+        """
+        return self.images[key]
+
+
 AUGMENTATIONS: dict[str | None, type[Augmentation]] = {None: Augmentation, "shift": RandomShift, "crop": RandomCrop}
 
 
-def make_augmentation(name: str | None, observation_space: spaces.Space, **kwargs: Any) -> Augmentation:
+def make_augmentation(
+    name: str | Callable[[spaces.Space], str | None] | None, observation_space: spaces.Space, **kwargs: Any
+) -> Augmentation:
     """
-    :param name: ``"shift"``, ``"crop"`` or None
+    :param name: ``"shift"``, ``"crop"`` or None, or what chooses one of them for an observation, or an image of it
     :param observation_space: Space of the stored observations
     :param kwargs: Arguments of the augmentation
     :return: The augmentation
     """
+    if isinstance(observation_space, spaces.Dict):
+        parts = {
+            key: make_augmentation(name, space, **kwargs) for key, space in image_spaces(observation_space).items()
+        }
+        is_plain = all(type(part) is Augmentation for part in parts.values())
+        return Augmentation(observation_space) if is_plain else DictAugmentation(observation_space, parts)
+    if callable(name):
+        name = name(observation_space)
     return AUGMENTATIONS[name](observation_space, **kwargs)
 
 

@@ -1,6 +1,7 @@
 """Replay buffers: one that keeps each frame of stacked images once, and one that never samples marked transitions.
 
-``FrameStackReplayBuffer`` is one ring of frames, and per transition the positions of its frames in that ring.
+``FrameStackReplayBuffer`` is one ring of frames, and per transition the positions of its frames in that ring;
+``DictFrameStackReplayBuffer`` has such a ring for each image of a dictionary.
 """
 
 import itertools
@@ -17,8 +18,10 @@ import torch as th
 from gymnasium import spaces
 from numpy import ndarray
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
+
+from sb3_cure.observations import image_spaces, rows_of
 
 try:
     import psutil
@@ -37,7 +40,7 @@ class Samples(NamedTuple):
     A batch of B transitions, as heads, intrinsic rewards and critics get it.
 
     The first fields are those of SB3's ``ReplayBufferSamples``. Observations are as stored: images uint8 in 0-255,
-    channels first; vectors float32.
+    channels first; vectors float32; dictionaries of both by key (those without images are one vector here).
 
     :param observations: What the agent saw, [B, *shape]
     :param actions: What it did, scaled to [-1, 1], float32 [B, action_dim]
@@ -65,6 +68,14 @@ class Samples(NamedTuple):
     n_step_next_observations: th.Tensor | None = None
     n_step_dones: th.Tensor | None = None
     n_step_discounts: th.Tensor | None = None
+
+    def of(self, key: str) -> "Samples":
+        """
+        :param key: Of an image in dictionaries of observations
+        :return: The batch as it is for an agent that sees this image alone
+        """
+        fields = self._asdict().items()
+        return Samples(**{name: value[key] if isinstance(value, dict) else value for name, value in fields})
 
 
 def is_marked(info: Mapping[str, Any]) -> bool:
@@ -102,14 +113,14 @@ def transitions(
     :raises IndexError: If a row of a ``FrameStackReplayBuffer`` is empty, or its frames have been overwritten
     """
     inds = rows, env_inds
-    if isinstance(buffer, FrameStackReplayBuffer):
-        slots = buffer.slots(rows, env_inds)
-        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of NumPy
-        obs, next_obs = th.from_numpy(buffer.frames).index_select(0, slots).view(2, -1, *buffer.obs_shape).numpy()
+    obs: Any
+    next_obs: Any
+    if isinstance(buffer, FrameStackReplayBuffer | DictFrameStackReplayBuffer):
+        obs, next_obs = buffer.observations_at(rows, env_inds)
     elif buffer.optimize_memory_usage:
         obs, next_obs = buffer.observations[inds], buffer.observations[(rows + 1) % buffer.buffer_size, env_inds]
     else:
-        obs, next_obs = buffer.observations[inds], buffer.next_observations[inds]
+        obs, next_obs = rows_of(buffer.observations, inds), rows_of(buffer.next_observations, inds)
     data = (
         buffer._normalize_obs(obs, env),
         buffer.actions[inds],
@@ -118,8 +129,14 @@ def transitions(
         (buffer.dones[inds] * (1 - buffer.timeouts[inds])).reshape(-1, 1),
         buffer._normalize_reward(buffer.rewards[inds].reshape(-1, 1), env),
     )
-    # All of these are fresh arrays already, so no second copy
-    return ReplayBufferSamples(*(buffer.to_torch(array, copy=False) for array in data))  # type: ignore[arg-type]
+
+    def to_torch(array: Any) -> Any:
+        if isinstance(array, dict):
+            return {key: to_torch(part) for key, part in array.items()}
+        return buffer.to_torch(array, copy=False)  # all of these are fresh arrays already
+
+    kind: Any = DictReplayBufferSamples if isinstance(obs, dict) else ReplayBufferSamples
+    return kind(*map(to_torch, data))
 
 
 class SkipsMarked(ReplayBuffer):
@@ -147,6 +164,15 @@ class SkipsMarked(ReplayBuffer):
             n_steps = min(infos[i].get("env_fault_steps", 1), self.buffer_size)
             self.marked[(self.pos - np.arange(n_steps)) % self.buffer_size, i] = True
         return marks
+
+    def _draw_rows(self, batch_size: int) -> ndarray:
+        """Positions drawn uniformly, with replacement, from the latest ``size()`` rows, [batch_size]."""
+        n_rows = self.size()
+        rows = np.random.randint(0, n_rows, size=batch_size)
+        if n_rows < (self.buffer_size if self.full else self.pos):
+            # Rows were lost: count from the oldest one that is left. Else rows are positions, as in SB3.
+            rows = (rows + self.pos - n_rows) % self.buffer_size
+        return rows
 
     def _get_samples(self, batch_inds: ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """
@@ -331,12 +357,7 @@ class FrameStackReplayBuffer(SkipsMarked):
         self._tails = np.zeros((n_envs, frame_stack), dtype=np.int64)
         self.reset()
 
-        if psutil is not None and self.nbytes > (available := psutil.virtual_memory().available):
-            warnings.warn(
-                f"The full replay buffer needs {self.nbytes / 1e9:.2f} GB of memory, but {available / 1e9:.2f} GB are "
-                "available: make buffer_size smaller, or keep the frames on a disk (frames_dir).",
-                stacklevel=2,
-            )
+        _warn_of_memory(self.nbytes)
 
     @property
     def nbytes(self) -> int:
@@ -419,11 +440,19 @@ class FrameStackReplayBuffer(SkipsMarked):
         :param env: VecEnv to normalize the observations and rewards with
         :return: Batch on ``device``, observations uint8 (unless ``env`` normalizes them)
         """
-        rows = np.random.randint(0, self._n_valid, size=batch_size)
-        if self._n_valid < (self.buffer_size if self.full else self.pos):
-            # Rows were lost: count from the oldest valid one. Else rows are positions, as in SB3.
-            rows = (rows + self.pos - self._n_valid) % self.buffer_size
-        return self._get_samples(rows, env=env)
+        return self._get_samples(self._draw_rows(batch_size), env=env)
+
+    def observations_at(self, rows: ndarray, env_inds: ndarray) -> tuple[ndarray, ndarray]:
+        """
+        :param rows: Row positions, [n]
+        :param env_inds: Environment of each, [n]
+        :return: Observations, and their successors, [n, *shape] each
+        :raises IndexError: If a row is empty, or its frames have been overwritten
+        """
+        slots = self.slots(rows, env_inds)
+        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of NumPy
+        obs, next_obs = th.from_numpy(self.frames).index_select(0, slots).view(2, -1, *self.obs_shape).numpy()
+        return obs, next_obs
 
     def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
         # A stack that continues the stored one has its very frames.
@@ -496,6 +525,199 @@ class FrameStackReplayBuffer(SkipsMarked):
             self.frames[: len(state["frames"])] = state["frames"]
 
 
+class DictFrameStackReplayBuffer(SkipsMarked):
+    """
+    SB3's ``DictReplayBuffer`` for images and vectors, in which a ``FrameStackReplayBuffer`` keeps the frames of each
+    image once. With equal seeds and an equal stream it returns the same batches, bit for bit.
+
+    Vectors are kept as SB3 does. Where the streams of an image break so often that its ring has to give up rows, these
+    rows are given up for all keys. Marked transitions (see ``MARKS``) are never sampled.
+
+    :param buffer_size: Max number of transitions, over all environments
+    :param observation_space: Dictionary of which images are uint8 of shape (frames * c, height, width), oldest first
+    :param action_space: Action space
+    :param device: PyTorch device of the sampled tensors
+    :param n_envs: Number of parallel environments
+    :param optimize_memory_usage: Ignored: frames are shared in any case
+    :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
+        as an infinite horizon task
+    :param frame_stack: Number of frames in an observation of each image: by key (of those that are not there: 1), or
+        one number for all (1 where it does not divide the channels). Without stacks an image is stored once instead of
+        twice
+    :param frames_dir: As of ``FrameStackReplayBuffer``
+    """
+
+    observation_space: spaces.Dict
+    observations: dict[str, ndarray]  # type: ignore[assignment]  # of the vectors
+    next_observations: dict[str, ndarray]  # type: ignore[assignment]
+    #: What all keys share: one entry per row
+    _ROW_ARRAYS = ("actions", "rewards", "dones", "timeouts", "marked")
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        *,
+        frame_stack: int | Mapping[str, int] = 1,
+        frames_dir: str | Path | None = None,
+    ):
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        #: Frames of each image, by key
+        self.images: dict[str, FrameStackReplayBuffer] = {}
+        for key, space in image_spaces(observation_space).items():
+            told = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
+            if not isinstance(frame_stack, Mapping) and space.shape[0] % told:
+                told = 1
+            settings: dict[str, Any] = dict(
+                handle_timeout_termination=handle_timeout_termination, frames_dir=frames_dir
+            )
+            self.images[key] = FrameStackReplayBuffer(
+                buffer_size, space, action_space, device, n_envs, frame_stack=told, **settings
+            )
+        rows = (self.buffer_size, n_envs)
+        shapes: Any = self.obs_shape
+        self.observations, self.next_observations = (
+            {
+                key: np.zeros((*rows, *shapes[key]), dtype=space.dtype)
+                for key, space in observation_space.spaces.items()
+                if key not in self.images
+            }
+            for _ in range(2)
+        )
+        self.actions = np.zeros((*rows, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
+        self.rewards, self.dones, self.timeouts = (np.zeros(rows, dtype=np.float32) for _ in range(3))
+        self.marked = np.zeros(rows, dtype=bool)
+        self._share_rows()
+        _warn_of_memory(self.nbytes)
+
+    def _share_rows(self) -> None:
+        """Actions and the like are there once, not once per image."""
+        for image in self.images.values():
+            vars(image).update({name: getattr(self, name) for name in self._ROW_ARRAYS})
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays of the full buffer; the system commits them as they fill."""
+        shared = sum(getattr(self, name).nbytes for name in self._ROW_ARRAYS)
+        vectors = [*self.observations.values(), *self.next_observations.values()]
+        return sum(array.nbytes for array in vectors) + shared + sum(i.nbytes - shared for i in self.images.values())
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        for image in self.images.values():
+            image.reset()
+
+    def size(self) -> int:
+        """
+        :return: Number of rows that can be sampled
+        """
+        return min((image.size() for image in self.images.values()), default=super().size())
+
+    def add(  # type: ignore[override]
+        self,
+        obs: dict[str, ndarray],
+        next_obs: dict[str, ndarray],
+        action: ndarray,
+        reward: ndarray,
+        done: ndarray,
+        infos: Infos,
+    ) -> None:
+        """
+        Store one transition per environment; of a marked one nothing but the mark. All inputs are copied.
+
+        :param obs: Observations by key, [n_envs, ...] each
+        :param next_obs: Successors of the same shapes; of an episode's last step the terminal observation
+        :param action: Actions, [n_envs, ...]
+        :param reward: Rewards, [n_envs]
+        :param done: Whether the episode ended, [n_envs]
+        :param infos: One dictionary per environment; ``TimeLimit.truncated`` and marks are used
+        :raises ValueError: If images have another dtype or shape
+        """
+        row, marks = self.pos, self._mark(infos)
+        for key, image in self.images.items():
+            image.add(obs[key], next_obs[key], action, reward, done, infos)
+        for arrays, new in ((self.observations, obs), (self.next_observations, next_obs)):
+            for key, array in arrays.items():
+                array[row] = np.asarray(new[key]).reshape(array[row].shape)
+                array[row, marks] = 0
+        self.actions[row] = np.asarray(action).reshape((self.n_envs, self.action_dim))
+        self.rewards[row], self.dones[row] = reward, done
+        self.actions[row, marks] = self.rewards[row, marks] = 0
+        if self.handle_timeout_termination:
+            self.timeouts[row] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self.pos = (self.pos + 1) % self.buffer_size
+        self.full = self.full or self.pos == 0
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        """
+        Sample uniformly, with replacement, from the valid rows and the environments.
+
+        :param batch_size: Number of transitions to sample
+        :param env: VecEnv to normalize the observations and rewards with
+        :return: Batch on ``device``
+        """
+        return self._get_samples(self._draw_rows(batch_size), env=env)  # type: ignore[return-value]
+
+    def observations_at(self, rows: ndarray, env_inds: ndarray) -> tuple[dict[str, ndarray], dict[str, ndarray]]:
+        """
+        :param rows: Row positions, [n]
+        :param env_inds: Environment of each, [n]
+        :return: Observations, and their successors, by key, [n, *shape] each
+        :raises IndexError: If a row of an image is empty, or its frames have been overwritten
+        """
+        images = {key: image.observations_at(rows, env_inds) for key, image in self.images.items()}
+        found: list[dict[str, ndarray]] = []
+        for i, vectors in enumerate((self.observations, self.next_observations)):
+            keys = self.observation_space.spaces
+            found.append({k: images[k][i] if k in images else vectors[k][rows, env_inds] for k in keys})
+        return found[0], found[1]
+
+    def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
+        goes_on = np.ones(rows.shape, dtype=bool)
+        for image in self.images.values():
+            goes_on &= image._goes_on(rows, next_rows, env_inds)
+        for key, vectors in self.observations.items():
+            same = self.next_observations[key][rows, env_inds] == vectors[next_rows, env_inds]
+            goes_on &= same.reshape(*rows.shape, -1).all(axis=2)
+        return goes_on
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what has not been written to: a saved buffer is as large as its contents."""
+        state = {name: value for name, value in vars(self).items() if name != "last_sampled"}
+        n_rows = self.buffer_size if self.full else self.pos
+        state |= {name: state[name][:n_rows] for name in self._ROW_ARRAYS}
+        return state | {name: rows_of(state[name], slice(n_rows)) for name in ("observations", "next_observations")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the full size of every array."""
+        self.__dict__.update(state)
+        for name in self._ROW_ARRAYS:
+            setattr(self, name, _grown(state[name], self.buffer_size))
+        for name in ("observations", "next_observations"):
+            setattr(self, name, {key: _grown(array, self.buffer_size) for key, array in state[name].items()})
+        self._share_rows()
+
+
+def _warn_of_memory(nbytes: int) -> None:
+    if psutil is not None and nbytes > (available := psutil.virtual_memory().available):
+        warnings.warn(
+            f"The full replay buffer needs {nbytes / 1e9:.2f} GB of memory, but {available / 1e9:.2f} GB are "
+            "available: make buffer_size smaller, or keep the frames on a disk (frames_dir).",
+            stacklevel=3,
+        )
+
+
 def _grown(array: ndarray, length: int) -> ndarray:
     """The array itself where it has the length, else a copy that is filled up with zeros."""
     if len(array) == length:
@@ -533,10 +755,14 @@ def choose_replay_buffer(
     :param skips: Whether transitions that are not finite will be marked
     :return: Class of the replay buffer (None: SB3's choice), and its arguments
     """
+    may_be_marked = skips or restarts_workers(env)
+    if isinstance(observation_space, spaces.Dict):
+        if plain and not may_be_marked:
+            return None, kwargs
+        return DictFrameStackReplayBuffer, {"frame_stack": _stack_of(env) or 1, **kwargs}
     is_box = isinstance(observation_space, spaces.Box)
     if is_box and not plain and observation_space.dtype == np.uint8 and len(observation_space.shape) == 3:  # type: ignore[arg-type]
         return FrameStackReplayBuffer, {"frame_stack": _stack_of(env) or 1, **kwargs}
-    may_be_marked = skips or restarts_workers(env)
     return (SkippingReplayBuffer if is_box and (may_be_marked or not plain) else None), kwargs
 
 

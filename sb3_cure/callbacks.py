@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
@@ -116,10 +117,7 @@ class RolloutCallback(PeriodicCallback):
     def _init_callback(self) -> None:
         """Refuse now what would end the training when the callback is due."""
         model, space = self.model, self.eval_env.observation_space
-        shape = space.shape or ()
-        # SB3 may have moved the channels of images to the front
-        moved = (shape[2], *shape[:2]) if len(shape) == 3 else shape
-        if self.eval_env.action_space != model.action_space or model.observation_space.shape not in (shape, moved):
+        if self.eval_env.action_space != model.action_space or not _same_shapes(space, model.observation_space):
             raise ValueError(
                 f"eval_env has {space} and {self.eval_env.action_space}, but the model was made for "
                 f"{model.observation_space} and {model.action_space}: make it as the training environment."
@@ -141,6 +139,16 @@ class RolloutCallback(PeriodicCallback):
     @property
     def _actions(self) -> str:
         return "deterministic actions" if self.deterministic else "sampled actions"
+
+
+def _same_shapes(space: spaces.Space, trained: spaces.Space) -> bool:
+    """Whether observations have the shapes of those of training, in which SB3 may have moved the channels of images to
+    the front."""
+    if isinstance(space, spaces.Dict) and isinstance(trained, spaces.Dict):
+        same_keys = space.spaces.keys() == trained.spaces.keys()
+        return same_keys and all(_same_shapes(space[key], trained[key]) for key in space.spaces)
+    shape = space.shape
+    return trained.shape in (shape, (shape[2], *shape[:2]) if shape is not None and len(shape) == 3 else shape)
 
 
 class EvalBothCallback(RolloutCallback):

@@ -21,12 +21,13 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 
 from sb3_cure.arguments import check_arguments
 from sb3_cure.augmentations import Augmentation
-from sb3_cure.buffers import Samples, SkipsMarked, choose_replay_buffer
+from sb3_cure.buffers import Samples, SkipsMarked, choose_replay_buffer, transitions
 from sb3_cure.critics import TwinQ
 from sb3_cure.guards import Guard, crash_report
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.metrics import Metrics
 from sb3_cure.mixers import CuriousMixer
+from sb3_cure.observations import rows_of
 from sb3_cure.policies import ActorCritic, CuRePolicy
 from sb3_cure.precision import resolve_compile, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -45,7 +46,8 @@ class CuRe(OffPolicyAlgorithm):
     With ``srl=None, curiosity=None``, no augmentation and no ``policy_kwargs=dict(share_encoder=True)`` everything is
     off: policies, replay buffer and ``train`` are the base class's, bit for bit.
 
-    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, or a subclass of ``CuRePolicy``
+    :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for dictionaries of
+        both, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
     :param learning_rate: Of everything but the temperatures; a number or a schedule of the remaining progress
     :param buffer_size: Transitions in the replay buffer
@@ -366,7 +368,7 @@ class CuRe(OffPolicyAlgorithm):
         if self.num_timesteps >= learning_starts:
             second = self._second_actor_acts(n_envs)
             if second.any():
-                actions[second] = self._second_actor_actions(self._last_obs[second])  # type: ignore[index, call-overload]
+                actions[second] = self._second_actor_actions(second)
         if action_noise is not None:
             actions = np.clip(actions + action_noise(), -1, 1)
         return self.policy.unscale_action(actions), actions
@@ -379,12 +381,12 @@ class CuRe(OffPolicyAlgorithm):
             return np.full(n_envs, self.curiosity == "random")
         return self._mixer.choose(n_envs, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
 
-    def _second_actor_actions(self, observations: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1], [n, action_dim]."""
+    def _second_actor_actions(self, where: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1] in the environments where it acts, [n, action_dim]."""
         if self.curiosity == "random":
-            actions = np.array([self.action_space.sample() for _ in observations])
+            actions = np.array([self.action_space.sample() for _ in np.flatnonzero(where)])
         else:
-            actions, _ = self.predict_curious(observations)
+            actions, _ = self.predict_curious(rows_of(self._last_obs, where))
         return self.policy.scale_action(actions)
 
     def _store_transition(
@@ -436,7 +438,7 @@ class CuRe(OffPolicyAlgorithm):
             learns_srl, learns_rl = self._phase()
             for _ in range(2 if self.srl_schedule == "alternating" else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-                batch = Samples(**sampled._asdict(), views=self.policy.views(sampled.observations))
+                batch = self.policy.samples(sampled)
                 if self.n_steps > 1 and self.task and learns_rl and isinstance(self.replay_buffer, SkipsMarked):
                     ahead = self.replay_buffer.look_ahead(self.n_steps, self.gamma, self._vec_normalize_env)
                     batch = batch._replace(**ahead)
@@ -501,7 +503,8 @@ class CuRe(OffPolicyAlgorithm):
         read = [_read(run.latents, trains) for run in runs]
         with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
             loss, error = srl.loss(batch, *(latents for _, latents in read))
-        if error.shape != (len(batch.views),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
+        latents = runs[0].latents.detach()
+        if error.shape != (len(latents),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
             raise ValueError(
                 f"{type(srl).__name__}.loss returned an error of shape {tuple(error.shape)} in {error.dtype} "
                 f"(requires_grad={error.requires_grad}), but it is one number per sample, detached, in fp32."
@@ -509,7 +512,7 @@ class CuRe(OffPolicyAlgorithm):
         if trains:
             self._learn_from("srl", loss.float(), srl.optimizer, "srl", read)
             srl.after_step()
-        variance = runs[0].latents.detach().var(dim=0, correction=0).mean()
+        variance = latents.var(dim=0, correction=0).mean()
         self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
         of_transitions = srl.needs_next_latents or srl.models_transitions
         about_next = self.curiosity_target == "next_observation" and not of_transitions
@@ -529,7 +532,7 @@ class CuRe(OffPolicyAlgorithm):
 
         :return: Scaled reward, [B, 1]
         """
-        intrinsic.attach(self.replay_buffer, self._vec_normalize_env, self._encode_centred)  # type: ignore[arg-type]
+        intrinsic.attach(self.replay_buffer, self._look_up, self._encode_centred)  # type: ignore[arg-type]
         read = self._read_centred(batch, intrinsic)
         latents, next_latents = [read[name][1] if name in read else None for name in ("latents", "next_latents")]
         with self._autocast(intrinsic.mixed_precision):
@@ -562,7 +565,13 @@ class CuRe(OffPolicyAlgorithm):
             read[name] = _read(latents, intrinsic.trains_encoder)
         return read
 
-    def _encode_centred(self, observations: th.Tensor, gradient: bool = False) -> th.Tensor:
+    def _look_up(self, rows: np.ndarray, env_inds: np.ndarray) -> Samples:
+        """Transitions of the replay buffer by their places, as heads and rewards get them."""
+        assert self.replay_buffer is not None
+        sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)
+        return self.policy.samples(sampled, random=False)
+
+    def _encode_centred(self, observations: Any, gradient: bool = False) -> th.Tensor:
         """Latents of centred views by the online encoder, fp32, [n, features_dim]."""
         with th.set_grad_enabled(gradient), self._autocast():
             return self.policy.encode(observations).float()
@@ -605,7 +614,7 @@ class CuRe(OffPolicyAlgorithm):
         """Policy improvement and the temperature's step; neither trains the encoder."""
         run, temperature = self.policy.encoder_update.run(), agent.temperature()
         with self._autocast():
-            actions, log_prob = agent.actor.action_log_prob(run.features.detach())
+            actions, log_prob = agent.actor.action_log_prob(run.features)
             value = self._critics.value(agent.critic, run.latents.detach(), actions)
         loss = (temperature * log_prob - value).mean()
         self._optimize(f"{name} actor", loss, agent.actor.optimizer)

@@ -9,7 +9,7 @@ from stable_baselines3.sac.sac import SAC
 from sb3_cure.critics import TwinQ
 from sb3_cure.cure import CuRe
 from sb3_cure.persistence import Persistence
-from sb3_cure.policies import CnnPolicy, MlpPolicy
+from sb3_cure.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_cure.pretraining import Pretraining
 from sb3_cure.vec_env.model import ModelEnvironments
 
@@ -24,9 +24,10 @@ class CuReSAC(Pretraining, Persistence, ModelEnvironments, CuRe, SAC):  # type: 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": sac_policies.MultiInputPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
     }
     plain_policies: ClassVar[dict[type[BasePolicy], type[BasePolicy]]] = {
         MlpPolicy: sac_policies.MlpPolicy,
         CnnPolicy: sac_policies.CnnPolicy,
+        MultiInputPolicy: sac_policies.MultiInputPolicy,
     }

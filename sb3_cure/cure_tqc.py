@@ -26,6 +26,12 @@ class MlpPolicy(policies.MlpPolicy):
     critics = TruncatedQuantiles
 
 
+class MultiInputPolicy(policies.MultiInputPolicy):
+    """``CuRePolicy`` for dictionaries with critics of quantiles."""
+
+    critics = TruncatedQuantiles
+
+
 class CuReTQC(Pretraining, Persistence, ModelEnvironments, CuRe, TQC):  # type: ignore[misc]
     """Truncated quantile critics from pixels, with state representation learning and a curious policy.
 
@@ -36,9 +42,10 @@ class CuReTQC(Pretraining, Persistence, ModelEnvironments, CuRe, TQC):  # type: 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": tqc_policies.MultiInputPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
     }
     plain_policies: ClassVar[dict[type[BasePolicy], type[BasePolicy]]] = {
         MlpPolicy: tqc_policies.MlpPolicy,
         CnnPolicy: tqc_policies.CnnPolicy,
+        MultiInputPolicy: tqc_policies.MultiInputPolicy,
     }

@@ -7,6 +7,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
 from sb3_cure.evaluation import trained_actors
+from sb3_cure.observations import images_of
 from sb3_cure.policies import CuRePolicy
 
 
@@ -41,17 +42,18 @@ class DeterministicActor(nn.Module):
             self.register_buffer(name, bound)
         self.train(False)
 
-    def forward(self, observations: th.Tensor) -> th.Tensor:
+    def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """
-        :param observations: As the agent sees them, [B, *shape]: images uint8, channels first
+        :param observations: As the agent sees them, [B, *shape], or a dictionary: images uint8, channels first
         :return: Actions within the environment's bounds, [B, *action shape]
         :raises ValueError: for images that are not uint8
         """
-        if self._observation_space.dtype == "uint8" and observations.dtype != th.uint8:
-            raise ValueError(f"observations are {observations.dtype}, but images must be uint8: do not divide by 255.")
+        for image in images_of(observations, self._observation_space).values():
+            if image.dtype != th.uint8:
+                raise ValueError(f"observations are {image.dtype}, but images must be uint8: do not divide by 255.")
         (policy,) = self._policy
         policy.set_training_mode(False)  # as `predict` does: the model may have trained on
-        inputs = observations if self.trunk is None else self.trunk(policy.center(observations))
+        inputs: Any = observations if self.trunk is None else self.trunk(policy.center(observations))
         mean, *_ = self.actor.get_action_dist_params(inputs)
         scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)
         return self.low + scaled * (self.high - self.low)

@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_cure.buffers import Samples, transitions
+from sb3_cure.buffers import transitions
 from sb3_cure.envs import render_check
 from sb3_cure.layers import Conv2dReLU
 from sb3_cure.policies import CuRePolicy, encoder_of
@@ -288,9 +288,9 @@ def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) 
     head = getattr(model.policy, "srl", None)
     if not isinstance(head, RAE):
         return None
-    views = model.policy.augmentation.center(batch.observations)
-    variance = float(head.target(views, dither=False).var(dim=0, correction=0).mean())
-    error = head.error(Samples(**{**batch._asdict(), "views": views}), latents)
+    seen = model.policy.samples(batch, random=False)
+    variance = float(head.target(seen.views, dither=False).var(dim=0, correction=0).mean())
+    error = head.error(seen, latents)
     return None if variance == 0 else 1 - float(error.mean()) / variance
 
 

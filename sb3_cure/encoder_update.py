@@ -13,6 +13,7 @@ import torch as th
 from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_cure.encoders import Encoder
+from sb3_cure.observations import detached
 
 #: Every how many updates gradients are measured at the parameters, which costs a backward pass for each source
 SHARE_INTERVAL = 100
@@ -24,11 +25,11 @@ Optimize = Callable[[str, th.Tensor, th.optim.Optimizer], None]
 class Encoded(NamedTuple):
     """One run of the encoder.
 
-    :param features: Features of its trunk, with their graph, [B, trunk_dim]
+    :param features: Features of its trunk, detached, as actors read them, [B, trunk_dim]
     :param latents: Latents in fp32, with their graph, [B, features_dim]
     """
 
-    features: th.Tensor
+    features: Any
     latents: th.Tensor
 
 
@@ -95,7 +96,7 @@ class EncoderUpdate:
         del self.mean_squares[source], self.weights[source]
         self.parameter_norms = {}
 
-    def begin(self, views: th.Tensor, next_views: th.Tensor, n_step_views: th.Tensor | None = None) -> None:
+    def begin(self, views: Any, next_views: Any, n_step_views: Any = None) -> None:
         """Begin an update, and forget one that was not brought to its end.
 
         :param views: What the encoder is to see of the observations, preprocessed, [B, *view shape]
@@ -106,7 +107,7 @@ class EncoderUpdate:
         if n_step_views is not None:
             self._inputs["n-step "] = n_step_views
         self._runs: dict[str, Encoded] = {}
-        self._next_features: dict[str, th.Tensor] = {}
+        self._next_features: dict[str, Any] = {}
         self._pulls: dict[str, list[tuple[th.Tensor, th.Tensor]]] = {}
         self.gradient_norms: dict[str, th.Tensor] = {}
         self._measured: dict[str, th.Tensor] = {}
@@ -123,7 +124,7 @@ class EncoderUpdate:
         """
         return self._run("next ")
 
-    def next_features(self, which: str = "next ") -> th.Tensor:
+    def next_features(self, which: str = "next ") -> Any:
         """
         :param which: ``"next "`` or ``"n-step "``
         :return: Features alone of these observations, which actors read, [B, trunk_dim]
@@ -140,7 +141,7 @@ class EncoderUpdate:
             with self.autocast():
                 features = self.encoder.trunk(self._inputs[which])
                 # In full precision, whatever the encoder ends with: losses and optimisers work with these.
-                self._runs[which] = Encoded(features, self.encoder.projection(features).float())
+                self._runs[which] = Encoded(detached(features), self.encoder.projection(features).float())
         return self._runs[which]
 
     def backward(self, source: str, read: Sequence[tuple[th.Tensor, th.Tensor]]) -> None:

@@ -3,13 +3,25 @@
 Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), which the CuRe paper uses (appendix A).
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.layers import Conv2dReLU, FlattenImage, FullPrecision, Projection, conv_sizes, init_weights
+from sb3_cure.layers import (
+    Conv2dReLU,
+    FlattenImage,
+    FullPrecision,
+    Projection,
+    VectorNorm,
+    conv_sizes,
+    init_weights,
+)
+from sb3_cure.observations import image_spaces
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -35,7 +47,13 @@ class Encoder(BaseFeaturesExtractor):
         """Space of what the encoder sees: the observations', or that of crops of them."""
         return self._observation_space
 
-    def forward(self, observations: th.Tensor) -> th.Tensor:
+    def make_projection(self) -> nn.Module:
+        """
+        :return: A new projection of the trunk's features, such as each actor owns
+        """
+        return Projection(self.trunk_dim, self.features_dim, getattr(self.projection, "tanh", True))
+
+    def forward(self, observations: Any) -> th.Tensor:
         """
         :param observations: Preprocessed observations, [B, *shape]; images in [0, 1]
         :return: Latents, [B, features_dim]
@@ -102,6 +120,87 @@ class VectorEncoder(Encoder):
         init_weights(self)
 
 
+class DictTrunk(nn.Module):
+    """Features of each image by a trunk of its own, and the vectors as they are, side by side.
+
+    :param trunks: Trunks of the images, by key
+    :param vectors: Keys of the vectors
+    """
+
+    def __init__(self, trunks: Mapping[str, nn.Module], vectors: list[str]):
+        super().__init__()
+        self.images, self.vectors = list(trunks), vectors
+        self.trunks = nn.ModuleList(trunks.values())
+
+    def forward(self, observations: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
+        """
+        :param observations: Preprocessed observations
+        :return: Features of each image, [B, its trunk_dim]; then, if there are any, all vectors as one, fp32, [B, n]
+        """
+        features = [trunk(observations[key]) for key, trunk in zip(self.images, self.trunks, strict=True)]
+        if self.vectors:
+            features.append(th.cat([observations[key].flatten(1).float() for key in self.vectors], dim=1))
+        return tuple(features)
+
+
+class DictProjection(nn.Module):
+    """What ``DictTrunk`` returns to joined latents: a projection for each image, a LayerNorm for the vectors.
+
+    :param projections: Of the images, in their order
+    :param vector_dim: Size of all vectors together; 0: there are none
+    """
+
+    def __init__(self, projections: list[nn.Module], vector_dim: int):
+        super().__init__()
+        norms = [VectorNorm(vector_dim)] if vector_dim else []
+        self.parts = nn.ModuleList([*projections, *norms])
+
+    def forward(self, features: tuple[th.Tensor, ...]) -> th.Tensor:
+        """
+        :param features: Of each part
+        :return: Latents, fp32, [B, features_dim]
+        """
+        return th.cat([part(feature) for part, feature in zip(self.parts, features, strict=True)], dim=1)
+
+
+class DictEncoder(Encoder):
+    """Dictionaries of images and vectors: an encoder for each image, whose latents are joined with the vectors.
+
+    Vectors need no encoder; they are normalised (``VectorNorm``), so that neither part drowns the other.
+
+    :param observation_space: Dictionary with at least one image
+    :param by_key: Further arguments of the encoders of some images, by key
+    :param kwargs: Arguments of all encoders, as of ``PixelEncoder``; ``features_dim`` is that of each
+    """
+
+    def __init__(
+        self, observation_space: spaces.Dict, by_key: Mapping[str, Mapping[str, Any]] | None = None, **kwargs: Any
+    ):
+        found, own = image_spaces(observation_space), by_key or {}
+        encoders = {key: PixelEncoder(space, **{**kwargs, **own.get(key, {})}) for key, space in found.items()}
+        vectors = {key: space for key, space in observation_space.spaces.items() if key not in found}
+        vector_dim = sum(map(get_flattened_obs_dim, vectors.values()))
+        sizes = [encoder.features_dim for encoder in encoders.values()]
+        super().__init__(
+            observation_space,
+            sum(sizes) + (vector_dim + 2 if vector_dim else 0),
+            sum(encoder.trunk_dim for encoder in encoders.values()) + vector_dim,
+        )
+        #: Encoders of the images by key. Their modules are those of trunk and projection, which register them
+        self.images = encoders
+        #: Which of the latents are theirs
+        self.slices = {key: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, key in enumerate(encoders)}
+        self.vector_dim = vector_dim
+        self.trunk = DictTrunk({key: encoder.trunk for key, encoder in encoders.items()}, list(vectors))
+        self.projection = DictProjection([encoder.projection for encoder in encoders.values()], vector_dim)
+
+    def make_projection(self) -> nn.Module:
+        """
+        :return: Of the same parts as its own; one linear map of all features would drown the vectors
+        """
+        return DictProjection([encoder.make_projection() for encoder in self.images.values()], self.vector_dim)
+
+
 class ExtractorEncoder(Encoder):
     """Any SB3 features extractor as the shared encoder: it is the trunk, and its features are the latents.
 
@@ -110,8 +209,8 @@ class ExtractorEncoder(Encoder):
 
     def __init__(self, extractor: BaseFeaturesExtractor):
         super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
-        is_image = is_image_space(extractor._observation_space)
-        self.trunk = extractor if is_image else FullPrecision(extractor)
+        sees_images = bool(image_spaces(extractor._observation_space))
+        self.trunk = extractor if sees_images else FullPrecision(extractor)
         self.projection = nn.Identity()
 
 

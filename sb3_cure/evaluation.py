@@ -11,11 +11,13 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
+from sb3_cure.observations import images_of, rows_of
 from sb3_cure.policies import encoder_of
-from sb3_cure.srl import CURL
+from sb3_cure.srl import CURL, heads_by_key
 
 ACTORS = ("task", "curious", "random")
 
@@ -27,14 +29,15 @@ class Episode:
 
     :param rewards: Reward of each step, [T]
     :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
-    :param observations: The observations before each step, [T, *shape]; images channels first, as the model has them
+    :param observations: The observations before each step, [T, *shape], or such by key; images channels first, as the
+        model has them
     :param frames: ``env.render()`` after each step, if asked for
     :param states: The true state of the environment before each step, [T, d], if asked for; else empty
     """
 
     rewards: np.ndarray
     srl_errors: np.ndarray
-    observations: np.ndarray
+    observations: Any
     frames: list[np.ndarray]
     states: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -58,10 +61,10 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
     policy.set_training_mode(False)
     errors, fields = [], batch._asdict()
     with th.no_grad():
-        for start in range(0, len(batch.observations), chunk):
+        for start in range(0, len(batch.actions), chunk):
             rows = slice(start, start + chunk)
-            columns = {name: None if column is None else column[rows] for name, column in fields.items()}
-            part = Samples(**{**columns, "views": policy.augmentation.center(columns["observations"])})
+            columns: Any = {name: None if each is None else rows_of(each, rows) for name, each in fields.items()}
+            part = policy.samples(Samples(**columns), random=False)
             errors.append(policy.error(part).float().cpu().numpy())
     return np.concatenate(errors)
 
@@ -86,14 +89,22 @@ def even_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) 
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    head: Any = getattr(model.policy, "srl", None)
-    if not isinstance(head, CURL):
+    heads = _with_banks(model)
+    if not heads:
         return
     actors = [*trained_actors(model), "random"]
-    share = max(len(head.bank) // len(actors), 1)  # type: ignore[arg-type]
     seen = [_as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
-    frames = np.concatenate([each[np.linspace(0, len(each) - 1, share).astype(int)] for each in seen])
-    head.set_bank(th.as_tensor(frames[: len(head.bank)]))  # type: ignore[arg-type]
+    for key, head in heads.items():
+        share = max(len(head.bank) // len(actors), 1)
+        images = [images_of(each, model.observation_space)[key] for each in seen]
+        frames = np.concatenate([each[np.linspace(0, len(each) - 1, share).astype(int)] for each in images])
+        head.set_bank(th.as_tensor(frames[: len(head.bank)]))
+
+
+def _with_banks(model: BaseAlgorithm) -> dict[str, Any]:
+    """The model's heads that have negatives, by the key of their image."""
+    heads = heads_by_key(getattr(model.policy, "srl", None))
+    return {key: head for key, head in heads.items() if isinstance(head, CURL)}
 
 
 @contextlib.contextmanager
@@ -105,22 +116,23 @@ def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None)
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    head: Any = getattr(model.policy, "srl", None)
-    if not isinstance(head, CURL) or int(head.bank_filled) == 0:  # type: ignore[arg-type]
+    heads = _with_banks(model)
+    if not heads or any(int(head.bank_filled) == 0 for head in heads.values()):
         yield
         return
-    usual = head.bank[: int(head.bank_filled)].clone()  # type: ignore[index, arg-type]
+    usual = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
     even_negatives(model, env, seed)
     try:
         yield
     finally:
-        head.set_bank(usual)
+        for key, head in heads.items():
+            head.set_bank(usual[key])
 
 
-def _as_trained(model: BaseAlgorithm, observations: np.ndarray) -> np.ndarray:
+def _as_trained(model: BaseAlgorithm, observations: Any) -> Any:
     """Observations normalised as in training, if a ``VecNormalize`` did so."""
     normalizer = model.get_vec_normalize_env()
-    return observations if normalizer is None else normalizer.normalize_obs(observations)  # type: ignore[return-value]
+    return observations if normalizer is None else normalizer.normalize_obs(observations)
 
 
 def run_episodes(
@@ -174,36 +186,42 @@ def run_episodes(
             steps.append((action, float(reward), terminated))
             if render:
                 frames.append(env.render())
-        seen: Any = maybe_transpose(np.stack(observations), model.observation_space)
+        seen: Any = maybe_transpose(_stacked(observations), model.observation_space)
         actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
             errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))
         kept = {"states": np.stack(true_states)} if states else {}
-        yield Episode(rewards, errors, seen[:-1], frames, **kept)  # type: ignore[arg-type]
+        yield Episode(rewards, errors, rows_of(seen, slice(-1)), frames, **kept)  # type: ignore[arg-type]
+
+
+def _stacked(observations: list[Any]) -> Any:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
+    return np.stack(observations)
 
 
 def _as_batch(
-    model: BaseAlgorithm, observations: np.ndarray, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray
+    model: BaseAlgorithm, observations: Any, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray
 ) -> Samples:
     """An episode in the form in which heads read the replay buffer (actions scaled to [-1, 1])."""
-    seen = th.as_tensor(observations, device=model.device)
+    seen = obs_as_tensor(observations, model.device)
     columns = (model.policy.scale_action(actions), dones[:, None], rewards[:, None])  # type: ignore[operator]
     scaled, done, reward = (th.as_tensor(each, dtype=th.float32, device=model.device) for each in columns)
-    return Samples(seen[:-1], scaled, seen[1:], done, reward)
+    return Samples(rows_of(seen, slice(-1)), scaled, rows_of(seen, slice(1, None)), done, reward)
 
 
 class Uncomfortable(NamedTuple):
     """
     Where the agent's representation errs the most.
 
-    :param observations: The observations, the worst first, [k, *shape]
+    :param observations: The observations, the worst first, [k, *shape], or such by key
     :param errors: Their SRL errors, [k]
     :param ages: How many agent steps ago they were stored, [k]
     :param mean_error: Mean SRL error of the whole replay buffer
     """
 
-    observations: np.ndarray
+    observations: Any
     errors: np.ndarray
     ages: np.ndarray
     mean_error: float
@@ -241,7 +259,9 @@ def most_uncomfortable(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chun
             chosen.append(int(candidate))
         if len(chosen) == k:
             break
-    observations = transitions(buffer, rows[chosen], env_inds[chosen]).observations.cpu().numpy()
+    found: Any = transitions(buffer, rows[chosen], env_inds[chosen]).observations
+    is_dict = isinstance(found, dict)
+    observations = {k: part.cpu().numpy() for k, part in found.items()} if is_dict else found.cpu().numpy()
     return Uncomfortable(observations, errors[chosen], ages[chosen] * buffer.n_envs, float(errors.mean()))
 
 

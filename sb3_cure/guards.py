@@ -150,7 +150,11 @@ def crash_report(model: OffPolicyAlgorithm, batch: Any) -> Iterator[None]:
             "environments": list(map(int, envs)),
         }
         (path / "report.json").write_text(json.dumps(about, indent=2))
-        arrays = {name: value.cpu().numpy() for name, value in batch._asdict().items() if isinstance(value, th.Tensor)}
+        parts: dict[str, Any] = {}
+        for name, value in batch._asdict().items():
+            by_key = value if isinstance(value, dict) else {"": value}
+            parts |= {f"{name}.{key}" if key else name: part for key, part in by_key.items()}
+        arrays = {name: value.cpu().numpy() for name, value in parts.items() if isinstance(value, th.Tensor)}
         np.savez_compressed(path / "batch.npz", **arrays)  # type: ignore[arg-type]
         error.crash_report = str(path)
         raise

@@ -1,9 +1,9 @@
 """Building blocks of the encoder, the decoder, the actors and the critics."""
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -60,15 +60,17 @@ def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
     return sizes
 
 
-def preprocess(observations: th.Tensor, observation_space: spaces.Space) -> th.Tensor:
+def preprocess(observations: Any, observation_space: spaces.Space) -> Any:
     """SB3's preprocessing (images divided by 255, discrete values one-hot), images in the cheapest way.
 
-    :param observations: Observations as stored, [B, *shape]
+    :param observations: Observations as stored, [B, *shape], or a dictionary of them
     :param observation_space: Their space (only its kind matters, so crops are welcome)
     :return: Input of the encoder; images in [0, 1], in NHWC memory order and, within autocast, in its number format
     """
+    if isinstance(observation_space, spaces.Dict):
+        return {key: preprocess(observations[key], part) for key, part in observation_space.spaces.items()}
     if not is_image_space(observation_space):
-        return preprocess_obs(observations, observation_space)  # type: ignore[return-value]
+        return preprocess_obs(observations, observation_space)
     device = observations.device.type
     dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else th.float32
     # Reordered while still one byte per value; all of 0-255 is exact in bfloat16.
@@ -199,3 +201,62 @@ class Projection(nn.Module):
         with full_precision(projected):
             latents = self.norm(projected.float())
             return th.tanh(latents) if self.tanh else latents
+
+
+class VectorNorm(nn.Module):
+    """LayerNorm of a vector [B, n] beside the constants 1 and -1, to [B, n + 2].
+
+    LayerNorm takes the mean and the size of what it is given away: of one joint nothing would be left, of a robot at
+    rest as much as of one that moves. Beside two constants both can be read from what these have become.
+
+    :param n: Size of the vector
+    """
+
+    def __init__(self, n: int):
+        super().__init__()
+        self.norm = nn.LayerNorm(n + 2)
+
+    def forward(self, vectors: th.Tensor) -> th.Tensor:
+        with full_precision(vectors):
+            ones = th.ones_like(vectors[:, :1])
+            return self.norm(th.cat([vectors, ones, -ones], dim=1))
+
+
+class MeanError(nn.Module):
+    """Mean over sensors of their errors, each divided by its running deviation; that of one sensor stays as it is.
+
+    Without it the sensor whose errors are the largest numbers would decide what is worth visiting.
+
+    :param n: Number of sensors
+    :param decay: Weight of the past in the running variances, per update
+    """
+
+    variances: th.Tensor
+    weight: th.Tensor
+
+    def __init__(self, n: int, decay: float = 0.99):
+        super().__init__()
+        self.decay = decay
+        self.register_buffer("variances", th.zeros(n))
+        self.register_buffer("weight", th.zeros(()))
+
+    @th.no_grad()
+    def forward(self, errors: Sequence[th.Tensor], learns: bool) -> th.Tensor:
+        """
+        :param errors: Of each sensor, [B]
+        :param learns: Whether the running variances follow
+        :return: [B]
+        """
+        if len(errors) == 1:
+            return errors[0].detach()
+        each = th.stack([error.detach().float() for error in errors])
+        if learns:
+            # As of rewards: a spread below a thousandth of the errors' size is rounding.
+            new = th.maximum(each.var(dim=1, correction=0), 1e-6 * each.square().mean(dim=1))
+            rate = (1 - self.decay) * new.isfinite().all()
+            self.variances.lerp_(new.nan_to_num(), rate)
+            self.weight.lerp_(th.ones_like(self.weight), rate)
+        # The averages start at zero, which their total weight undoes; before the first of them nothing is divided.
+        seen = self.weight > 0
+        deviations = (self.variances / self.weight.clamp(min=1e-12)).sqrt().clamp(min=1e-12)
+        return (each / th.where(seen, deviations, 1.0)[:, None]).mean(dim=0)

@@ -8,6 +8,7 @@ from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoard
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.buffers import Samples, frame_stack_of
+from sb3_cure.observations import image_spaces, rows_of
 from sb3_cure.policies import CuRePolicy
 
 #: Updates between two pictures of reconstructions
@@ -62,10 +63,10 @@ class Metrics(KVWriter):
         """
         keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
         if keeps and model._n_updates % RECONSTRUCTION_INTERVAL == 1:
-            strip = reconstruction_strip(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
-            if strip is not None:
-                image = Image(strip, "CHW")
-                model.logger.record("srl/reconstructions", image, exclude=("stdout", "log", "json", "csv"))
+            strips = reconstruction_strips(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
+            for key, strip in strips.items():
+                name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
+                model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Called by the logger before the formats that write."""
@@ -92,21 +93,38 @@ class Metrics(KVWriter):
 
 
 @th.no_grad()
-def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
+def reconstruction_strips(
+    policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8
+) -> dict[str, np.ndarray]:
     """Newest frames of a few observations above their reconstructions.
 
     :param policy: The policy
-    :param batch: Samples of image observations
+    :param batch: Samples
     :param frame_stack: Frames per observation
     :param columns: How many observations
-    :return: uint8 image (C, 2 * H, columns * W) with C = 1 or 3, or None if no images are drawn
+    :return: For each image that is drawn, by its key (``""`` where observations are images), an image uint8
+        (C, 2 * H, columns * W) with C = 1 or 3
     """
-    observations = batch.observations[:columns]
-    pair = policy.reconstruct(observations) if observations.dim() == 4 else None
-    if pair is None:
-        return None
-    rows = [th.cat(list(newest_frames(images, frame_stack)), dim=2) for images in pair]
-    return th.cat(rows, dim=1).cpu().numpy()
+    if not image_spaces(policy.sensed_space):
+        return {}
+    pair = policy.reconstruct(rows_of(batch.observations, slice(columns))) or ({}, {})
+    seen, drawn = (part if isinstance(part, dict) else {"": part} for part in pair)
+    strips = {}
+    for key in drawn:
+        rows = [th.cat(list(newest_frames(images[key], frame_stack)), dim=2) for images in (seen, drawn)]
+        strips[key] = th.cat(rows, dim=1).cpu().numpy()
+    return strips
+
+
+def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
+    """
+    :param policy: The policy
+    :param batch: Samples
+    :param frame_stack: Frames per observation
+    :param columns: How many observations
+    :return: The (first) image of ``reconstruction_strips``, or None if there is none
+    """
+    return next(iter(reconstruction_strips(policy, batch, frame_stack, columns).values()), None)
 
 
 def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:

@@ -21,11 +21,12 @@ from sb3_cure.augmentations import make_augmentation
 from sb3_cure.buffers import Samples
 from sb3_cure.critics import LatentCritic, TwinQ
 from sb3_cure.encoder_update import EncoderUpdate
-from sb3_cure.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.intrinsic import IntrinsicReward, RewardScale
-from sb3_cure.layers import Projection, full_precision, init_weights, preprocess, run_mlp
+from sb3_cure.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
+from sb3_cure.intrinsic import DictReward, IntrinsicReward, RewardScale
+from sb3_cure.layers import full_precision, init_weights, preprocess, run_mlp
+from sb3_cure.observations import image_spaces, images_of, join, sensed_space
 from sb3_cure.precision import compile_while_training
-from sb3_cure.srl import SRLHead
+from sb3_cure.srl import DictHead, SRLHead, heads_by_key
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -127,13 +128,14 @@ class CuRePolicy(BasePolicy):
     ``actor``, ``critic`` and ``critic_target`` are the task's. ``intrinsic`` computes the intrinsic reward, ``scale``
     scales it. ``augmentation`` says what the encoder sees, ``encoder_update`` how it is stepped.
 
-    :param observation_space: Observation space (channels-first images, or vectors)
+    :param observation_space: Observation space (channels-first images, vectors, or a dictionary of both)
     :param action_space: Action space
     :param lr_schedule: Learning rate schedule
     :param net_arch: Hidden layers of actors and critics (paper: 1024; two of them in SAC-AE)
     :param activation_fn: Activation function
     :param use_sde: Accepted because SB3 passes it
-    :param features_extractor_class: ``PixelEncoder``, ``VectorEncoder`` or any SB3 ``BaseFeaturesExtractor``
+    :param features_extractor_class: ``PixelEncoder``, ``VectorEncoder``, ``DictEncoder`` or any SB3
+        ``BaseFeaturesExtractor``
     :param features_extractor_kwargs: Its arguments
     :param optimizer_class: Optimiser of everything, ``th.optim.Adam`` by default
     :param optimizer_kwargs: Its arguments but for the learning rate
@@ -190,7 +192,7 @@ class CuRePolicy(BasePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class or self.default_encoder,
+            features_extractor_class or self.choose_encoder(observation_space),
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -213,9 +215,12 @@ class CuRePolicy(BasePolicy):
             augmentation_kwargs=augmentation_kwargs,
             update=update,
         )
+        #: What encoder, head and rewards take observations for
+        self.sensed_space = sensed_space(observation_space)
+        chosen: Any = augmentation
         if augmentation == "auto":
-            augmentation = None if srl_class is None else srl_class.choose_augmentation(observation_space)
-        self.augmentation = make_augmentation(augmentation, observation_space, **(augmentation_kwargs or {}))
+            chosen = None if srl_class is None else srl_class.choose_augmentation
+        self.augmentation = make_augmentation(chosen, self.sensed_space, **(augmentation_kwargs or {}))
         self._build_encoder(srl_class, srl_kwargs or {})
         self.task = self._make_actor_critic()
         self.curious = self.intrinsic = None
@@ -229,10 +234,36 @@ class CuRePolicy(BasePolicy):
             self.encoder, encoder_sources, update, optimizer_class, lr=self.learning_rate, **self.optimizer_kwargs
         )
 
-    def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
-        kwargs = self.features_extractor_kwargs
+    @classmethod
+    def choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+        """
+        :param observation_space: Observation space
+        :return: Class of the encoder where the user names none
+        """
+        return cls.default_encoder
+
+    def _encoder_kwargs(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> dict[str, Any]:
+        """The user's, and what the head asks for where the user does not."""
+        kwargs = dict(self.features_extractor_kwargs)
         if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
-            kwargs = {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
+            return {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
+        if srl_class is not None and issubclass(self.features_extractor_class, DictEncoder):
+            own, by_key = kwargs.pop("by_key", {}), {}
+            for key in image_spaces(self.sensed_space):
+                asked = srl_class.configure_encoder(self.augmentation.of(key), **srl_kwargs)
+                by_key[key] = {**asked, **kwargs, **own.get(key, {})}
+            return {"by_key": by_key}
+        return kwargs
+
+    def _build_head(self, srl_class: type[SRLHead], srl_kwargs: dict[str, Any]) -> SRLHead:
+        # Dynamics are of the joined latents; what there is to see of an image is each image's own.
+        joined = srl_class.needs_next_latents or srl_class.models_transitions
+        if joined or not isinstance(self.sensed_space, spaces.Dict):
+            return srl_class(self.encoder, self.sensed_space, **srl_kwargs)
+        return DictHead(srl_class, self.encoder, self.sensed_space, **srl_kwargs)
+
+    def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
+        kwargs = self._encoder_kwargs(srl_class, srl_kwargs)
         self.encoder = make_encoder(self.features_extractor_class, self.augmentation.view_space, **kwargs)
         self.encoder_target = copy.deepcopy(self.encoder).requires_grad_(False)
         self.srl = None
@@ -241,7 +272,7 @@ class CuRePolicy(BasePolicy):
             if srl_class.models_transitions:
                 srl_kwargs = {"action_space": self.action_space, **srl_kwargs}
             with _seeded(seed):
-                self.srl = srl_class(self.encoder, self.observation_space, **srl_kwargs)
+                self.srl = self._build_head(srl_class, srl_kwargs)
             self.srl.bind(self.encoder_target, self.augmentation)
             # A head may hold the encoder as a part of its own: it is the encoder's optimiser that trains it.
             shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))
@@ -251,14 +282,12 @@ class CuRePolicy(BasePolicy):
         self._intrinsic_seed = seed + 1
 
     def _build_intrinsic(self, intrinsic_class: type[IntrinsicReward], kwargs: dict[str, Any]) -> None:
-        self._intrinsic_kwargs = kwargs
+        self._intrinsic_choice = intrinsic_class, kwargs
+        per_image = isinstance(self.sensed_space, spaces.Dict) and intrinsic_class.configured(**kwargs).per_image
+        make: Any = functools.partial(DictReward, intrinsic_class) if per_image else intrinsic_class
         with _seeded(self._intrinsic_seed):
-            self.intrinsic = intrinsic_class(
-                self.observation_space,
-                self.action_space,  # type: ignore[arg-type]
-                self.encoder.features_dim,
-                **kwargs,
-            )
+            self.intrinsic = make(self.sensed_space, self.action_space, self.encoder.features_dim, **kwargs)
+        assert self.intrinsic is not None
         self.intrinsic.bind(self.srl)
         parameters = [parameter for parameter in self.intrinsic.parameters() if parameter.requires_grad]
         self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
@@ -266,12 +295,11 @@ class CuRePolicy(BasePolicy):
     def _make_actor_critic(self) -> ActorCritic:
         encoder = self.encoder
         actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
-        tanh = getattr(encoder.projection, "tanh", True)
         actor = TrunkActor(
             self.observation_space,
             self.action_space,  # type: ignore[arg-type]
             actor_arch,
-            Projection(encoder.trunk_dim, encoder.features_dim, tanh),
+            encoder.make_projection(),  # type: ignore[arg-type]
             encoder.features_dim,
             activation_fn=self.activation_fn,
         )
@@ -359,41 +387,61 @@ class CuRePolicy(BasePolicy):
             part for encoder in (self.encoder, self.encoder_target) for part in (encoder.trunk, encoder.projection)
         ]
         modules += [agent.actor.features_extractor for agent in self.agents.values()]
-        modules += [] if self.srl is None else list(self.srl.children())
+        modules += [part for head in heads_by_key(self.srl).values() for part in head.children()]
         for module in modules:
             if module._compiled_call_impl is None:
                 compile_while_training(module, self)
 
-    def preprocess(self, views: th.Tensor) -> th.Tensor:
+    def sense(self, observations: Any) -> Any:
+        """
+        :param observations: As stored, [B, *shape], or a dictionary of such
+        :return: What encoder, head and rewards take them for: a dictionary without images is one vector
+        """
+        if self.sensed_space is self.observation_space or not isinstance(observations, dict):
+            return observations
+        return join(observations, self.observation_space)  # type: ignore[arg-type]
+
+    def samples(self, sampled: Any, random: bool = True) -> Samples:
+        """
+        :param sampled: What a replay buffer returned
+        :param random: Whether the views are random ones, to learn from; else the centred ones, to measure
+        :return: The same as heads and rewards get it
+        """
+        fields = sampled._asdict()
+        for name in ("observations", "next_observations"):
+            fields[name] = self.sense(fields[name])
+        see = self.views if random else self.augmentation.center
+        return Samples(**{**fields, "views": see(fields["observations"])})
+
+    def preprocess(self, views: Any) -> Any:
         """
         :param views: What the encoder is to see, images in 0-255
         :return: The encoder's input: images in [0, 1]
         """
         return preprocess(views, self.augmentation.view_space)
 
-    def augment(self, observations: th.Tensor) -> th.Tensor:
+    def augment(self, observations: Any) -> Any:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Randomly augmented encoder inputs, as in training
         """
         return self.preprocess(self.views(observations))
 
-    def views(self, observations: th.Tensor) -> th.Tensor:
+    def views(self, observations: Any) -> Any:
         """
         :param observations: [B, *shape], images in 0-255
         :return: What the encoder is to learn from: random views, images in NHWC memory order, [B, *view shape]
         """
-        views = self.augmentation(observations)
-        return views.contiguous(memory_format=th.channels_last) if views.dim() == 4 else views
+        return _channels_last(self.augmentation(self.sense(observations)))
 
-    def center(self, observations: th.Tensor) -> th.Tensor:
+    def center(self, observations: Any) -> Any:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Encoder inputs without randomness, as when acting
         """
-        return self.preprocess(self.augmentation.center(observations))
+        return self.preprocess(self.augmentation.center(self.sense(observations)))
 
-    def encode(self, observations: th.Tensor) -> th.Tensor:
+    def encode(self, observations: Any) -> th.Tensor:
         """
         :param observations: [B, *shape], images in 0-255
         :return: Latents as the acting agent sees them, [B, features_dim]
@@ -416,15 +464,18 @@ class CuRePolicy(BasePolicy):
             return self.intrinsic.error(batch.observations, latents)
         return self.srl.error(batch, latents)  # type: ignore[union-attr]
 
-    def reconstruct(self, observations: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
+    def reconstruct(self, observations: Any) -> tuple[Any, Any] | None:
         """
         :param observations: [B, *shape], images in 0-255
-        :return: What was to be drawn, and what the head, or else the intrinsic reward, draws of it from the latents;
-            None if neither draws
+        :return: What was to be drawn, and what the head, or else the intrinsic reward, draws of it from the latents
+            (of dictionaries, the images by key); None if neither draws
         """
+        observations = self.sense(observations)
         latents = self.encode(observations)
         for part, seen in ((self.srl, self.augmentation.center(observations)), (self.intrinsic, observations)):
             drawn = None if part is None else part.reconstruct(latents)
+            if isinstance(drawn, dict):
+                return images_of(seen, self.sensed_space), drawn
             if drawn is not None:
                 return seen, drawn
         return None
@@ -439,7 +490,7 @@ class CuRePolicy(BasePolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         actor = self.agents[self.default_agent].actor
-        return actor(self.encoder.trunk(self.center(observation)), deterministic)  # type: ignore[arg-type]
+        return actor(self.encoder.trunk(self.center(observation)), deterministic)
 
     @contextlib.contextmanager
     def acting(self, agent: str) -> Iterator[None]:
@@ -464,7 +515,7 @@ class CuRePolicy(BasePolicy):
         data = super()._get_constructor_parameters()
         del data["normalize_images"]
         # Of what there is now: a curious agent may have come for a pretraining.
-        intrinsic = (None, None) if self.intrinsic is None else (type(self.intrinsic), self._intrinsic_kwargs)
+        intrinsic = (None, None) if self.intrinsic is None else self._intrinsic_choice
         return data | dict(
             lr_schedule=self._dummy_schedule,
             net_arch=self.net_arch,
@@ -493,6 +544,25 @@ class MlpPolicy(CuRePolicy):
     default_encoder = VectorEncoder
 
 
+class MultiInputPolicy(CuRePolicy):
+    """``CuRePolicy`` for dictionaries of images and vectors; one without images acts as one vector."""
+
+    @classmethod
+    def choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+        """
+        :param observation_space: Dictionary of images and vectors
+        :return: Class of the encoder
+        """
+        return DictEncoder if image_spaces(observation_space) else VectorEncoder
+
+
+def _channels_last(views: Any) -> Any:
+    """Images in NHWC memory order; vectors as they are."""
+    if isinstance(views, dict):
+        return {key: _channels_last(view) for key, view in views.items()}
+    return views.contiguous(memory_format=th.channels_last) if views.dim() == 4 else views
+
+
 @contextlib.contextmanager
 def _seeded(seed: int) -> Iterator[None]:
     """Random numbers of its own, so that under every head and reward the other networks of a seed begin alike."""
@@ -509,7 +579,7 @@ def encoder_of(policy: BasePolicy) -> tuple[nn.Module, Callable[[th.Tensor], th.
 
     :param policy: A policy
     :return: The encoder, and what it makes, as when acting, of observations as stored ([B, *shape], images in 0-255):
-        latents [B, features_dim]. None for dictionaries, and where nothing is learned in between
+        latents [B, features_dim]. None for dictionaries of other policies, and where nothing is learned in between
     """
     encoder: Any
     encode: Callable[[th.Tensor], th.Tensor]
@@ -524,4 +594,5 @@ def encoder_of(policy: BasePolicy) -> tuple[nn.Module, Callable[[th.Tensor], th.
         # BaseModel's, as an actor-critic's own returns features of both where these are not shared.
         encode = functools.partial(BaseModel.extract_features, owner, features_extractor=encoder)
     learned = any(True for _ in encoder.parameters())
-    return (encoder, encode) if learned and not isinstance(policy.observation_space, spaces.Dict) else None
+    known = isinstance(policy, CuRePolicy) or not isinstance(policy.observation_space, spaces.Dict)
+    return (encoder, encode) if learned and known else None

@@ -7,9 +7,10 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 from torch._functorch import config as functorch_config
+
+from sb3_cure.observations import image_spaces
 
 #: Why ``compile="auto"`` is eager
 NOT_COMPILED = "compiled updates were slower on the CPU they were measured on, and not measured on a GPU yet"
@@ -31,7 +32,7 @@ def resolve_precision(precision: str, device: th.device, observation_space: spac
     :return: ``"fp32"`` or ``"bf16"``; auto chooses bf16 for images, where the device computes it natively
     """
     if precision == "auto":
-        return "bf16" if is_image_space(observation_space) and _has_fast_bf16(device) else "fp32"
+        return "bf16" if image_spaces(observation_space) and _has_fast_bf16(device) else "fp32"
     return precision
 
 

@@ -8,6 +8,7 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.arguments import CuReArguments
@@ -114,11 +115,15 @@ def test_images_of_floats_are_refused() -> None:
 
 
 @pytest.mark.parametrize("cls", [CuReSAC, CuReTQC])
-def test_dictionaries_need_everything_off(cls: type[CuReSAC]) -> None:
+def test_dictionaries_of_sb3s_own_environment(cls: type[CuReSAC]) -> None:
+    """With everything on and off; another policy is refused in SB3's words, or in ours where it is not one of them."""
     env = SimpleMultiObsEnv(discrete_actions=False)
-    with pytest.raises(ValueError, match="a kind of CuRePolicy"):
-        cls("MultiInputPolicy", env)
+    tiny_model("MultiInputPolicy", env, cls, learning_starts=5, buffer_size=20).learn(7)
     cls("MultiInputPolicy", env, srl=None, curiosity=None, buffer_size=20, learning_starts=5).learn(7)
+    with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):
+        cls("CnnPolicy", env)
+    with pytest.raises(ValueError, match="a kind of CuRePolicy: use 'CnnPolicy', 'MlpPolicy' or 'MultiInputPolicy'"):
+        cls(MultiInputPolicy, env)
 
 
 @pytest.mark.parametrize("name", ["learning_rat", "srl_kwarg"])

@@ -238,14 +238,6 @@ def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
     assert differences(state_of(ours), state_of(theirs)) == []
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"srl": None, "curiosity": None, "policy_kwargs": {"share_encoder": True}}])
-@pytest.mark.parametrize("buffer", [None, HerReplayBuffer])
-def test_dictionaries_with_extras_are_refused(kwargs: dict[str, Any], buffer: Any) -> None:
-    """At once, whatever the replay buffer: nothing is half done."""
-    with pytest.raises(ValueError, match="need a kind of CuRePolicy"):
-        CuReSAC("MultiInputPolicy", Goal(), replay_buffer_class=buffer, **kwargs)
-
-
 class Counting(ReplayBuffer):
     """It counts what it gives."""
 

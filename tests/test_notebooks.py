@@ -46,6 +46,12 @@ STEPS = 60
 WARMUP = 40
 EPISODES = 1
 """,
+    "07_camera_and_joints": """
+STEPS = 60
+WARMUP = 40
+EVERY = 30
+EPISODES = 1
+""",
 }
 
 

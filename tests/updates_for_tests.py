@@ -167,6 +167,10 @@ class StraightLine:
     def scaled(self, observations: th.Tensor) -> th.Tensor:
         return observations.float() / 255 if observations.dtype == th.uint8 else observations
 
+    def srl(self, batch: Samples, *latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Loss of the head, and the error of each sample."""
+        return LOSSES[self.model.srl](self, batch, *latents)  # type: ignore[index]
+
     def values(self, critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
         return critic_values(critic, latents, actions)
 
@@ -217,7 +221,7 @@ class StraightLine:
         errors = th.zeros(len(obs))
         if self.head is not None:
             read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
-            loss, errors = LOSSES[self.model.srl](self, batch, *read)
+            loss, errors = self.srl(batch, *read)
             found["srl_loss"] = loss
             learn(loss, self.head, *read)
         if self.model.srl == "spr":

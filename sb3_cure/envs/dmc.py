@@ -1,6 +1,7 @@
 """DeepMind Control tasks as Gymnasium environments that are seen through pixels."""
 
 import difflib
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure.envs.backgrounds import Background
+from sb3_cure.envs.physics import Proprioception
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
 
@@ -108,6 +110,67 @@ class DMCPixels(PixelObservation):
             self.background.load_state_dict(state)
 
 
+class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.utils.RecordConstructorArgs):
+    """
+    Observes a dm_control environment through cameras, and through the joints of the robot itself.
+
+    :param env: An environment of shimmy that has not rendered yet
+    :param cameras: By the key of its images, the index of each camera
+    :param proprioception: Whether there is a key ``"proprioception"``: what
+        :class:`~sb3_cure.envs.physics.Proprioception` gives
+    :param image_size: Height and width of the images in pixels
+    :param kwargs: Further arguments of :class:`DMCPixels`
+    """
+
+    def __init__(
+        self, env: gym.Env, cameras: dict[str, int], proprioception: bool, image_size: int = 84, **kwargs: Any
+    ) -> None:
+        gym.utils.RecordConstructorArgs.__init__(
+            self, cameras=list(cameras.items()), proprioception=proprioception, image_size=image_size, **kwargs
+        )
+        super().__init__(env)
+        self._cameras = {key: DMCPixels(env, image_size, camera_id=index, **kwargs) for key, index in cameras.items()}
+        self._joints = Proprioception(env) if proprioception else None
+        first = next(iter(self._cameras.values()))
+        self.image_size, self.renderer = first.image_size, first.renderer
+        parts: list[tuple[str, gym.Space]] = [(key, each.observation_space) for key, each in self._cameras.items()]
+        if self._joints is not None:
+            #: Names of the joints' positions and velocities
+            self.proprioception_names = self._joints.names
+            parts.append(("proprioception", gym.spaces.Box(-np.inf, np.inf, (len(self._joints.names),), np.float32)))
+        self.observation_space = gym.spaces.Dict(parts)  # type: ignore[assignment]
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        for camera in self._cameras.values():
+            if camera.background is not None:
+                camera.background.begin(seed)
+        return super().reset(seed=seed, options=options)
+
+    def observation(self, observation: Any) -> dict[str, np.ndarray]:
+        seen = {key: camera.observation(observation) for key, camera in self._cameras.items()}
+        return seen if self._joints is None else {**seen, "proprioception": self._joints()}
+
+    def close(self) -> None:
+        for camera in self._cameras.values():
+            camera._camera = None
+        super().close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: The cameras'; all else that observations depend on is the physics'
+        """
+        return {key: camera.state_dict() for key, camera in self._cameras.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: Result of ``state_dict``
+        """
+        for key, camera in self._cameras.items():
+            camera.load_state_dict(state[key])
+
+
 def make_dmc_env(
     domain: str,
     task: str,
@@ -121,6 +184,8 @@ def make_dmc_env(
     seed: int | None = None,
     grayscale: bool = False,
     background: str | None = None,
+    cameras: Sequence[int] | None = None,
+    proprioception: bool = False,
 ) -> gym.Env:
     """
     Make a task of the DeepMind Control suite that is seen through pixels.
@@ -128,6 +193,10 @@ def make_dmc_env(
     Observations are uint8 of shape (3 x frame_stack, image_size, image_size), oldest frame first; the first frame is
     repeated at reset, and one frame is rendered per agent step. Actions are float32 in [-1, 1]. Episodes last 1000
     environment steps and end by truncation. ``unwrapped`` is shimmy's ``DmControlCompatibilityV0``.
+
+    With ``cameras`` or ``proprioception`` observations are dictionaries, for ``"MultiInputPolicy"``: such images under
+    ``"image"``, or ``"camera0"``, ``"camera1"``, ... (by their indices), and what the robot tells of itself under
+    ``"proprioception"``.
 
     :param domain: Domain of the suite, such as ``"cartpole"``
     :param task: Task of that domain, such as ``"swingup"``
@@ -145,6 +214,10 @@ def make_dmc_env(
     :param background: What is seen behind the robot in place of sky, floor and walls: ``"noise"``, random pixels that
         are new in each frame, or a folder of images, one of which is drawn for each episode. Drawn by ``seed``, apart
         from the task, and not shown in videos
+    :param cameras: Indices of several cameras, each rendered once per agent step; ``camera_id`` (by default the first
+        of them) is then that of videos alone
+    :param proprioception: Whether positions and velocities of the robot's own joints are observed, too; neither those
+        of objects and targets nor where the robot is (see :class:`~sb3_cure.envs.physics.Proprioception`)
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack``, ``action_repeat`` and
         ``renderer``
     :raises ValueError: If there is no such task or an argument is out of range
@@ -162,7 +235,8 @@ def make_dmc_env(
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"render_mode={render_mode!r} is not supported; use 'rgb_array', or None for no videos.")
     action_repeat = ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat
-    camera_id = CAMERAS.get(domain, 0) if camera_id is None else camera_id
+    if camera_id is None:
+        camera_id = cameras[0] if cameras else CAMERAS.get(domain, 0)
 
     from sb3_cure.envs.rendering import load_gl
 
@@ -205,10 +279,17 @@ def make_dmc_env(
             seed=seed,
             grayscale=grayscale,
             background=background,
+            cameras=cameras,
+            proprioception=proprioception,
         ),
     )
     env = ActionRepeat(NormalizeActions(env), action_repeat)
-    env = DMCPixels(env, image_size, grayscale, camera_id, renderer, background, seed)
+    seen: dict[str, Any] = dict(grayscale=grayscale, renderer=renderer, background=background, seed=seed)
+    if cameras or proprioception:
+        views = {f"camera{index}": index for index in cameras} if cameras else {"image": camera_id}
+        env = DMCSensors(env, views, proprioception, image_size, **seen)
+    else:
+        env = DMCPixels(env, image_size, camera_id=camera_id, **seen)
     return StackFrames(env, frame_stack)
 
 

@@ -18,7 +18,7 @@ _QUATERNION = [("_qw", ("", "")), ("_qx", ("", "")), ("_qy", ("", "")), ("_qz", 
 _ROTATION = [("_rx", _RADIANS), ("_ry", _RADIANS), ("_rz", _RADIANS)]
 _POSITIONS = [_PLACE + _QUATERNION, _QUATERNION, [("", _METRES)], [("", _RADIANS)]]
 _VELOCITIES = [_PLACE + _ROTATION, _ROTATION, [("", _METRES)], [("", _RADIANS)]]
-_HINGE = 3
+_FREE, _HINGE = 0, 3
 
 # Two coordinates that show what a task is about, for every environment that has both (else the first two), and what
 # they are.
@@ -93,6 +93,48 @@ def physics_state(env: gym.Env) -> np.ndarray:
     around = model.jnt_qposadr[(model.jnt_type == _HINGE) & (model.jnt_limited == 0)]
     positions[around] = np.pi - (np.pi - positions[around]) % (2 * np.pi)
     return np.concatenate([positions, physics.data.qvel])
+
+
+class Proprioception:
+    """What a robot of the DeepMind Control suite can tell of itself: positions and velocities of its own joints.
+
+    Neither of objects and targets nor of where in the world the robot is, which no encoder in a joint tells: left out
+    are the joints of other bodies (balls, pegs, boxes, the spinner of finger) and those with which a robot floats
+    (free joints, ``rootx``, ``rooty``, ``rootz``). Slides are in metres, hinges in radians, or as cosine and sine where
+    they turn all around; velocities are in metres or radians per second.
+
+    :param env: As of ``physics_state_names``
+    :raises ValueError: if the environment is not one of dm_control
+    """
+
+    def __init__(self, env: gym.Env):
+        self._physics = _physics(env)
+        model = self._physics.model
+        own = [joint for joint in range(model.njnt) if _is_own(model, joint)]
+        around = [joint for joint in own if model.jnt_type[joint] == _HINGE and not model.jnt_limited[joint]]
+        bounded = [joint for joint in own if joint not in around]
+        self._bounded, self._around = model.jnt_qposadr[bounded], model.jnt_qposadr[around]
+        self._dofs = model.jnt_dofadr[own]
+        names = {joint: model.id2name(joint, "joint") for joint in own}
+        #: Names of what it gives, in that order
+        self.names = [names[joint] for joint in bounded]
+        self.names += [f"{names[joint]}_{part}" for part in ("cos", "sin") for joint in around]
+        self.names += [f"{names[joint]}_velocity" for joint in own]
+
+    def __call__(self) -> np.ndarray:
+        """
+        :return: Positions, then velocities, float32 [d], in the order of ``names``
+        """
+        data = self._physics.data
+        angles = data.qpos[self._around]
+        parts = data.qpos[self._bounded], np.cos(angles), np.sin(angles), data.qvel[self._dofs]
+        return np.concatenate(parts).astype(np.float32)
+
+
+def _is_own(model: Any, joint: int) -> bool:
+    name, body = model.id2name(joint, "joint"), model.id2name(model.jnt_bodyid[joint], "body")
+    floats = model.jnt_type[joint] == _FREE or name in ("rootx", "rooty", "rootz")
+    return not floats and not body.startswith(("ball", "peg", "box", "spinner"))
 
 
 def telling_coordinates(names: list[str]) -> tuple[str, str]:

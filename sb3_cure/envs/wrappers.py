@@ -156,13 +156,14 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
         return np.array(np.moveaxis(np.atleast_3d(frame), -1, 0), order="C")
 
 
-class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
     Joins the last observations along their first axis, oldest first; the first one of an episode is repeated.
 
-    Images with the channels last (their smallest dimension, as SB3 tells them) are joined along the last axis.
+    Images with the channels last (their smallest dimension, as SB3 tells them) are joined along the last axis. Of
+    dictionaries the images are stacked, the rest stays as it is.
 
-    :param env: An environment whose observations are arrays, such as images
+    :param env: An environment whose observations are arrays, such as images, or dictionaries with images
     :param frame_stack: Number of observations in a stack
     :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows
     """
@@ -171,34 +172,48 @@ class StackFrames(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstruct
         RecordConstructorArgs.__init__(self, frame_stack=frame_stack)
         super().__init__(env)
         self.frame_stack = check_at_least_one("frame_stack", frame_stack, usual=3)
-        box = env.observation_space
-        if not isinstance(box, spaces.Box):
+        space = env.observation_space
+        # Of observations that are no dictionary, under the key ""
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        is_dict = isinstance(space, spaces.Dict)
+        boxes = {
+            k: box for k, box in parts.items() if isinstance(box, spaces.Box) and (len(box.shape) == 3 or not is_dict)
+        }
+        if not boxes:
             raise ValueError(
-                f"Observations of {box} cannot be stacked: expected a Box; wrap in PixelObservation first."
+                f"Observations of {space} cannot be stacked: expected a Box; wrap in PixelObservation first."
             )
-        shape = box.shape
-        self._axis = 2 if len(shape) == 3 and shape[2] < min(shape[:2]) else 0
-        low, high = (np.concatenate([bound] * self.frame_stack, self._axis) for bound in (box.low, box.high))
-        channels = low.shape[self._axis] if low.ndim == 3 else 0
+        self._axes = {
+            k: 2 if len(box.shape) == 3 and box.shape[2] < min(box.shape[:2]) else 0 for k, box in boxes.items()
+        }
+        stacked = {**parts, **{key: self._stacked_space(box, self._axes[key]) for key, box in boxes.items()}}
+        self.observation_space = spaces.Dict(list(stacked.items())) if is_dict else stacked[""]
+        self._frames: dict[str, deque[np.ndarray]] = {key: deque(maxlen=self.frame_stack) for key in boxes}
+
+    def _stacked_space(self, box: spaces.Box, axis: int) -> spaces.Box:
+        low, high = (np.concatenate([bound] * self.frame_stack, axis) for bound in (box.low, box.high))
+        channels = low.shape[axis] if low.ndim == 3 else 0
         if channels > min(low.shape):
             raise ValueError(
-                f"frame_stack={self.frame_stack} images of shape {shape} have {channels} channels in all, but SB3 "
+                f"frame_stack={self.frame_stack} images of shape {box.shape} have {channels} channels in all, but SB3 "
                 "takes the smallest dimension for the channels: choose larger images (image_size) or fewer frames."
             )
-        self.observation_space = spaces.Box(low, high, dtype=box.dtype.type)
-        self._frames: deque[np.ndarray] = deque(maxlen=self.frame_stack)
+        return spaces.Box(low, high, dtype=box.dtype.type)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        frame, info = self.env.reset(seed=seed, options=options)
-        self._frames.extend([np.array(frame)] * self.frame_stack)  # an environment may write the next one into it
-        return np.concatenate(self._frames, self._axis), info
+    def _push(self, observation: Any, times: int) -> Any:
+        parts = observation if isinstance(observation, dict) else {"": observation}
+        for key, frames in self._frames.items():
+            frames.extend([np.array(parts[key])] * times)  # an environment may write the next one into it
+        stacked = {key: np.concatenate(frames, self._axes[key]) for key, frames in self._frames.items()}
+        return {**parts, **stacked} if isinstance(observation, dict) else stacked[""]
 
-    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        frame, reward, terminated, truncated, info = self.env.step(action)
-        self._frames.append(np.array(frame))
-        return np.concatenate(self._frames, self._axis), reward, terminated, truncated, info
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._push(observation, self.frame_stack), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._push(observation, 1), reward, terminated, truncated, info
 
 
 def make_pixel_env(

@@ -4,6 +4,7 @@
 """
 
 from sb3_cure.intrinsic.base import IntrinsicReward, OwnGenerator, RewardScale
+from sb3_cure.intrinsic.dictionary import DictReward
 from sb3_cure.intrinsic.registry import INTRINSIC_REWARDS, get_intrinsic_class
 from sb3_cure.intrinsic.shuffled import Shuffled
 
@@ -11,6 +12,7 @@ INTRINSIC_REWARDS["shuffled"] = Shuffled  # which is made of the others
 
 __all__ = [
     "INTRINSIC_REWARDS",
+    "DictReward",
     "IntrinsicReward",
     "OwnGenerator",
     "RewardScale",

@@ -3,14 +3,17 @@
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_cure.buffers import Samples
 from sb3_cure.srl.base import SRLHead
+
+#: From rows and environments of a replay buffer, [n] each, to its samples
+LookUp = Callable[[np.ndarray, np.ndarray], Samples]
 
 
 class IntrinsicReward(nn.Module):
@@ -36,6 +39,9 @@ class IntrinsicReward(nn.Module):
     mixed_precision: bool = False
     #: Whether policies are measured by ``error`` rather than by the SRL error
     measures: bool = False
+    #: Whether the reward reads observations as one image or vector: of a dictionary, each image then has a reward of
+    #: its own (``DictReward``). Else a reward that reads observations gets the dictionary
+    per_image: bool = False
     #: What the constructor is told of the agent unless ``intrinsic_kwargs`` says otherwise: ``"frame_stack"`` (frames
     #: per image that the replay buffer knows of, else 1), ``"curiosity_target"``
     asks: ClassVar[tuple[str, ...]] = ()
@@ -60,13 +66,11 @@ class IntrinsicReward(nn.Module):
         :raises ValueError: if it is not one that the reward can be made of
         """
 
-    def attach(
-        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
-    ) -> None:
+    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """Called by the algorithm before each ``loss``, for rewards that look beyond the batch.
 
         :param replay_buffer: The replay buffer, which has just drawn the batch
-        :param env: What it normalises with
+        :param look_up: What it holds: samples by rows and environments, [n] each
         :param encode: The online encoder: latents, [n, features_dim], of centred views of stored observations
         """
 

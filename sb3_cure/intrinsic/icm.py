@@ -61,7 +61,7 @@ class ICM(IntrinsicReward):
         :param kwargs: Its other arguments
         :return: This class, or one that does not train the agent's encoder
         """
-        return cls if encoder == "shared" else IntrinsicReward
+        return cls if encoder == "shared" else OwnEncoder
 
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
@@ -86,3 +86,12 @@ class ICM(IntrinsicReward):
         features = self.encoder(scaled(observations, self.observation_space))  # type: ignore[misc]
         with full_precision(features):
             return self.norm(features)  # type: ignore[no-any-return]
+
+
+class OwnEncoder(ICM):
+    """What holds with an encoder of the reward's own."""
+
+    reads = ()
+    trains_encoder = False
+    mixed_precision = True
+    per_image = True

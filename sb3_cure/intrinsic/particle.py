@@ -9,11 +9,10 @@ import torch as th
 from gymnasium import spaces
 from numpy import ndarray
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_cure.buffers import Samples, SkipsMarked, transitions
-from sb3_cure.intrinsic.base import IntrinsicReward
+from sb3_cure.buffers import Samples, SkipsMarked
+from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.networks import make_network, scaled
 from sb3_cure.layers import full_precision
 
@@ -35,6 +34,8 @@ class Particle(IntrinsicReward):
     :param n_filters: Channels of the random network
     :raises ValueError: for another space
     """
+
+    per_image = True
 
     features: th.Tensor
 
@@ -80,13 +81,20 @@ class Particle(IntrinsicReward):
         self.places = state["places"].cpu().numpy().copy()
         self.cursor, self.last_pos = state["counters"].tolist()
 
-    def attach(
-        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
-    ) -> None:
+    @classmethod
+    def configured(cls, space: str = "random", **kwargs: Any) -> type[IntrinsicReward]:
+        """
+        :param space: As of the constructor
+        :param kwargs: Its other arguments
+        :return: This class, or one that does not read images
+        """
+        return cls if space == "random" else IntrinsicReward
+
+    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """Forget what the replay buffer has overwritten; find out who may be whose neighbour; encode what is to be.
 
         :param replay_buffer: The replay buffer
-        :param env: What it normalises with
+        :param look_up: What it holds
         :param encode: The online encoder
         :raises ValueError: if the buffer does not tell which transitions it has drawn
         """
@@ -108,7 +116,7 @@ class Particle(IntrinsicReward):
         if self.encoder is not None:
             self._remembered = self.features[th.from_numpy(known).to(self.features.device)]
         elif len(known) > 0:
-            self._remembered = encode(transitions(replay_buffer, rows[known], env_inds[known], env).next_observations)
+            self._remembered = encode(look_up(rows[known], env_inds[known]).next_observations)
         else:
             self._remembered = None
 

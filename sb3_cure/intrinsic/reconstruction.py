@@ -26,6 +26,7 @@ class Reconstruction(IntrinsicReward):
     reads = ("next_latents",)
     mixed_precision = True
     measures = True
+    per_image = True
 
     def __init__(
         self,

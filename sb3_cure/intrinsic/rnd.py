@@ -1,16 +1,16 @@
 """Random network distillation (RND): what a network has not learned to tell of the newest frame."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_cure.buffers import Samples, transitions, unmarked
-from sb3_cure.intrinsic.base import IntrinsicReward
+from sb3_cure.buffers import Samples, unmarked
+from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.networks import DITHER, make_network, scaled
 
 #: Most observations that the statistics are taken of, and how many at a time
@@ -35,6 +35,7 @@ class RND(IntrinsicReward):
     """
 
     mixed_precision = True
+    per_image = True
     asks = ("frame_stack",)
 
     mean: th.Tensor
@@ -54,6 +55,7 @@ class RND(IntrinsicReward):
         self.space = observation_space
         if is_image_space(observation_space, check_channels=False):
             channels, height, width = observation_space.shape  # type: ignore[misc]
+            frame_stack = 1 if channels % frame_stack else frame_stack  # as the replay buffer takes it
             self.space = spaces.Box(0, 255, (channels // frame_stack, height, width), np.uint8)
         self.target = make_network(self.space, [hidden_dim, n_outputs], n_filters).requires_grad_(False)
         self.predictor = make_network(self.space, [hidden_dim, hidden_dim, hidden_dim, n_outputs], n_filters)
@@ -74,13 +76,11 @@ class RND(IntrinsicReward):
         """
         self.measured = bool(state)
 
-    def attach(
-        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
-    ) -> None:
+    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """Take the statistics, once.
 
         :param replay_buffer: The replay buffer
-        :param env: What it normalises with
+        :param look_up: What it holds
         :param encode: Unused
         """
         if self.measured:
@@ -89,7 +89,7 @@ class RND(IntrinsicReward):
         chosen = np.linspace(0, len(rows) - 1, min(len(rows), OBSERVATIONS)).astype(int)
         total, squares = th.zeros_like(self.mean, dtype=th.float64), th.zeros_like(self.mean, dtype=th.float64)
         for part in np.split(chosen, range(CHUNK, len(chosen), CHUNK)):
-            seen = self._newest(transitions(replay_buffer, rows[part], env_inds[part], env).next_observations).double()
+            seen = self._newest(look_up(rows[part], env_inds[part]).next_observations).double()
             total += seen.sum(dim=0)
             squares += seen.square().sum(dim=0)
         mean = total / len(chosen)

@@ -6,10 +6,9 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_cure.buffers import Samples
-from sb3_cure.intrinsic.base import IntrinsicReward, OwnGenerator
+from sb3_cure.intrinsic.base import IntrinsicReward, LookUp, OwnGenerator
 from sb3_cure.intrinsic.registry import get_intrinsic_class
 from sb3_cure.srl.base import SRLHead
 
@@ -54,15 +53,13 @@ class Shuffled(IntrinsicReward):
         """
         self.of.bind(srl)
 
-    def attach(
-        self, replay_buffer: ReplayBuffer, env: VecNormalize | None, encode: Callable[[th.Tensor], th.Tensor]
-    ) -> None:
+    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """
         :param replay_buffer: For the other reward
-        :param env: The same
+        :param look_up: The same
         :param encode: The same
         """
-        self.of.attach(replay_buffer, env, encode)
+        self.of.attach(replay_buffer, look_up, encode)
 
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None

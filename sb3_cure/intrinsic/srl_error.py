@@ -51,6 +51,8 @@ class SRLError(IntrinsicReward):
         """
         if not self.per_pixel or srl is None:
             return
+        if isinstance(srl.observation_space, spaces.Dict):
+            raise ValueError("per_pixel=True compares the pixels of one image: of dictionaries, use 'reconstruction'.")
         if type(srl).reconstruct is SRLHead.reconstruct:
             raise ValueError(
                 f"per_pixel=True compares pixels, but {type(srl).__name__} does not draw: use srl='rae', another head "

@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
 from sb3_cure.persistence.encoding import BUFFERS, ArchiveError, is_state, read_state, refusing, write_state
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
@@ -23,21 +23,25 @@ def can_be_kept(kind: type) -> bool:
     return kind in BUFFERS
 
 
-def buffer_state(buffer: ReplayBuffer, frames: bool = True) -> dict[str, Any]:
+def buffer_state(buffer: ReplayBuffer, frames: bool = True, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
     """
     :param buffer: A replay buffer
     :param frames: Whether the frames of a ``FrameStackReplayBuffer`` are among its arrays
+    :param leave_out: Of these, arrays by row that another buffer has, too
     :return: What of it was written to, as plain values and views of its arrays
     """
     n_rows = buffer.buffer_size if buffer.full else buffer.pos
     state = {"class": type(buffer).__name__, "size": buffer.buffer_size, "n_envs": buffer.n_envs}
     counters = {"pos": int(buffer.pos), "full": bool(buffer.full)}
     if isinstance(buffer, FrameStackReplayBuffer):
-        arrays = {name: getattr(buffer, name)[:n_rows] for name in buffer._ROW_ARRAYS} | {"_tails": buffer._tails}
+        rows = [name for name in buffer._ROW_ARRAYS if name not in leave_out]
+        arrays = {name: getattr(buffer, name)[:n_rows] for name in rows} | {"_tails": buffer._tails}
         counters |= {name: int(getattr(buffer, name)) for name in _FRAME_COUNTERS}
         if frames:
             arrays["frames"] = buffer.frames[: buffer._n_frames]
         return {**state, "frame_capacity": buffer.frame_capacity, "counters": counters, "arrays": arrays}
+    if isinstance(buffer, DictFrameStackReplayBuffer):
+        state["images"] = {key: buffer_state(image, frames, buffer._ROW_ARRAYS) for key, image in buffer.images.items()}
     # The memory-efficient variant keeps the next observation in the next row.
     n_seen = min(n_rows + buffer.optimize_memory_usage, buffer.buffer_size)
     arrays = {}
@@ -82,24 +86,35 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
             optimize_memory_usage=model.optimize_memory_usage,
             **model.replay_buffer_kwargs,
         )
-        counters = state["counters"]
-        vars(buffer).update({key: type(vars(buffer)[key])(value) for key, value in counters.items()})
-        if isinstance(buffer, FrameStackReplayBuffer) and buffer._n_frames > 0:
-            buffer.reserve_frames()
-        own_state = buffer_state(buffer, frames="frames" in state["arrays"])
-        for key in ("frame_capacity", "counters"):
-            if state.get(key) != own_state.get(key):
-                raise ArchiveError(f"{name} has {key}={state.get(key)!s:.50}, not {own_state.get(key)}.")
-        own, given = own_state["arrays"], state["arrays"]
-        for key in sorted(own.keys() | given.keys()):
-            here, there = (_kind(arrays.get(key)) for arrays in (own, given))
-            if here != there:
-                raise ArchiveError(
-                    f"{name} has {key:.50} as {there}, but this model's replay buffer needs {here}: load the replay "
-                    "buffer of a model with the same settings and environment."
-                )
-            own[key][...] = given[key]
+        _restore(buffer, state, name)
         return buffer
+
+
+def _restore(buffer: Any, state: dict[str, Any], name: str, leave_out: tuple[str, ...] = ()) -> None:
+    """Put counters and arrays into a new buffer, and into those that it is made of."""
+    counters, images, given_images = state["counters"], getattr(buffer, "images", {}), state.get("images", {})
+    vars(buffer).update({key: type(vars(buffer)[key])(value) for key, value in counters.items()})
+    if images.keys() != given_images.keys():
+        raise ArchiveError(f"{name} has other images than this model: load the replay buffer of the same environment.")
+    for key, image in images.items():
+        if not counters.items() <= given_images[key]["counters"].items():
+            raise ArchiveError(f"{name} has images that do not belong together: it is damaged.")
+        _restore(image, given_images[key], name, buffer._ROW_ARRAYS)
+    if isinstance(buffer, FrameStackReplayBuffer) and buffer._n_frames > 0:
+        buffer.reserve_frames()
+    own_state = buffer_state(buffer, "frames" in state["arrays"], leave_out)
+    for key in ("frame_capacity", "counters"):
+        if state.get(key) != own_state.get(key):
+            raise ArchiveError(f"{name} has {key}={state.get(key)!s:.50}, not {own_state.get(key)}.")
+    own, given = own_state["arrays"], state["arrays"]
+    for key in sorted(own.keys() | given.keys()):
+        here, there = (_kind(arrays.get(key)) for arrays in (own, given))
+        if here != there:
+            raise ArchiveError(
+                f"{name} has {key:.50} as {there}, but this model's replay buffer needs {here}: load the replay "
+                "buffer of a model with the same settings and environment."
+            )
+        own[key][...] = given[key]
 
 
 def _kind(array: Any) -> str:

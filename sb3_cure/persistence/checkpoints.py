@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
 from sb3_cure.persistence.buffers import buffer_from_state, buffer_state, can_be_kept
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import why_not_restorable
@@ -36,20 +37,21 @@ class CheckpointWriter:
 
     def __init__(self, path: str | Path):
         self.generations = Generations(path)
-        # Files of frames: name, numbers of the first frame and after the last one, and checksum
-        self._segments: list[tuple[str, int, int, str]] = []
+        # Of each ring of frames, its files: name, numbers of the first frame and after the last one, and checksum
+        self._segments: dict[str, list[tuple[str, int, int, str]]] = {}
         # Whose frames they hold
-        self._frame_numbers: object = None
+        self._frame_numbers: dict[str, object] = {}
 
-    def continue_from(self, generation: Generation, state: dict[str, Any], buffer: FrameStackReplayBuffer) -> None:
+    def continue_from(self, generation: Generation, state: dict[str, Any], buffer: ReplayBuffer | None) -> None:
         """
         :param generation: The checkpoint from which a model was just restored, frames and all
         :param state: Its training state
         :param buffer: The model's replay buffer
         """
-        segments = state["buffer"]["segments"]
-        self._segments = [(*segment, generation.sums[f"../segments/{segment[0]}"]) for segment in segments]
-        self._frame_numbers = buffer.frame_numbers
+        for key, ring in rings_of(buffer).items():
+            segments = _ring_state(state["buffer"], key)["segments"]
+            self._segments[key] = [(*segment, generation.sums[f"../segments/{segment[0]}"]) for segment in segments]
+            self._frame_numbers[key] = ring.frame_numbers
 
     def write(
         self, model: OffPolicyAlgorithm, run: Run, keep: int, environments_may_be_gone: bool = False
@@ -63,34 +65,40 @@ class CheckpointWriter:
         :raises OSError: if it could not be; the checkpoints are then as before
         """
         state = training_state(model, run, environments_may_be_gone)
-        buffer = model.replay_buffer
-        segments: list[tuple[str, int, int, str]] = []
+        buffer: Any = model.replay_buffer
+        rings = rings_of(buffer)
+        segments: dict[str, list[tuple[str, int, int, str]]] = {}
 
         def fill(folder: Path, number: int) -> dict[str, str]:
             model.save(folder / MODEL)
-            if isinstance(buffer, FrameStackReplayBuffer):
-                segments[:] = self._write_frames(buffer, number)
+            if rings:
                 state["buffer"] = buffer_state(buffer, frames=False)
-                state["buffer"]["segments"] = [list(segment[:3]) for segment in segments]
+                for place, (key, ring) in enumerate(rings.items()):
+                    segments[key] = self._write_frames(ring, number, key, place)
+                    _ring_state(state["buffer"], key)["segments"] = [list(segment[:3]) for segment in segments[key]]
             else:
                 model.save_replay_buffer(folder / BUFFER)
             for i, output in enumerate(log_files(model.logger)):
                 shutil.copyfile(output.file.name, folder / f"log-{i}")
             write_state(folder / STATE, state)
-            return {name: digest for name, _, _, digest in segments}
+            return {name: digest for each in segments.values() for name, _, _, digest in each}
 
         generation = self.generations.write(fill, keep)
-        self._segments, self._frame_numbers = segments, getattr(buffer, "frame_numbers", None)
+        self._segments = segments
+        self._frame_numbers = {key: ring.frame_numbers for key, ring in rings.items()}
         return generation
 
-    def _write_frames(self, buffer: FrameStackReplayBuffer, number: int) -> list[tuple[str, int, int, str]]:
+    def _write_frames(
+        self, buffer: FrameStackReplayBuffer, number: int, key: str, place: int
+    ) -> list[tuple[str, int, int, str]]:
         """Only those frames that no segment has; segments that the ring has overwritten are left out."""
         oldest, last = max(buffer._n_frames - buffer.frame_capacity, 0), buffer._n_frames
-        known = self._segments if self._frame_numbers is buffer.frame_numbers else []
+        known = self._segments[key] if self._frame_numbers.get(key) is buffer.frame_numbers else []
         segments = [segment for segment in known if segment[2] > oldest]
         first = max(segments[-1][2] if segments else 0, oldest)
         if first < last:
-            path = self.generations.segments / f"frames-{first}-{last}-{number:06d}.bin"
+            which = f"{place}-" if key else ""
+            path = self.generations.segments / f"frames-{which}{first}-{last}-{number:06d}.bin"
             digest = hashlib.sha256()
             with path.open("wb") as file:
                 for run in _runs_of_frames(buffer, first, last):
@@ -99,6 +107,20 @@ class CheckpointWriter:
             flush_to_disk(path)
             segments.append((path.name, first, last, digest.hexdigest()))
         return segments
+
+
+def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameStackReplayBuffer]:
+    """
+    :param buffer: A replay buffer
+    :return: The rings of frames in it, by the key of their image, or the buffer itself as ``""``
+    """
+    if isinstance(buffer, FrameStackReplayBuffer):
+        return {"": buffer}
+    return buffer.images if isinstance(buffer, DictFrameStackReplayBuffer) else {}
+
+
+def _ring_state(state: dict[str, Any], key: str) -> dict[str, Any]:
+    return state["images"][key] if "images" in state else state
 
 
 def _runs_of_frames(buffer: FrameStackReplayBuffer, first: int, last: int) -> Iterator[memoryview]:
@@ -130,25 +152,25 @@ def load_checkpoint(model: Any, generation: Generation, lost: list[Path]) -> dic
     if "buffer" not in state:
         model.load_replay_buffer(folder / BUFFER, truncate_last_traj=False)
         return state
-    if model.replay_buffer_class is not FrameStackReplayBuffer:
+    if model.replay_buffer_class not in (FrameStackReplayBuffer, DictFrameStackReplayBuffer):
         raise CheckpointError(
             f"the checkpoint {folder} has single frames, but this model's replay buffer is a "
             f"{type(model.replay_buffer).__name__}: resume with environments that tell the same frame_stack."
         )
     model.replay_buffer = buffer = buffer_from_state(model, state["buffer"], str(folder))
-    assert isinstance(buffer, FrameStackReplayBuffer)
     lost_names = {path.name for path in lost}
-    for name, first, last in state["buffer"]["segments"]:
-        if name in lost_names:
-            _forget_frames_before(buffer, last)
-            continue
-        if f"../segments/{name}" not in generation.sums:
-            raise CheckpointError(f"{folder} lacks the checksum of {name}")
-        kept = max(first, buffer._n_frames - buffer.frame_capacity)
-        with (folder.parent / "segments" / name).open("rb") as file:
-            file.seek((kept - first) * int(np.prod(buffer.frame_shape)))
-            for run in _runs_of_frames(buffer, kept, last):
-                file.readinto(run)
+    for key, ring in rings_of(buffer).items():
+        for name, first, last in _ring_state(state["buffer"], key)["segments"]:
+            if name in lost_names:
+                _forget_frames_before(ring, last)
+                continue
+            if f"../segments/{name}" not in generation.sums:
+                raise CheckpointError(f"{folder} lacks the checksum of {name}")
+            kept = max(first, ring._n_frames - ring.frame_capacity)
+            with (folder.parent / "segments" / name).open("rb") as file:
+                file.seek((kept - first) * int(np.prod(ring.frame_shape)))
+                for run in _runs_of_frames(ring, kept, last):
+                    file.readinto(run)
     return state
 
 

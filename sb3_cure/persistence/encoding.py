@@ -32,7 +32,7 @@ from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 from torch.nn.modules import activation
 
 from sb3_cure import encoders
-from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.intrinsic import INTRINSIC_REWARDS
 from sb3_cure.srl import SRL_HEADS
 
@@ -73,7 +73,10 @@ def refusing(name: str) -> Iterator[None]:
 # ---------------------------------------------------------------------- names
 
 #: Replay buffers that are written without pickle
-BUFFERS = (FrameStackReplayBuffer, SkippingReplayBuffer, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
+BUFFERS = (
+    *(FrameStackReplayBuffer, DictFrameStackReplayBuffer, SkippingReplayBuffer),
+    *(ReplayBuffer, DictReplayBuffer, NStepReplayBuffer),
+)
 #: Types of the numbers in arrays
 NUMBERS: tuple[type[np.generic], ...] = (
     *(np.bool_, np.float16, np.float32, np.float64),
@@ -104,6 +107,7 @@ NAMED: dict[str, Any] = {
         HerReplayBuffer,
         encoders.PixelEncoder,
         encoders.VectorEncoder,
+        encoders.DictEncoder,
         torch_layers.FlattenExtractor,
         torch_layers.NatureCNN,
         torch_layers.CombinedExtractor,

@@ -8,7 +8,6 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 
-from sb3_cure.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence.archive import SavesModels
 from sb3_cure.persistence.buffers import SavesReplayBuffers
 from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_usable
@@ -68,7 +67,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
         assert model.env is not None, "resume needs the environments of the training"
         state = load_checkpoint(model, generation, lost)
         writer = CheckpointWriter(path)
-        if not lost and isinstance(model.replay_buffer, FrameStackReplayBuffer):
+        if not lost:
             writer.continue_from(generation, state, model.replay_buffer)
         run = model._run
         run.writers[Path(path).resolve()] = writer

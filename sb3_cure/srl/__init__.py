@@ -9,6 +9,7 @@ from sb3_cure.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
+from sb3_cure.srl.dictionary import DictHead, heads_by_key
 from sb3_cure.srl.dynamics import Forward, Inverse
 from sb3_cure.srl.self_prediction import SPR
 from sb3_cure.srl.variational import VAE
@@ -47,10 +48,12 @@ __all__ = [
     "SPR",
     "SRL_HEADS",
     "VAE",
+    "DictHead",
     "Forward",
     "Inverse",
     "PixelDecoder",
     "SRLHead",
     "SRLOutput",
     "get_srl_class",
+    "heads_by_key",
 ]

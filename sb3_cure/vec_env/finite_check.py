@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_cure.observations import image_spaces, images_of
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -51,7 +52,9 @@ class FiniteCheck(VecEnvWrapper):
         # The latest observations that were returned, and which environments returned a bad one in their place
         self._seen: Observations | None = None
         self._stand_ins: npt.NDArray[np.bool_] = np.zeros(self.num_envs, dtype=bool)
-        self._steps_in_the_dark = 0 if is_image_space(self.observation_space) else STEPS_IN_THE_DARK
+        # Keys of images (`""` where observations are images) of which nothing was brighter than black so far
+        self._dark = dict.fromkeys(image_spaces(self.observation_space), 0)
+        self._steps_in_the_dark = 0
         self._normalizer = unwrap_vec_wrapper(self.venv, VecNormalize)
         if self.skip and self._normalizer is not None:
             raise ValueError(
@@ -92,7 +95,7 @@ class FiniteCheck(VecEnvWrapper):
         self.n_steps += self.num_envs
         if rewards.dtype == object:  # of worker processes, one of which returned None
             rewards = rewards.astype(np.float32)
-        if self._steps_in_the_dark < STEPS_IN_THE_DARK:
+        if self._dark:
             self._look_for_light(observations)
         bad_rewards = self._find_bad("reward", rewards)
         bad_ends = np.zeros(self.num_envs, dtype=bool)
@@ -161,17 +164,20 @@ class FiniteCheck(VecEnvWrapper):
             )
         return True
 
-    def _look_for_light(self, observations: np.ndarray) -> None:
+    def _look_for_light(self, observations: Any) -> None:
         self._steps_in_the_dark += 1
-        brightest = np.max(observations)
-        if brightest > 1:
-            self._steps_in_the_dark = STEPS_IN_THE_DARK
-        elif self._steps_in_the_dark == STEPS_IN_THE_DARK:
+        images = images_of(observations, self.observation_space)
+        brightest = {key: int(np.max(images[key])) for key in self._dark}
+        self._dark = {key: value for key, value in brightest.items() if value <= 1}
+        if self._dark and self._steps_in_the_dark == STEPS_IN_THE_DARK:
+            which = f" {', '.join(map(repr, self._dark))}" if any(self._dark) else ""
             warnings.warn(
-                f"no pixel of the images so far is brighter than {brightest} of 255, so that the policy sees black: if "
-                "the environment returns floats in [0, 1], return (255 * image).astype(np.uint8) instead.",
+                f"no pixel of the images{which} so far is brighter than {max(self._dark.values())} of 255, so that the "
+                "policy sees black: if the environment returns floats in [0, 1], return "
+                "(255 * image).astype(np.uint8) instead.",
                 stacklevel=2,
             )
+            self._dark = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies of models: what SB3's wrapper keeps of its class cannot be copied."""

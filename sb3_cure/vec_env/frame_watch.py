@@ -16,7 +16,7 @@ class FrameFaultError(RuntimeError):
 
 class FrameWatch(gym.Wrapper):
     """
-    Looks at the newest frame of uint8 images, beside the physics, and changes nothing.
+    Looks at the newest frame of uint8 images, also of each in a dictionary, beside the physics; and changes nothing.
 
     While the pixels stay the same although something moves, ``info["frozen_frames"]`` counts the steps.
 
@@ -40,7 +40,10 @@ class FrameWatch(gym.Wrapper):
     ) -> None:
         super().__init__(env)
         space = env.observation_space
-        self._sees_images = isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3
+        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        # Of observations that are no dictionary, under the key ""
+        self._boxes = {key: part for key, part in parts.items() if isinstance(part, spaces.Box)}
+        self._images = [key for key, box in self._boxes.items() if box.dtype == np.uint8 and len(box.shape) == 3]
         self._frame_stack = told_by(env, "frame_stack")
         self._allow_black_frames = allow_black_frames
         # Agent steps
@@ -50,9 +53,10 @@ class FrameWatch(gym.Wrapper):
         if state is None and hasattr(getattr(physics, "data", None), "qpos"):
             state = _joint_positions
         self._state = state
-        self._frame: np.ndarray | None = None
+        # By the key of the image: its latest frame, and for how many steps it has stayed the same, in all and in motion
+        self._frame: dict[str, np.ndarray] = {}
+        self._n_same, self._n_moving = dict.fromkeys(self._images, 0), dict.fromkeys(self._images, 0)
         self._position = np.zeros(0)
-        self._n_same = self._n_moving = 0
 
     def set_env_attr(self, name: str, value: Any) -> None:
         """
@@ -70,39 +74,44 @@ class FrameWatch(gym.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._check(observation, is_step=True)
-        if self._n_moving:
-            info = {**info, "frozen_frames": self._n_same}
+        frozen = [self._n_same[key] for key in self._images if self._n_moving[key]]
+        if frozen:
+            info = {**info, "frozen_frames": max(frozen)}
         return observation, reward, terminated, truncated, info
 
     def _check(self, observation: Any, is_step: bool) -> None:
-        space = self.env.observation_space
-        if isinstance(space, spaces.Box) and np.shape(observation) != space.shape:
-            shape = np.shape(observation)
-            raise FrameFaultError(f"returned an observation of shape {shape}, but its space is of shape {space.shape}")
-        if not self._sees_images:
-            return
-        # As in SB3, the smallest of the three dimensions tells where the channels are.
-        axis = 2 if observation.shape[2] < min(observation.shape[:2]) else 0
-        oldest, left_over = divmod(observation.shape[axis] * (self._frame_stack - 1), self._frame_stack)
-        frame = observation if left_over else observation[(slice(None),) * axis + (slice(oldest, None),)]
-        if not self._allow_black_frames and not frame.any():
+        parts = observation if isinstance(observation, dict) else {"": observation}
+        for key, box in self._boxes.items():
+            if np.shape(parts[key]) != box.shape:
+                what, shape = f"{key!r}" if key else "an observation", np.shape(parts[key])
+                raise FrameFaultError(f"returned {what} of shape {shape}, but its space is of shape {box.shape}")
+        frames = {key: self._newest(parts[key]) for key in self._images}
+        if not self._allow_black_frames and not all(frame.any() for frame in frames.values()):
             raise FrameFaultError(
                 "returned a black frame, so that rendering has failed (pass allow_black_frames=True if it may be dark)"
             )
-        if self._patience is None or self._state is None:
+        if not frames or self._patience is None or self._state is None:
             return
         position = np.array(self._state(self.env), dtype=np.float64)
-        if self._frame is None or not np.array_equal(frame, self._frame):
-            self._frame, self._n_same, self._n_moving = frame.copy(), 0, 0
-        else:
-            self._n_same += is_step
-            self._n_moving += bool(np.abs(position - self._position).max(initial=0.0) > self._motion)
+        moves = len(self._frame) > 0 and bool(np.abs(position - self._position).max(initial=0.0) > self._motion)
         self._position = position
-        if self._n_moving >= self._patience:
-            raise FrameFaultError(
-                f"returned the same pixels {self._n_same} times in a row while its physics moved, so that rendering is "
-                "stuck (raise frozen_steps if its camera sees so little)"
-            )
+        for key, frame in frames.items():
+            if key not in self._frame or not np.array_equal(frame, self._frame[key]):
+                self._frame[key], self._n_same[key], self._n_moving[key] = frame.copy(), 0, 0
+            else:
+                self._n_same[key] += is_step
+                self._n_moving[key] += moves
+            if self._n_moving[key] >= self._patience:
+                raise FrameFaultError(
+                    f"returned the same pixels {self._n_same[key]} times in a row while its physics moved, so that "
+                    "rendering is stuck (raise frozen_steps if its camera sees so little)"
+                )
+
+    def _newest(self, image: np.ndarray) -> np.ndarray:
+        # As in SB3, the smallest of the three dimensions tells where the channels are.
+        axis = 2 if image.shape[2] < min(image.shape[:2]) else 0
+        oldest, left_over = divmod(image.shape[axis] * (self._frame_stack - 1), self._frame_stack)
+        return image if left_over else image[(slice(None),) * axis + (slice(oldest, None),)]
 
 
 def _joint_positions(env: gym.Env) -> np.ndarray:

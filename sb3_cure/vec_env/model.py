@@ -50,8 +50,8 @@ class ModelEnvironments(OffPolicyAlgorithm):
         if may_be_marked and not isinstance(self.replay_buffer, SkipsMarked):
             raise ValueError(
                 f"a {type(self.replay_buffer).__name__} cannot promise that faulty transitions are never sampled: use "
-                "a SkippingReplayBuffer or a FrameStackReplayBuffer, or on_bad_transition='raise' and "
-                "on_env_fault='raise'."
+                "a SkippingReplayBuffer or a FrameStackReplayBuffer (DictFrameStackReplayBuffer of dictionaries), or "
+                "on_bad_transition='raise' and on_env_fault='raise'."
             )
         return super()._setup_learn(*args, **kwargs)
 

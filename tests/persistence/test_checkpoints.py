@@ -24,6 +24,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import Goal, SensorBox
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -133,6 +134,13 @@ CASES = {
     # More than is promised: a checkpoint out of turn, at a signal, makes its updates earlier. Those in turn do always.
     "overlapped updates": Case(in_workers, {"overlap": True}),
     "watched workers": Case(in_watched_workers),
+    "dictionaries, small rings": Case(
+        lambda: make_vec_env(SensorBox, 2, env_kwargs={"episode_length": 7}),
+        {"buffer_size": 40, "srl": "curl", "intrinsic": "reconstruction", "intrinsic_kwargs": {"n_layers": 2}},
+        policy="MultiInputPolicy",
+        steps=80,
+    ),
+    "dictionaries without images": Case(Goal, policy="MultiInputPolicy"),
     # Checkpoints are taken after 10, 20, ... steps: episodes of 10 steps, so right after a bad observation, too.
     "bad transitions": Case(
         lambda: make_vec_env(Flawed, 1, env_kwargs={"episode_length": 10}),
@@ -162,18 +170,25 @@ def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallba
     return model
 
 
+def stored_in(buffer: Any) -> dict[str, Any]:
+    """Arrays and counters, of the images of a dictionary, too."""
+    stored = {name: value for name, value in vars(buffer).items() if isinstance(value, np.ndarray | int)}
+    for name in ("observations", "next_observations"):
+        vectors = vars(buffer).get(name)
+        stored |= {f"{name}.{key}": value for key, value in vectors.items()} if isinstance(vectors, dict) else {}
+    return stored | {key: stored_in(image) for key, image in vars(buffer).get("images", {}).items()}
+
+
 def outcome(model: CuReSAC, folder: Path) -> dict[str, Any]:
     """All that training leaves behind; the log without what a clock has written."""
-    buffer = model.replay_buffer
-    ignored = ("psutil",)
-    stored = {name: value for name, value in vars(buffer).items() if isinstance(value, np.ndarray | int)}
+    stored = stored_in(model.replay_buffer)
     with (folder / "logs" / "progress.csv").open() as file:
         rows = list(csv.DictReader(file))
     clocks = ("time/fps", "time/time_elapsed")
     log = [{key: value for key, value in row.items() if key not in clocks} for row in rows]
     return {
         "networks": state_of(model),
-        "buffer": {name: value for name, value in stored.items() if name not in ignored},
+        "buffer": stored,
         "log": log,
         "counters": (model.num_timesteps, model._n_updates, model._episode_num),
         "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),

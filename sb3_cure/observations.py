@@ -1,0 +1,69 @@
+"""Observations of one sensor, or dictionaries of several: which parts are images, and how vectors become one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+
+#: [B, *shape], or such by key
+Observations = th.Tensor | dict[str, th.Tensor]
+
+
+def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
+    """
+    :param space: Space of observations
+    :return: Spaces of the images among them by key; an observation that is itself an image has the key ``""``
+    """
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    return {key: part for key, part in parts.items() if is_image_space(part)}  # type: ignore[misc]
+
+
+def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
+    """
+    :param observations: Arrays or tensors, or dictionaries of them
+    :param space: Their space
+    :return: The images among them, by the keys of ``image_spaces``
+    """
+    return {key: observations[key] if isinstance(observations, dict) else observations for key in image_spaces(space)}
+
+
+def rows_of(observations: Any, rows: Any) -> Any:
+    """
+    :param observations: [n, *shape], or a dictionary of such
+    :param rows: An index, a slice or a mask
+    :return: These rows, as a dictionary if the observations are one
+    """
+    if isinstance(observations, Mapping):
+        return {key: rows_of(part, rows) for key, part in observations.items()}
+    return observations[rows]
+
+
+def sensed_space(space: spaces.Space) -> spaces.Space:
+    """
+    :param space: Space of observations as they are stored
+    :return: What encoder, head and rewards take it for: a dictionary without images is one vector
+    """
+    if not isinstance(space, spaces.Dict) or image_spaces(space):
+        return space
+    return spaces.Box(-np.inf, np.inf, (get_flattened_obs_dim(space),), np.float32)
+
+
+def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
+    """
+    :param observations: Observations without images, as stored
+    :param space: Their space
+    :return: One vector of all, discrete values one-hot, fp32, [B, n]
+    """
+    parts = [preprocess_obs(observations[key], part) for key, part in space.spaces.items()]
+    return th.cat([part.flatten(1) for part in parts], dim=1)  # type: ignore[union-attr]
+
+
+def detached(features: Any) -> Any:
+    """
+    :param features: A tensor, or a tuple of tensors
+    :return: The same without a graph
+    """
+    return features.detach() if isinstance(features, th.Tensor) else tuple(part.detach() for part in features)
