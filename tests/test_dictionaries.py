@@ -99,7 +99,7 @@ class HandWrittenEncoder(th.nn.Module):
     def trunk(self, observations: dict[str, th.Tensor]) -> Any:
         features = []
         for key, trunk in zip(("front", "wrist"), self.of.trunk.trunks, strict=True):
-            first, second = trunk[0], trunk[2]
+            first, second = (layer for layer in trunk if isinstance(layer, th.nn.Conv2d))
             hidden = F.relu(F.conv2d(observations[key], first.weight, first.bias, stride=2))
             hidden = F.relu(F.conv2d(hidden, second.weight, second.bias))
             features.append(hidden.permute(0, 2, 3, 1).reshape(len(hidden), -1))

@@ -458,6 +458,10 @@ def test_positive_error_is_the_distance_of_the_two_views() -> None:
     th.manual_seed(5)
     keys = head.target_encoder(head.augment(batch.observations).float() / 255)
     th.testing.assert_close(error, (latents - keys).square().mean(dim=1).detach(), rtol=1e-4, atol=1e-6)
+    same_shift = head.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
+    own = head.target_encoder(same_shift.unflatten(1, batch.observations.shape[:2])[0].float() / 255)
+    expected = (latents - own).square().mean(dim=1)
+    th.testing.assert_close(head.error(batch, latents), expected, rtol=1e-4, atol=1e-6)
     alone = [head.error(samples, latents[i : i + 1]) for i, samples in enumerate(singles(batch))]
     th.testing.assert_close(th.cat(alone), head.error(batch, latents), rtol=1e-4, atol=1e-6)
 

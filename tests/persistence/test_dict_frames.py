@@ -39,7 +39,7 @@ def test_a_checkpoint_adds_the_new_frames_of_each_image(tmp_path: Path) -> None:
 
 def test_rows_without_one_image_are_given_up(tmp_path: Path) -> None:
     """Where a file of frames is damaged; the other images' are whole, and so is what is left."""
-    model = sensor_model(environment(), gradient_steps=0).learn(60, ExactCheckpoint(20, tmp_path))
+    model = sensor_model(environment(), gradient_steps=0).learn(60, ExactCheckpoint(20, tmp_path, keep=1))
     kept = Generations(tmp_path)
     state = read_state(kept.folder(kept.numbers()[-1]) / "state.safetensors")["buffer"]
     damaged = kept.segments / state["images"]["wrist"]["segments"][1][0]
