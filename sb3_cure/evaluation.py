@@ -314,22 +314,24 @@ def state_probe(
     policy.set_training_mode(False)
     latents, states = [], []
     for episode in episodes:
-        if len(episode.states) != len(episode.observations):
+        n = len(episode.states)
+        if n != len(episode.rewards):
             raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
-        seen = th.as_tensor(_as_trained(model, episode.observations), device=model.device)
+        seen = obs_as_tensor(_as_trained(model, episode.observations), model.device)
+        parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, n, 128)]
         with th.no_grad():
-            latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in seen.split(128)]))
+            latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in parts]))
         states.append(episode.states)
     if len(states) < 2:
         raise ValueError("the probe predicts each episode from others, but there is one at most: give more.")
 
     is_angle = [unit == "rad" for unit in units or [""] * len(names)]
     columns = np.concatenate(states).T
-    parts = [
+    targets_of = [
         np.stack([np.sin(column), np.cos(column)], axis=1) if angle else column[:, None]
         for column, angle in zip(columns, is_angle, strict=True)
     ]
-    targets, inputs = np.concatenate(parts, axis=1), np.concatenate(latents)
+    targets, inputs = np.concatenate(targets_of, axis=1), np.concatenate(latents)
     owners = np.repeat(np.arange(len(states)), [len(each) for each in states])
     errors = np.zeros(targets.shape[1])
     for owner in range(len(states)):
@@ -337,7 +339,7 @@ def state_probe(
         predicted = _ridge(inputs[~own], targets[~own], inputs[own], ridge)
         errors += np.square(predicted - targets[own]).sum(axis=0)
     spread = np.square(targets - targets.mean(axis=0)).sum(axis=0)
-    ends = np.cumsum([part.shape[1] for part in parts])[:-1]
+    ends = np.cumsum([part.shape[1] for part in targets_of])[:-1]
     result = {}
     for name, error, total in zip(names, np.split(errors, ends), np.split(spread, ends), strict=True):
         varies = total.sum() > 1e-9 * len(targets)

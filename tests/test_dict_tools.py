@@ -1,6 +1,7 @@
 """What is around the agent takes dictionaries, too: export, evaluation, callbacks, pictures, crash reports."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.buffers import Samples
 from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
 from sb3_cure.deployment import DeterministicActor
-from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, srl_errors
+from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, srl_errors, state_probe
 from sb3_cure.guards import NonFiniteError
 from sb3_cure.metrics import reconstruction_strips
 from sb3_cure.srl import RAE, SRLOutput
@@ -160,3 +161,11 @@ def test_frame_watch_looks_at_each_camera(what: str, step: int | None, sentence:
             return
         *_, info = env.step(action)
     assert step is None and "frozen_frames" not in info
+
+
+def test_the_true_state_is_probed_in_joined_latents() -> None:
+    """The joints lie in them: what they tell is read nearly perfectly."""
+    model = sensor_model()
+    episodes = run_episodes(model, SensorBox(), 4, "random", seed=0)
+    told = [replace(each, states=each.observations["joints"].astype(np.float64)) for each in episodes]  # type: ignore[call-overload]
+    assert min(state_probe(model, told, ["x", "y"]).values()) > 0.95

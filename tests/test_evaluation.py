@@ -308,7 +308,9 @@ def probed(latents: list[np.ndarray], states: list[np.ndarray], **kwargs: Any) -
     model = tiny_model("MlpPolicy", VectorBox())
     model.policy.encode = lambda observations: observations  # type: ignore[method-assign]
     none = np.zeros(0)
-    episodes = [Episode(none, none, seen, [], state) for seen, state in zip(latents, states, strict=True)]
+    episodes = [
+        Episode(np.zeros(len(state)), none, seen, [], state) for seen, state in zip(latents, states, strict=True)
+    ]
     return state_probe(model, iter(episodes), [f"s{i}" for i in range(states[0].shape[1])], **kwargs)
 
 

@@ -8,6 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import sensor_model
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
@@ -78,6 +79,29 @@ def test_sums_of_any_stream_equal_sb3s(
     for buffer in (twins.ours, twins.skipping):
         seeded_sample(buffer, 40)
         assert_sums_equal(buffer, sb3s(twins, n_steps), n_steps)
+
+
+def test_sums_of_dictionaries() -> None:
+    """Of several images and a vector; where the stream breaks without an end, too."""
+    model = sensor_model(n_steps=3, gamma=GAMMA).learn(30)
+    model.env.reset()  # type: ignore[union-attr]
+    model._last_obs = None
+    model.learn(40, reset_num_timesteps=False)
+    buffer: Any = model.replay_buffer
+    rows = np.arange(70)
+    buffer.last_sampled = rows, np.zeros(70, int)
+    ahead = buffer.look_ahead(3, GAMMA)
+    for row in rows:
+        total, last = 0.0, row
+        for power in range(3):
+            last = row + power
+            total += GAMMA**power * float(buffer.rewards[last, 0])
+            if buffer.dones[last, 0] or last in (29, 69):
+                break
+        assert float(ahead["n_step_rewards"][row]) == pytest.approx(total, rel=1e-5)
+        _, expected = buffer.observations_at(np.array([last]), np.array([0]))
+        for key, part in expected.items():
+            np.testing.assert_array_equal(ahead["n_step_next_observations"][key][row].numpy(), part[0])
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
