@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl screens demo test test-oldest check bench mutation notebooks clean help
+.PHONY: .venv gl screens demo test test-all test-oldest check bench mutation notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -73,6 +73,9 @@ demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten mi
 
 test: gl  ## run the tests in two processes (options for pytest: make test PYTEST_ARGS="-x -k buffer")
 	$(RUN) pytest -n 2 --dist worksteal $(PYTEST_ARGS)
+
+test-all: gl  ## run all combinations of algorithms, heads, rewards and sensors, of which test runs a set
+	SB3_CURE_TEST_ALL=1 $(RUN) pytest -n 2 --dist worksteal tests/test_combinations.py $(PYTEST_ARGS)
 
 # What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
 # the replay buffer, CuRe's own arguments, and the pixels of dm_control.

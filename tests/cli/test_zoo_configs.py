@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure import CuReSAC
 from sb3_cure.cli import zoo
+from sb3_cure.cli.main import main
 from sb3_cure.experiments.demo import ENV_KWARGS, SETTINGS
 from sb3_cure.experiments.grid import load_grid
 
@@ -158,6 +160,19 @@ def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
     assert evaluation.observation_space == model.observation_space
     assert evaluation.get_attr("renderer") == ["fast" if "fast/" in path else "dmc"]
     evaluation.close()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_fast_file_trains_from_the_command_line(
+    method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With its own networks, as users type it; the log shows the burst and the updates after it."""
+    small = ["learning_starts:100", "warmup_updates:20", "batch_size:16"]
+    arguments = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", str(FOLDER / f"fast/{method}.yml")]
+    arguments += ["-n", "300", "-params", *small, "--eval-freq", "-1", "--log-interval", "1", "-f", str(tmp_path)]
+    assert main([*arguments, "--device", "cpu"]) == 0
+    printed = re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)
+    assert int(printed[-1]) == 20 + 149  # up to the last step of two episodes of 125
 
 
 @pytest.mark.parametrize("path", FILES)
