@@ -68,7 +68,7 @@ class CuRe(OffPolicyAlgorithm):
         ``"shuffled"`` (another one without its information, as a control), or a subclass of ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
-        task's; ``"random"``: the second actor draws uniform actions (control); None: off
+        task's; ``"random"``: the second actor draws a uniform action for each bout (control); None: off
     :param curiosity_prob: p_c, probability with which the second actor acts; a number in [0, 1], or a schedule
     :param curiosity_bout: L: who acts is redrawn with probability 1/L per step, and at resets. 1: the paper's coin;
         ``"episode"``: at resets only
@@ -383,7 +383,9 @@ class CuRe(OffPolicyAlgorithm):
 
     def _second_actor_actions(self, where: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1] in the environments where it acts, [n, action_dim]."""
-        if self.curiosity == "random":
+        if self.curiosity == "random" and self.task:
+            actions = self._mixer.hold(self.action_space.sample)
+        elif self.curiosity == "random":
             actions = np.array([self.action_space.sample() for _ in np.flatnonzero(where)])
         else:
             actions, _ = self.predict_curious(rows_of(self._last_obs, where))

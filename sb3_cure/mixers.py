@@ -1,5 +1,6 @@
 """Who acts: the task actor or the curious one (Algorithm 1 of the paper), and for how long."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,10 @@ class CuriousMixer:
         self.curious: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
         #: Where an episode begins with the next step, [n_envs]
         self.starts: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        #: Where a bout of the curious actor begins with this step, [n_envs]
+        self.begins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
+        #: What a random second actor does in its bout, [n_envs, *action shape]
+        self.held: npt.NDArray[Any] = np.zeros(0)
         self.n_steps = 0
         self.n_curious = 0
         self.n_bouts = 0
@@ -46,14 +51,29 @@ class CuriousMixer:
         before = self.curious & ~self.starts
         if bout == 1:
             self.curious = self.rng.random(n_envs) < p
+            self.begins = self.curious
         else:
             redraws = self.starts if bout == "episode" else self.starts | (self.rng.random(n_envs) < 1 / float(bout))
             self.curious = np.where(redraws, self.rng.random(n_envs) < p, self.curious)
+            self.begins = self.curious & redraws
         self.starts = np.zeros(n_envs, dtype=bool)
         self.n_steps += n_envs
         self.n_curious += int(self.curious.sum())
         self.n_bouts += int((self.curious & ~before).sum())
         return self.curious
+
+    def hold(self, sample: Callable[[], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Actions of a random second actor where it acts: drawn where a bout begins, and held until it ends.
+
+        :param sample: Draws an action
+        :return: Where it acts, [n, *action shape]
+        """
+        for i in np.flatnonzero(self.begins):
+            action = sample()
+            if self.held.shape != (len(self.curious), *action.shape):
+                self.held = np.zeros((len(self.curious), *action.shape), dtype=action.dtype)
+            self.held[i] = action
+        return self.held[self.curious]
 
     def pop_metrics(self) -> dict[str, float]:
         """

@@ -1,6 +1,7 @@
 """Who acts, and for how long: draws per environment and step, constant or scheduled, reproducible and counted."""
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_cure import CuReSAC
+from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.mixers import CuriousMixer
 
 BOUTS = st.one_of(st.just("episode"), st.floats(1, 50))
@@ -258,3 +261,51 @@ def test_logged_bout_is_the_mean_as_it_happened(bout: Any, monkeypatch: pytest.M
     model.dump_logs()
     assert written["rollout/curious_bout"] == pytest.approx(np.mean(lengths))
     assert written["rollout/curious_share"] == pytest.approx(curious.mean())
+
+
+# ---------------------------------------------------------------- a random second actor
+
+
+@given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0.1, 1), BOUTS, st.integers(0, 7))
+@settings(deadline=None, max_examples=40)
+def test_random_actions_are_held_for_a_bout(seed: int, n_envs: int, p: float, bout: Any, length: int) -> None:
+    """A new one in each step with L = 1, else where who acts is redrawn; environments hold their own."""
+    mixer, n_drawn = CuriousMixer(seed), 0
+
+    def sample() -> np.ndarray:
+        nonlocal n_drawn
+        n_drawn += 1
+        return np.array([n_drawn, -n_drawn])
+
+    held = np.zeros(n_envs, dtype=int)
+    for step in range(30):
+        if length and step and step % length == 0:
+            mixer.starts = np.ones(n_envs, dtype=bool)
+        began, before = (mixer.starts if step else np.ones(n_envs, dtype=bool)), n_drawn
+        was = mixer.curious.copy() if step else np.zeros(n_envs, dtype=bool)
+        curious = mixer.choose(n_envs, p, bout, 1.0)
+        if not curious.any():
+            continue
+        actions = mixer.hold(sample)
+        assert actions.shape[0] == curious.sum() and (actions[:, 1:] == -actions[:, :1]).all()
+        now = held.copy()
+        now[curious] = actions[:, 0]
+        new = curious & (now > before)
+        assert new[curious & (began | ~was)].all() and n_drawn - before == new.sum()
+        if bout == 1:
+            assert np.array_equal(new, curious)
+        elif bout == "episode":
+            assert np.array_equal(new, curious & began)
+        assert np.array_equal(now[curious & ~new], held[curious & ~new])
+        held = now
+
+
+def test_a_held_action_goes_on_after_a_resume(tmp_path: Path) -> None:
+    """Inside a bout, to the end of the episode."""
+    settings: dict[str, Any] = dict(curiosity="random", curiosity_bout="episode", curiosity_prob=1.0, learning_starts=0)
+    model = tiny_model("MlpPolicy", VectorBox(), **settings)
+    model.learn(5, callback=ExactCheckpoint(5, tmp_path / "at"))
+    resumed = CuReSAC.resume(tmp_path / "at", VectorBox())
+    resumed.learn(10, reset_num_timesteps=False)
+    actions = resumed.replay_buffer.actions[:15, 0]  # type: ignore[union-attr]
+    assert (actions == actions[0]).all()
