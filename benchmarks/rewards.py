@@ -226,7 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("results/rewards"), help="folder to write")
-    parser.add_argument("--seeds", type=int, default=2, help="seeds of each reward (default: 2)")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of each reward (default: 3)")
     parser.add_argument("--updates", type=int, default=300, help="updates before rewards are compared (default: 300)")
     parser.add_argument("--steps", type=int, default=1000, help="agent steps of each visit (default: 1000)")
     options = parser.parse_args(arguments)
