@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
-from sb3_cure.observations import images_of, rows_of
+from sb3_cure.observations import images_of, len_of, rows_of
 from sb3_cure.policies import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
@@ -61,7 +61,7 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
     policy.set_training_mode(False)
     errors, fields = [], batch._asdict()
     with th.no_grad():
-        for start in range(0, len(batch.actions), chunk):
+        for start in range(0, len_of(batch.observations), chunk):
             rows = slice(start, start + chunk)
             columns: Any = {name: None if each is None else rows_of(each, rows) for name, each in fields.items()}
             part = policy.samples(Samples(**columns), random=False)

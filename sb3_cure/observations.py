@@ -41,6 +41,14 @@ def rows_of(observations: Any, rows: Any) -> Any:
     return observations[rows]
 
 
+def len_of(observations: Any) -> int:
+    """
+    :param observations: [n, *shape], or a dictionary of such
+    :return: n
+    """
+    return len_of(next(iter(observations.values()))) if isinstance(observations, Mapping) else len(observations)
+
+
 def sensed_space(space: spaces.Space) -> spaces.Space:
     """
     :param space: Space of observations as they are stored

@@ -173,6 +173,7 @@ def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[Cu
         assert th.equal(norm.weight, th.ones(4))
     np.random.seed(1)
     batch = Samples(*model.replay_buffer.sample(BATCH))
+    batch = batch._replace(views=batch.observations)
     th.manual_seed(1)
     written_out = TwoCameras(model)
     expected = written_out.update(batch, update == "sequential")

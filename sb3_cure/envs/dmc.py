@@ -55,8 +55,7 @@ class DMCPixels(PixelObservation):
             grayscale=grayscale,
             camera_id=camera_id,
             renderer=renderer,
-            background=background,
-            seed=seed,
+            background=background,  # but no seed: what was drawn from it is part of the state
         )
         super().__init__(env, image_size, grayscale)
         self.renderer = renderer

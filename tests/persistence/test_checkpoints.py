@@ -140,7 +140,7 @@ CASES = {
         policy="MultiInputPolicy",
         steps=80,
     ),
-    "dictionaries without images": Case(Goal, policy="MultiInputPolicy"),
+    "dictionaries without images": Case(lambda: make_vec_env(Goal, 1), policy="MultiInputPolicy"),
     # Checkpoints are taken after 10, 20, ... steps: episodes of 10 steps, so right after a bad observation, too.
     "bad transitions": Case(
         lambda: make_vec_env(Flawed, 1, env_kwargs={"episode_length": 10}),
