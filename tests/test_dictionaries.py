@@ -132,7 +132,9 @@ class TwoCameras(StraightLine):
         self.encoder, self.encoder_target = map(HandWrittenEncoder, (self.encoder, self.encoder_target))
 
     def scaled(self, observations: Any) -> Any:
-        return {key: super(TwoCameras, self).scaled(part) for key, part in observations.items()}
+        if isinstance(observations, dict):
+            return {key: self.scaled(part) for key, part in observations.items()}
+        return super().scaled(observations)
 
     def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         losses, errors, joint = [], [], self.head
