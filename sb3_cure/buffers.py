@@ -763,7 +763,7 @@ def choose_replay_buffer(
     is_box = isinstance(observation_space, spaces.Box)
     if is_box and not plain and observation_space.dtype == np.uint8 and len(observation_space.shape) == 3:  # type: ignore[arg-type]
         return FrameStackReplayBuffer, {"frame_stack": _stack_of(env) or 1, **kwargs}
-    return (SkippingReplayBuffer if is_box and (may_be_marked or not plain) else None), kwargs
+    return (SkippingReplayBuffer if may_be_marked or not plain else None), kwargs
 
 
 def restarts_workers(env: VecEnv | None) -> bool:

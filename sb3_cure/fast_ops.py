@@ -8,7 +8,8 @@ from torch.nn import functional as F
 
 
 class _FusedConvReLU(th.autograd.Function):
-    """oneDNN's convolution with bias and ReLU, which then need no passes over the images of their own."""
+    """oneDNN's convolution with its bias, which then needs no pass over the images of its own, and a ReLU. Its ReLU is
+    not oneDNN's, which makes 0 of what is not a number: guards would not see it."""
 
     @staticmethod
     def forward(
@@ -19,7 +20,7 @@ class _FusedConvReLU(th.autograd.Function):
             kernel = weight.transpose(0, 1).flip(2, 3).contiguous(memory_format=th.channels_last)
             padding = len(weight[0, 0]) - 1
         conv = th.ops.mkldnn._convolution_pointwise
-        features: th.Tensor = conv(images, kernel, bias, [padding] * 2, [stride] * 2, [1, 1], 1, "relu", [], "")
+        features: th.Tensor = conv(images, kernel, bias, [padding] * 2, [stride] * 2, [1, 1], 1, "none", [], "").relu_()
         ctx.save_for_backward(images, weight, features)
         ctx.stride, ctx.transposed = stride, transposed
         return features

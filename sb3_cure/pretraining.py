@@ -59,6 +59,11 @@ class Pretraining(CuRe):
         """
         if self._was_over("load_transitions", True):
             return 0
+        if self._vec_normalize_env is not None and self._vec_normalize_env.training:
+            raise ValueError(
+                "load_transitions stores what is on disk, but VecNormalize has no statistics of that: load its own "
+                "(VecNormalize.load) and set training=False, or leave it out."
+            )
         with self._run.calling("load_transitions"):
             return fill(self.replay_buffer, episodes_of(source), self.policy.scale_action)  # type: ignore[arg-type]
 
@@ -110,7 +115,10 @@ class Pretraining(CuRe):
         if curious is not None and any(name.startswith("curious.") for name in networks):
             parts += ["curious.", "intrinsic.", "scale."]
         own = self.policy.state_dict()
-        here, there = ({n: t for n, t in all_.items() if n.startswith(tuple(parts))} for all_ in (own, networks))
+        here, there = (
+            {n: t for n, t in all_.items() if n.startswith(tuple(parts)) and "_extra_state" not in n}
+            for all_ in (own, networks)
+        )
         shapes = [{name: tuple(tensor.shape) for name, tensor in each.items()} for each in (here, there)]
         for name in [name for part in parts for name in here | there if name.startswith(part)] or parts:
             ours, theirs = (each.get(name) for each in shapes)
@@ -126,6 +134,10 @@ class Pretraining(CuRe):
             self.representation_frozen = self.representation_frozen or freeze
             self._freeze_if_asked()
         return self
+
+    def _phase(self) -> tuple[bool, bool]:
+        learns_srl, learns_rl = super()._phase()
+        return learns_srl and not self.representation_frozen, learns_rl
 
     def _freeze_if_asked(self) -> None:
         for part in (self.policy.encoder, self.policy.srl) if self.representation_frozen else ():
@@ -245,6 +257,8 @@ class Pretraining(CuRe):
         policy.default_agent = self._policy_choices()["default_agent"]
         if not keeps_transitions:
             self.replay_buffer.reset()  # type: ignore[union-attr]
+            if policy.intrinsic is not None:
+                policy.intrinsic.forget()
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
         self._warmed_up = False
         self._last_obs = None

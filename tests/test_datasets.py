@@ -12,6 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import VecNormalize
 from updates_for_tests import ALGORITHMS
 
 from sb3_cure import CuReSAC
@@ -204,3 +205,11 @@ def test_calls_that_were_over_are_skipped_after_a_kill(tmp_path: Path) -> None:
     whole = script(tiny_model("MlpPolicy", VectorBox()))
     assert type(whole.replay_buffer) is SkippingReplayBuffer and whole.replay_buffer.size() == 60
     assert differences(state_of(whole), state_of(resumed)) == []
+
+
+def test_unknown_statistics_are_refused(tmp_path: Path) -> None:
+    """VecNormalize would show all of it as the same."""
+    record(VectorBox, tmp_path, 20)
+    model = tiny_model("MlpPolicy", VecNormalize(make_vec_env(VectorBox, 1)))
+    with pytest.raises(ValueError, match="VecNormalize has no statistics"):
+        model.load_transitions(tmp_path)

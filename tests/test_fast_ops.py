@@ -98,6 +98,13 @@ def test_convolution_with_relu(
 
 
 @convolutions
+def test_what_is_not_a_number_shows_after_a_convolution(stride: int, transposed: bool) -> None:
+    inputs = [tensor(1, 4, 9, 9).float(), tensor(4, 4, 3, 3, seed=1).float(), tensor(4, seed=2).float()]
+    inputs[1][0] = th.nan
+    assert conv_relu(*inputs, stride, transposed).isnan().any()  # type: ignore[arg-type]
+
+
+@convolutions
 def test_convolution_with_relu_within_autocast(stride: int, transposed: bool) -> None:
     """One rounding at the end, as torch's own; gradients of the fp32 weights, in fp32."""
     inputs = [tensor(8, 16, 9, 9), tensor(16, 16, 3, 3, seed=1), tensor(16, seed=2)]

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -265,3 +266,26 @@ def test_save_and_load_with_several_steps(algorithm: str, tmp_path: Path) -> Non
         states.append(state_of(loaded))
     assert differences(states[0], states[1]) == []
     assert differences(states[0], states[2]) and differences(states[0], states[3])
+
+
+def test_single_steps_of_discrete_observations_stay_single() -> None:
+    """SB3's own n-step buffer would show heads and the curious agent what came n steps later."""
+    model = tiny_model("MlpPolicy", Numbers(), n_steps=3, srl="forward").learn(30)
+    batch = model.policy.samples(model.replay_buffer.sample(20))  # type: ignore[union-attr]
+    assert isinstance(model.replay_buffer, SkipsMarked)
+    assert ((batch.next_observations - batch.observations) % 5 == 1).all()
+
+
+class Numbers(gym.Env):
+    """Counts to 5 again and again."""
+
+    observation_space = gym.spaces.Discrete(5)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.n = 0
+        return 0, {}
+
+    def step(self, action: np.ndarray) -> Any:
+        self.n += 1
+        return self.n % 5, 1.0, False, self.n >= 12, {}

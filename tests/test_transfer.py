@@ -49,11 +49,11 @@ def test_parts_are_taken_and_the_task_begins_anew(algorithm: str, curiosity: str
 
 
 @both_algorithms
-@pytest.mark.parametrize("update", ["joint", "sequential"])
-def test_frozen_representation_stays(algorithm: str, update: str, tmp_path: Path) -> None:
-    """While all agents learn; also in a model that was saved and loaded."""
-    saved(tmp_path / "model", algorithm)
-    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], seed=5, update=update)
+@pytest.mark.parametrize(("update", "srl"), [("joint", "rae"), ("sequential", "rae"), ("joint", "spr")])
+def test_frozen_representation_stays(algorithm: str, update: str, srl: str, tmp_path: Path) -> None:
+    """While all agents learn; also in a model that was saved and loaded; with its statistics and moving averages."""
+    saved(tmp_path / "model", algorithm, srl=srl)
+    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], seed=5, update=update, srl=srl)
     model.transfer_from(tmp_path / "model", freeze=True)
     kept, agents = tensors(model, ("encoder.", "srl.")), tensors(model, ("task.", "curious."))
     model.learn(16)
@@ -103,3 +103,11 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
     SAC("MlpPolicy", VectorBox(), buffer_size=10).save(tmp_path / "sb3")
     with pytest.raises(ArchiveError, match="was pickled by SB3's save"):
         tiny_model("MlpPolicy", VectorBox()).transfer_from(tmp_path / "sb3")
+
+
+def test_memories_of_another_replay_buffer_stay_behind(tmp_path: Path) -> None:
+    """What a reward remembers of its model's transitions is not that of this one."""
+    saved(tmp_path / "model", intrinsic="particle")
+    model = tiny_model("CnnPolicy", PixelBox(), intrinsic="particle", seed=5).transfer_from(tmp_path / "model")
+    assert (model.policy.intrinsic.places == -1).all()  # type: ignore[union-attr]
+    assert model.learn(16)._n_updates > 0

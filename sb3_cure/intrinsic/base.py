@@ -74,6 +74,9 @@ class IntrinsicReward(nn.Module):
         :param encode: The online encoder: latents, [n, features_dim], of centred views of stored observations
         """
 
+    def forget(self) -> None:
+        """Called when the replay buffer was emptied: forget what refers to it."""
+
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
     ) -> tuple[th.Tensor | None, th.Tensor]:

@@ -63,6 +63,11 @@ class DictReward(IntrinsicReward):
         for key, reward in self._parts():
             reward.attach(replay_buffer, lambda *places, key=key: look_up(*places).of(key), encode)
 
+    def forget(self) -> None:
+        """For each reward."""
+        for _, reward in self._parts():
+            reward.forget()
+
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
     ) -> tuple[th.Tensor | None, th.Tensor]:

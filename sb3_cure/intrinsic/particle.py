@@ -120,6 +120,10 @@ class Particle(IntrinsicReward):
         else:
             self._remembered = None
 
+    def forget(self) -> None:
+        """The memory is of the replay buffer."""
+        self.places[:] = -1
+
     @th.no_grad()
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None

@@ -61,6 +61,10 @@ class Shuffled(IntrinsicReward):
         """
         self.of.attach(replay_buffer, look_up, encode)
 
+    def forget(self) -> None:
+        """For the other reward."""
+        self.of.forget()
+
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
     ) -> tuple[th.Tensor | None, th.Tensor]:

@@ -58,7 +58,8 @@ class NextLatents(SRLHead):
         :param next_latents: Unused
         :return: Mean error, and the error of each prediction, [B]
         """
-        error = self._error(batch, latents, self.augment(batch.next_observations), learns=True)
+        learns = th.is_grad_enabled()  # not in the phases of RL, and not if it is frozen
+        error = self._error(batch, latents, self.augment(batch.next_observations), learns)
         return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()

@@ -539,3 +539,10 @@ def test_declarations_default_to_the_classes_own() -> None:
     assert IntrinsicReward.configured(anything=1) is IntrinsicReward
     assert INTRINSIC_REWARDS["icm"].configured(encoder="own").trains_encoder is False
     assert INTRINSIC_REWARDS["shuffled"].configured(of="icm").trains_encoder is True
+
+
+def test_particles_of_an_emptied_buffer_are_forgotten() -> None:
+    """After a pretraining the memory is of transitions that are no longer there."""
+    model = tiny_model("MlpPolicy", VectorBox(), intrinsic="particle", learning_starts=20)
+    model.pretrain(30)
+    assert (model.policy.intrinsic.places == -1).all()  # type: ignore[union-attr]
