@@ -13,7 +13,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_cure.layers import (
-    Conv2dReLU,
     FlattenImage,
     FullPrecision,
     Projection,
@@ -93,7 +92,7 @@ class PixelEncoder(Encoder):
         layers: list[nn.Module] = []
         for layer in range(n_layers):
             channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
-            layers.append(Conv2dReLU(channels, n_filters, 3, stride))
+            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU(inplace=True)]
         self.trunk = nn.Sequential(*layers, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)

@@ -1,88 +1,24 @@
 """The few kernels that are written for speed. Each has its plain twin in ``tests/test_fast_ops.py``."""
 
-import functools
 from typing import Any
 
 import torch as th
 from torch.nn import functional as F
 
 
-class _FusedConvReLU(th.autograd.Function):
-    """oneDNN's convolution with its bias, which then needs no pass over the images of its own, and a ReLU. Its ReLU is
-    not oneDNN's, which makes 0 of what is not a number: guards would not see it."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: int, transposed: bool
-    ) -> th.Tensor:
-        kernel, padding = weight, 0
-        if transposed:  # a convolution of the padded images with the mirrored kernel
-            kernel = weight.transpose(0, 1).flip(2, 3).contiguous(memory_format=th.channels_last)
-            padding = len(weight[0, 0]) - 1
-        conv = th.ops.mkldnn._convolution_pointwise
-        features: th.Tensor = conv(images, kernel, bias, [padding] * 2, [stride] * 2, [1, 1], 1, "none", [], "").relu_()
-        ctx.save_for_backward(images, weight, features)
-        ctx.stride, ctx.transposed = stride, transposed
-        return features
-
-    @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
-        images, weight, features = ctx.saved_tensors
-        gradient = th.ops.aten.threshold_backward(gradient, features, 0)
-        to_images, to_weight, to_bias = ctx.needs_input_grad[:3]
-        in_kernel = to_bias and not ctx.transposed  # there it costs as much as the gradient of the weights
-        of_images, of_weight, of_bias = th.ops.aten.convolution_backward(
-            *(gradient, images, weight, [len(weight)], [ctx.stride] * 2, [0, 0], [1, 1], ctx.transposed, [0, 0], 1),
-            (to_images, to_weight, in_kernel),
-        )
-        if to_bias and not in_kernel:
-            of_bias = gradient.permute(0, 2, 3, 1).flatten(1).sum(dim=0).view(-1, gradient.shape[1]).sum(dim=0)
-        return of_images, of_weight, of_bias, None, None
-
-
-def conv_relu(
-    images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: int = 1, transposed: bool = False
-) -> th.Tensor:
-    """``relu(conv2d(...))`` or ``relu(conv_transpose2d(...))``, within autocast in its number format. On CPUs both
-    are one kernel of oneDNN.
-
-    :param images: In NHWC memory order, [B, C, H, W]
-    :param weight: [C', C, k, k], or of transposed ones [C, C', k, k]
-    :param bias: [C']
-    :param stride: Of both axes; 1 for transposed ones
-    :param transposed: Whether the convolution is transposed
-    :return: [B, C', H', W']
-    """
-    device = images.device.type
-    if th.is_autocast_enabled(device):
-        images, weight, bias = (each.to(th.get_autocast_dtype(device)) for each in (images, weight, bias))
-    fuses = device == "cpu" and th.backends.mkldnn.is_available() and not _is_traced()
-    if fuses and (images.dtype == th.float32 or (images.dtype == th.bfloat16 and _computes_bf16())):
-        return _FusedConvReLU.apply(images, weight, bias, stride, transposed)  # type: ignore[no-any-return]
-    return F.relu((F.conv_transpose2d if transposed else F.conv2d)(images, weight, bias, stride), inplace=True)
-
-
-def _is_traced() -> bool:
-    """Whether the graph is being recorded, to be compiled or to run elsewhere."""
-    return th.compiler.is_compiling() or th.jit.is_tracing()
-
-
-@functools.cache
-def _computes_bf16() -> bool:
-    return bool(th.ops.mkldnn._is_mkldnn_bf16_supported())
-
-
-def add_bias(images: th.Tensor, bias: th.Tensor) -> th.Tensor:
+def add_bias(images: th.Tensor, bias: th.Tensor, relu: bool = False) -> th.Tensor:
     """``images + bias`` for each channel. Repeated over an image, the bias is added in long runs: torch's own broadcast
     over the few channels of NHWC images costs ten times as much in bf16.
 
     :param images: In NHWC memory order, [B, C, H, W]
     :param bias: [C]
+    :param relu: Whether a ReLU follows
     :return: [B, C, H, W]
     """
     batch, channels, height, width = images.shape
     flat = images.permute(0, 2, 3, 1).reshape(batch, -1)
     biased = flat + bias.to(images.dtype).repeat(height * width)
+    biased = biased.relu_() if relu else biased
     return biased.view(batch, height, width, channels).permute(0, 3, 1, 2)
 
 

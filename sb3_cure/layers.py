@@ -9,8 +9,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
+from torch.nn import functional
 
-from sb3_cure.fast_ops import conv_relu
+from sb3_cure.fast_ops import add_bias
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -147,19 +148,9 @@ def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
         return inputs.float()
 
 
-class Conv2dReLU(nn.Conv2d):
-    """A convolution without padding, and a ReLU."""
-
-    def forward(self, images: th.Tensor) -> th.Tensor:
-        """
-        :param images: In NHWC memory order, [B, in_channels, H, W]
-        :return: [B, out_channels, H', W']
-        """
-        return conv_relu(images, self.weight, self.bias, self.stride[0])  # type: ignore[arg-type]
-
-
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
-    """A transposed convolution of stride 1, and a ReLU."""
+    """torch's transposed convolution of stride 1, and a ReLU. The bias is added afterwards: inside, oneDNN's bias
+    gradient costs as much as that of the weights."""
 
     def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
         """
@@ -167,7 +158,7 @@ class ConvTranspose2dReLU(nn.ConvTranspose2d):
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        return conv_relu(images, self.weight, self.bias, transposed=True)  # type: ignore[arg-type]
+        return add_bias(functional.conv_transpose2d(images, self.weight), self.bias, relu=True)  # type: ignore[arg-type]
 
 
 class FlattenImage(nn.Module):

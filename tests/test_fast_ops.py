@@ -1,7 +1,6 @@
 """Kernels written for speed against their plain twins: values, and the gradients of all that they read."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
@@ -11,16 +10,8 @@ from hypothesis import strategies as st
 from torch.nn import functional as F
 
 from sb3_cure import layers
-from sb3_cure.fast_ops import (
-    SquaredError,
-    add_bias,
-    conv_relu,
-    conv_transpose_cells,
-    from_cells,
-    random_bytes_like,
-    to_cells,
-)
-from sb3_cure.layers import EnsembleLinear, run_mlp
+from sb3_cure.fast_ops import SquaredError, add_bias, conv_transpose_cells, from_cells, random_bytes_like, to_cells
+from sb3_cure.layers import ConvTranspose2dReLU, EnsembleLinear, run_mlp
 
 sizes = st.integers(1, 9)
 
@@ -43,12 +34,16 @@ def agree(fast: Callable[..., th.Tensor], plain: Callable[..., th.Tensor], *inpu
         th.testing.assert_close(mine, theirs)
 
 
-@given(batch=sizes, channels=sizes, height=sizes, width=sizes)
+@given(batch=sizes, channels=sizes, height=sizes, width=sizes, relu=st.booleans())
 @settings(max_examples=30, deadline=None)
-def test_bias_of_channels(batch: int, channels: int, height: int, width: int) -> None:
+def test_bias_of_channels(batch: int, channels: int, height: int, width: int, relu: bool) -> None:
+    def plain(images: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        biased = images + bias.view(-1, 1, 1)
+        return biased.relu() if relu else biased
+
     images, bias = tensor(batch, channels, height, width), tensor(channels, seed=1)
-    agree(add_bias, lambda images, bias: images + bias.view(-1, 1, 1), images, bias)
-    assert add_bias(images, bias).is_contiguous(memory_format=th.channels_last)
+    agree(lambda x, b: add_bias(x, b, relu), plain, images, bias)
+    assert add_bias(images, bias, relu).is_contiguous(memory_format=th.channels_last)
 
 
 @given(batch=sizes, channels=sizes, height=sizes, width=sizes)
@@ -74,51 +69,19 @@ def test_transposed_convolution_by_cells(batch: int, channels: int, drawn: int, 
     agree(lambda *args: from_cells(conv_transpose_cells(*args)), plain, *inputs)
 
 
-convolutions = pytest.mark.parametrize(("stride", "transposed"), [(1, False), (2, False), (1, True)])
+def test_transposed_convolution_with_relu() -> None:
+    layer = ConvTranspose2dReLU(4, 5, 3).double()
+
+    def plain(images: th.Tensor) -> th.Tensor:
+        return F.conv_transpose2d(images, layer.weight, layer.bias).relu()
+
+    agree(layer, plain, tensor(2, 4, 6, 7))
 
 
-def plain_conv_relu(images: th.Tensor, weight: th.Tensor, bias: th.Tensor, stride: int, transposed: bool) -> th.Tensor:
-    return (F.conv_transpose2d if transposed else F.conv2d)(images, weight, bias, stride).relu()
-
-
-@convolutions
-@given(batch=sizes, channels=sizes, filters=sizes, height=st.integers(3, 9), width=st.integers(3, 9))
-@settings(max_examples=20, deadline=None)
-def test_convolution_with_relu(
-    stride: int, transposed: bool, batch: int, channels: int, filters: int, height: int, width: int
-) -> None:
-    shape = (channels, filters) if transposed else (filters, channels)
-    inputs = tensor(batch, channels, height, width), tensor(*shape, 3, 3, seed=1), tensor(filters, seed=2)
-    single = [each.float().requires_grad_() for each in inputs]
-    assert "Fused" in str(conv_relu(*single, stride, transposed).grad_fn)  # type: ignore[arg-type]
-    arguments = partial(partial, stride=stride, transposed=transposed)
-    for dtype in (th.float32, th.float64):
-        own = [each.to(dtype) for each in inputs]
-        agree(arguments(conv_relu), arguments(plain_conv_relu), *own)
-
-
-@convolutions
-def test_what_is_not_a_number_shows_after_a_convolution(stride: int, transposed: bool) -> None:
-    inputs = [tensor(1, 4, 9, 9).float(), tensor(4, 4, 3, 3, seed=1).float(), tensor(4, seed=2).float()]
-    inputs[1][0] = th.nan
-    assert conv_relu(*inputs, stride, transposed).isnan().any()  # type: ignore[arg-type]
-
-
-@convolutions
-def test_convolution_with_relu_within_autocast(stride: int, transposed: bool) -> None:
-    """One rounding at the end, as torch's own; gradients of the fp32 weights, in fp32."""
-    inputs = [tensor(8, 16, 9, 9), tensor(16, 16, 3, 3, seed=1), tensor(16, seed=2)]
-    outputs = []
-    for function in (conv_relu, plain_conv_relu):
-        own = [each.float().requires_grad_() for each in inputs]
-        with th.autocast("cpu", th.bfloat16):
-            features = function(*own, stride, transposed)  # type: ignore[arg-type]
-        assert features.dtype == th.bfloat16
-        features.float().square().mean().backward()
-        outputs.append([features.detach().float(), *(each.grad for each in own)])
-    for mine, theirs in zip(*outputs, strict=True):
-        assert mine.dtype == th.float32  # type: ignore[union-attr]
-        assert F.cosine_similarity(mine.flatten(), theirs.flatten(), dim=0) > 0.9999  # type: ignore[union-attr]
+def test_what_is_not_a_number_shows_after_a_transposed_convolution() -> None:
+    layer = ConvTranspose2dReLU(4, 5, 3)
+    layer.weight.data[0] = th.nan
+    assert layer(tensor(1, 4, 9, 9).float()).isnan().any()
 
 
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
