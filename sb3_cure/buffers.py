@@ -572,15 +572,10 @@ class DictFrameStackReplayBuffer(SkipsMarked):
         self.handle_timeout_termination = handle_timeout_termination
         #: Frames of each image, by key
         self.images: dict[str, FrameStackReplayBuffer] = {}
-        for key, space in image_spaces(observation_space).items():
-            told = frame_stack.get(key, 1) if isinstance(frame_stack, Mapping) else frame_stack
-            if not isinstance(frame_stack, Mapping) and space.shape[0] % told:
-                told = 1
-            settings: dict[str, Any] = dict(
-                handle_timeout_termination=handle_timeout_termination, frames_dir=frames_dir
-            )
+        settings: dict[str, Any] = dict(handle_timeout_termination=handle_timeout_termination, frames_dir=frames_dir)
+        for key, stack in stacks_by_key(observation_space, frame_stack).items():
             self.images[key] = FrameStackReplayBuffer(
-                buffer_size, space, action_space, device, n_envs, frame_stack=told, **settings
+                buffer_size, observation_space[key], action_space, device, n_envs, frame_stack=stack, **settings
             )
         rows = (self.buffer_size, n_envs)
         shapes: Any = self.obs_shape
@@ -725,6 +720,19 @@ def _grown(array: ndarray, length: int) -> ndarray:
     grown = np.zeros((length, *array.shape[1:]), dtype=array.dtype)
     grown[: len(array)] = array
     return grown
+
+
+def stacks_by_key(space: spaces.Dict, frame_stack: int | Mapping[str, int]) -> dict[str, int]:
+    """
+    :param space: Observations by key
+    :param frame_stack: Frames in an observation of each image: by key (of those that are not there: 1), or one number
+        for all (1 where it does not divide the channels)
+    :return: The same by key, for each image
+    """
+    images = image_spaces(space)
+    if isinstance(frame_stack, Mapping):
+        return {key: frame_stack.get(key, 1) for key in images}
+    return {key: 1 if image.shape[0] % frame_stack else frame_stack for key, image in images.items()}
 
 
 def _check_images(space: spaces.Space, frame_stack: int) -> None:

@@ -1,6 +1,6 @@
 """One intrinsic reward for each image of a dictionary."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
-from sb3_cure.buffers import Samples
+from sb3_cure.buffers import Samples, stacks_by_key
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.layers import MeanError
 from sb3_cure.observations import image_spaces
@@ -30,7 +30,7 @@ class DictReward(IntrinsicReward):
     def __init__(
         self,
         reward_class: type[IntrinsicReward],
-        observation_space: spaces.Space,
+        observation_space: spaces.Dict,
         action_space: spaces.Box,
         features_dim: int,
         **kwargs: Any,
@@ -38,10 +38,11 @@ class DictReward(IntrinsicReward):
         super().__init__(observation_space, action_space, features_dim)
         images = image_spaces(observation_space)
         self.keys = list(images)
-        stacks = kwargs.get("frame_stack")
-        own = {key: {"frame_stack": stacks.get(key, 1)} if isinstance(stacks, Mapping) else {} for key in images}
+        stacks = stacks_by_key(observation_space, kwargs["frame_stack"]) if "frame_stack" in kwargs else {}
+        own = {key: {"frame_stack": stack} for key, stack in stacks.items()}
         self.rewards = nn.ModuleList(
-            reward_class(space, action_space, features_dim, **{**kwargs, **own[key]}) for key, space in images.items()
+            reward_class(space, action_space, features_dim, **{**kwargs, **own.get(key, {})})
+            for key, space in images.items()
         )
         self.mean_reward = MeanError(len(images))
         for name in ("needs_srl", "reads", "trains_encoder", "mixed_precision", "measures"):

@@ -89,9 +89,7 @@ class ICM(IntrinsicReward):
 
 
 class OwnEncoder(ICM):
-    """What holds with an encoder of the reward's own."""
+    """With an encoder of the reward's own there is one for each image, and the agent's is left alone."""
 
-    reads = ()
-    trains_encoder = False
-    mixed_precision = True
     per_image = True
+    trains_encoder = False

@@ -55,7 +55,6 @@ class RND(IntrinsicReward):
         self.space = observation_space
         if is_image_space(observation_space, check_channels=False):
             channels, height, width = observation_space.shape  # type: ignore[misc]
-            frame_stack = 1 if channels % frame_stack else frame_stack  # as the replay buffer takes it
             self.space = spaces.Box(0, 255, (channels // frame_stack, height, width), np.uint8)
         self.target = make_network(self.space, [hidden_dim, n_outputs], n_filters).requires_grad_(False)
         self.predictor = make_network(self.space, [hidden_dim, hidden_dim, hidden_dim, n_outputs], n_filters)
