@@ -2,13 +2,16 @@
 
 import statistics
 import time
+from functools import partial
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from benchmarks.harness import BATCH_SIZE, make_env
+from benchmarks.settings import SETTINGS
 from sb3_cure import CuReSAC
 
 
@@ -31,48 +34,56 @@ def _seconds_per_step(model: CuReSAC, steps: int) -> float:
     return (clock.times[-1] - clock.times[0]) / (len(clock.times) - 1)
 
 
-def measure(n_envs: tuple[int, ...] = (1, 2, 4), steps: int = 20, repeats: int = 5, **kwargs: Any) -> dict[str, Any]:
+def measure(n_envs: tuple[int, ...] = (1, 2, 4), steps: int = 20, repeats: int = 5) -> dict[str, Any]:
     """One update per vector step, ``renderer="fast"``.
 
     :param n_envs: Numbers of environments; several live in worker processes, which can overlap with updates
     :param steps: Vector steps per measurement
     :param repeats: Rounds; medians count
-    :param kwargs: For ``CuReSAC``
-    :return: Milliseconds per vector step of collecting, of updating and of both, by number of environments
+    :return: Milliseconds per vector step of collecting, of updating, of both and of what both takes beside the update,
+        by number of environments, in the paper's setting; then by one environment and thread in the small one
     """
-    results: dict[str, Any] = {}
-    for number in n_envs:
-        vec_env = (DummyVecEnv if number == 1 else SubprocVecEnv)([make_env] * number)  # type: ignore[operator]
-        model = CuReSAC("CnnPolicy", vec_env, learning_starts=200, warmup_updates=0, buffer_size=2000, seed=0, **kwargs)
-        model.set_logger(configure(None, []))
-        model.learn(200)
-        rounds = []
-        for _ in range(repeats + 1):
-            model.gradient_steps = 0
-            collecting = _seconds_per_step(model, steps)
-            start = time.perf_counter()
-            model.train(steps, BATCH_SIZE)
-            updating = (time.perf_counter() - start) / steps
-            model.gradient_steps = 1
-            both = _seconds_per_step(model, steps)
-            row = {
-                "collect_ms": 1e3 * collecting,
-                "update_ms": 1e3 * updating,
-                "both_ms": 1e3 * both,
-                "agent_steps_per_s": number / both,
-                "both_over_sum": both / (collecting + updating),
-            }
-            if number > 1:
-                model.overlap = True
-                overlapped = _seconds_per_step(model, steps)
-                model.overlap = False
-                row |= {
-                    "overlapped_ms": 1e3 * overlapped,
-                    "overlapped_over_slower": overlapped / max(collecting, updating),
-                }
-            rounds.append(row)
-        vec_env.close()
-        medians: dict[str, Any] = dict.fromkeys(("overlapped_ms", "overlapped_over_slower"), "-")
-        medians |= {name: round(statistics.median(row[name] for row in rounds[1:]), 3) for name in rounds[0]}
-        results[f"n_envs={number}, renderer=fast"] = medians
+    results = {f"n_envs={number}, renderer=fast": _measure(number, steps, repeats, {}) for number in n_envs}
+    small, threads = SETTINGS[0], th.get_num_threads()
+    th.set_num_threads(small.threads)
+    env = {"image_size": small.size, "grayscale": small.grayscale}
+    networks = {"net_arch": [small.hidden] * 2, "features_extractor_kwargs": {"n_filters": small.filters}}
+    results[f"n_envs=1, renderer=fast, {small}"] = _measure(1, 2 * steps, repeats, env, policy_kwargs=networks)
+    th.set_num_threads(threads)
     return results
+
+
+def _measure(number: int, steps: int, repeats: int, env_kwargs: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+    vec_env = (DummyVecEnv if number == 1 else SubprocVecEnv)([partial(make_env, **env_kwargs)] * number)  # type: ignore[list-item]
+    model = CuReSAC("CnnPolicy", vec_env, learning_starts=200, warmup_updates=0, buffer_size=2000, seed=0, **kwargs)
+    model.set_logger(configure(None, []))
+    model.learn(200)
+    rounds = []
+    for _ in range(repeats + 1):
+        model.gradient_steps = 0
+        collecting = _seconds_per_step(model, steps)
+        start = time.perf_counter()
+        model.train(steps, BATCH_SIZE)
+        updating = (time.perf_counter() - start) / steps
+        model.gradient_steps = 1
+        both = _seconds_per_step(model, steps)
+        row = {
+            "collect_ms": 1e3 * collecting,
+            "update_ms": 1e3 * updating,
+            "both_ms": 1e3 * both,
+            "both_minus_update_ms": 1e3 * (both - updating),
+            "agent_steps_per_s": number / both,
+            "both_over_sum": both / (collecting + updating),
+        }
+        if number > 1:
+            model.overlap = True
+            overlapped = _seconds_per_step(model, steps)
+            model.overlap = False
+            row |= {
+                "overlapped_ms": 1e3 * overlapped,
+                "overlapped_over_slower": overlapped / max(collecting, updating),
+            }
+        rounds.append(row)
+    vec_env.close()
+    medians: dict[str, Any] = dict.fromkeys(("overlapped_ms", "overlapped_over_slower"), "-")
+    return medians | {name: round(statistics.median(row[name] for row in rounds[1:]), 3) for name in rounds[0]}
