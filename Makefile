@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl screens demo test test-all test-oldest check bench mutation notebooks clean help
+.PHONY: .venv gl screens demo test test-all test-oldest check dist bench mutation notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -96,6 +96,11 @@ check: .venv/.installed  ## lint, formatting and types
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 	$(RUN) mypy
+
+dist: .venv/.installed  ## build and check the wheel and the source archive, into dist/
+	rm -rf build dist *.egg-info
+	$(RUN) build --no-isolation
+	$(RUN) twine check --strict dist/*
 
 bench: gl  ## measure speed and memory and write results/benchmarks/ (half an hour; leave the machine alone)
 	$(RUN) benchmarks

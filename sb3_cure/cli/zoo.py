@@ -27,6 +27,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 import sb3_cure
 from sb3_cure.envs.rendering import is_headless
+from sb3_cure.zoo_files import zoo_file
 
 DEFAULT_ALGORITHM = "cure_sac"
 #: Algorithms by the names that ``--algo`` knows them by
@@ -43,6 +44,7 @@ TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
 class ExperimentManager(exp_manager.ExperimentManager):
     """rl-zoo3's, which reads the settings and makes environments and model, with these additions:
 
+    - ``--conf-file fast/cure_sac_ae`` is one of the package's files;
     - an entry ``dmc_pixels:`` of a YAML file holds for the tasks of this namespace that have none of their own, and
       ``my_module:My-v0:`` for an environment that this module registers;
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
@@ -59,6 +61,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             trial = self.load_trial(self.storage, self.study_name, self.trial_id)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
+        self.config = str(zoo_file(self.config))
         env_name = self.env_name
         if self.config.endswith((".yml", ".yaml")):
             # rl-zoo3 looks for the environment's own id, then for "default".

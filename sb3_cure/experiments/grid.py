@@ -22,6 +22,7 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.cure_tqc import CuReTQC
 from sb3_cure.envs.counting import TellCell
 from sb3_cure.envs.rendering import GLUnavailableError
+from sb3_cure.zoo_files import GRIDS, ZOO, zoo_file
 
 #: The file that tells that a cell is finished
 DONE = "DONE"
@@ -114,7 +115,7 @@ class Evaluation(_Part):
 class Method(_Part):
     """An arm of the comparison.
 
-    :param config: Zoo file, by its path relative to the grid's
+    :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
     :param overrides: What differs from the file's entry
     :param algo: A key of ``ALGOS``
     :param pretrain: The phase before training, if any
@@ -362,7 +363,7 @@ def load_grid(
     A file's budget of 0 means pretraining alone: nothing is trained after it. No other budget is in proportion to that,
     so that one can be asked for only where no method pretrains.
 
-    :param path: YAML file
+    :param path: YAML file, or the name of one of the package's grids, such as ``fast/curves``
     :param seeds: Instead of the file's: how many (the first of those that it lists, else from 0), or which
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
@@ -370,7 +371,7 @@ def load_grid(
     :return: The grid
     :raises GridError: with one sentence about what is wrong
     """
-    path = Path(path)
+    path = _find(path, GRIDS)
     content = _read_yaml(path)
     file = _validated(path, content)
     if budget is not None and budget != file.budget:
@@ -399,6 +400,13 @@ def load_grid(
     return Grid(file.experiment, file.kind, file.baseline, cells, arms, description)
 
 
+def _find(name: str | Path, folder: Path) -> Path:
+    try:
+        return zoo_file(name, folder)
+    except ValueError as error:
+        raise GridError(str(error)) from None
+
+
 def _validated(path: Path, content: Any) -> GridFile:
     try:
         return GridFile.model_validate(content)
@@ -425,7 +433,7 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
 def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
     """What an arm means on a task, of the zoo file's entry with the grid's overrides: ``n_envs``, ``env_kwargs`` and
     arguments of the algorithm."""
-    config = path.parent / method.config
+    config = path.parent / _find(method.config, ZOO)
     entries, name = _read_yaml(config), task.rpartition(":")[2]
     found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
     if not found:

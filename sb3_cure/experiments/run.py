@@ -340,7 +340,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Run a grid of experiments; what is done is not run again, what was interrupted goes on.",
     )
     add = parser.add_argument
-    add("grid", type=Path, help="YAML file, for example zoo_configs/experiments/curves.yml")
+    add("grid", help="YAML file, or the name of one of the package's grids, such as curves or fast/curves")
     add("--out", type=Path, default=Path("results"), help="folder of results (default: results)")
     seeds = "how many (5: the first ones, where the grid lists its seeds), or which (0,3,4; one alone: 3,)"
     add("--seeds", type=_seed_choice, metavar="SEEDS", help=seeds)

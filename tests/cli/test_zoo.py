@@ -248,6 +248,11 @@ def test_settings_may_be_python(folder: Path) -> None:
     assert main(["enjoy", "--env", TASK, "-n", "7", "--no-render"]) == 0
 
 
+def test_unknown_names_of_settings_tell_those_there_are(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"'cure_sac' is neither .*: cure_curl, cure_sac_ae, .*, fast/cure_curl, "):
+        main(["train", "--env", TASK, "--conf-file", "cure_sac"])
+
+
 def test_rl_zoos_own_algorithms_still_train(folder: Path) -> None:
     assert main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
     assert Path("logs/dqn/CartPole-v1_1/CartPole-v1.zip").is_file()

@@ -166,9 +166,9 @@ def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
 def test_each_fast_file_trains_from_the_command_line(
     method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """With its own networks, as users type it; the log shows the burst and the updates after it."""
+    """By its name and with its own networks, as users type it; the log shows the burst and the updates after it."""
     small = ["learning_starts:100", "warmup_updates:20", "batch_size:16"]
-    arguments = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", str(FOLDER / f"fast/{method}.yml")]
+    arguments = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", f"fast/{method}"]
     arguments += ["-n", "300", "-params", *small, "--eval-freq", "-1", "--log-interval", "1", "-f", str(tmp_path)]
     assert main([*arguments, "--device", "cpu"]) == 0
     printed = re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)

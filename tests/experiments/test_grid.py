@@ -43,6 +43,18 @@ def test_number_of_seeds_counts_those_listed(tmp_path: Path) -> None:
     assert [cell.seed for cell in load_grid(write_grid(tmp_path, seeds=2), seeds=3).cells] == [0, 1, 2]
 
 
+def test_grids_and_settings_of_the_package_by_name(tmp_path: Path) -> None:
+    """The same cells as by path; names that there are not are told from those that there are."""
+    assert load_grid("fast/curves") == load_grid(GRIDS / "fast" / "curves.yml")
+    methods = {"a": {"config": "fast/sac_ae"}}
+    (cell,) = load_grid(write_grid(tmp_path, methods=methods, tasks=[DMC_TASK], seeds=1)).cells
+    assert (cell.arguments["policy"], cell.env_kwargs["renderer"]) == ("CnnPolicy", "fast")
+    with pytest.raises(GridError, match=r"'fast/curve' is neither .*, visitation, .*, fast/curves, "):
+        load_grid("fast/curve")
+    with pytest.raises(GridError, match=r"'sac' is neither .*, sac_ae, .*, fast/sac_ae, "):
+        load_grid(write_grid(tmp_path, methods={"a": {"config": "sac"}}))
+
+
 @pytest.mark.parametrize(
     ("own", "asked", "expected"),
     [(400, 400, (400, 100)), (400, 40, (40, 10)), (400, 1, (1, 1)), (300, 1000, (1000, 333))],

@@ -1,0 +1,93 @@
+"""The wheel alone, in an empty environment and an empty folder, trains from the settings that it holds."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_cure import __version__
+from sb3_cure.zoo_files import GRIDS, ZOO, zoo_file
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The source archive, of a copy of what it is made from, and the wheel made from it."""
+    project = tmp_path_factory.mktemp("project")
+    for folder in ("sb3_cure", "zoo_configs"):
+        shutil.copytree(ROOT / folder, project / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("setup.cfg", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"):
+        shutil.copy(ROOT / name, project)
+    run([sys.executable, "-m", "build", "--no-isolation", "--outdir", "dist"], project)
+    return project / f"dist/sb3_cure-{__version__}.tar.gz", project / f"dist/sb3_cure-{__version__}-py3-none-any.whl"
+
+
+def run(command: list, folder: Path) -> str:
+    """What it prints, in a folder and without the path of modules of these tests."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, env=environment, timeout=300,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+def test_wheel_and_source_archive_hold_all_files(archives: tuple[Path, Path]) -> None:
+    """Every module, template and YAML file, but for those of clusters, which need a checkout."""
+    with tarfile.open(archives[0]) as source, zipfile.ZipFile(archives[1]) as wheel:
+        in_source = {name.partition("/")[2] for name in source.getnames()}
+        in_wheel = {name for name in wheel.namelist() if "dist-info" not in name}
+    files = [path for path in (ROOT / "sb3_cure").rglob("*") if path.is_file() and path.suffix != ".pyc"]
+    files += [path for path in ZOO.rglob("*.yml") if "cluster" not in path.parts]
+    assert in_wheel == {path.relative_to(ROOT).as_posix() for path in files}
+    assert in_wheel | {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md"} <= in_source
+    assert not any(name.startswith("tests") for name in in_source)
+
+
+def test_wheel_trains_by_the_name_of_its_settings(archives: tuple[Path, Path], tmp_path: Path) -> None:
+    """In an environment of its own, which sees the dependencies of this one, but not the package installed there."""
+    venv.create(tmp_path / "venv", symlinks=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    installed = Path(run([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], tmp_path).strip())
+    run([sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps", archives[1]], tmp_path)
+    # A folder that a .pth file names is searched, but its own .pth files, such as the checkout's, are not read.
+    (installed / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    small = ["learning_starts:100", "warmup_updates:2", "batch_size:16"]
+    train = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", "fast/cure_sac_ae", "-n", "150"]
+    train += ["-params", *small, "--eval-freq", "-1", "--log-interval", "1", "--device", "cpu"]
+    printed = run([python.with_name("sb3-cure"), *train], empty)
+    assert f"Loading hyperparameters from: {installed / 'sb3_cure/zoo_configs/fast/cure_sac_ae.yml'}" in printed
+    assert re.findall(r"n_updates +\| (\d+)", printed) == ["26"]  # the burst, and up to the end of an episode of 125
+    (model,) = empty.rglob("*.zip")
+    assert model.name == "dmc_pixels-cartpole-swingup-v0.zip"
+
+
+def test_files_are_found_by_name_or_path(tmp_path: Path) -> None:
+    for folder, name in ((ZOO, "sac_ae"), (ZOO, "fast/sac_ae"), (GRIDS, "curves"), (GRIDS, "fast/curves")):
+        assert zoo_file(name, folder) == folder / f"{name}.yml"
+        assert zoo_file(name, folder).is_file()
+    assert zoo_file("mine/sac_ae.yml") == Path("mine/sac_ae.yml")
+    with pytest.raises(ValueError, match=r"^'fast/sac' is neither .*: .*, sac_ae, .*, fast/sac_ae, .*\.$"):
+        zoo_file("fast/sac")
+    with pytest.raises(ValueError, match=r"curves_curl, .*fast/curves_curl"):
+        zoo_file("sac_ae", GRIDS)
+
+
+def test_changelog_and_citation_name_the_version() -> None:
+    released = re.search(r"^## \[(.*)\] - (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert released and released.groups() == (citation["version"], citation["date-released"])
+    assert citation["version"] == __version__
