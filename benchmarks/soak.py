@@ -224,19 +224,24 @@ def plot(rows: list[dict[str, float]], filled: float, path: Path) -> None:
     :param filled: Agent steps after which the replay buffer is full
     :param path: PNG file
     """
-    from matplotlib import pyplot
+    from matplotlib import style
+    from matplotlib.figure import Figure
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(9, 3), layout="constrained")
-    steps = [row["agent_steps"] for row in rows]
-    for name in ("rss_mb", "workers_rss_mb", "others_rss_mb"):
-        axes[0].plot(steps, [row[name] for row in rows], label=name)
-    for name in ("fds", "workers_fds", "others_fds", "workers", "other_processes", "faults"):
-        axes[1].plot(steps, [row[name] for row in rows], label=name)
-    for axis in axes:
-        axis.axvline(filled, color="grey", linestyle=":")
-        axis.set_xlabel("agent steps (dotted: the replay buffer is full)")
-        axis.legend(fontsize=7)
-    figure.savefig(path, dpi=90)
+    from sb3_cure.experiments.plots import STYLE, save  # after the watch, which counts this process's memory
+
+    with style.context(STYLE):
+        figure = Figure(figsize=(9, 3))
+        axes = figure.subplots(1, 2)
+        steps = [row["agent_steps"] for row in rows]
+        for name in ("rss_mb", "workers_rss_mb", "others_rss_mb"):
+            axes[0].plot(steps, [row[name] for row in rows], label=name)
+        for name in ("fds", "workers_fds", "others_fds", "workers", "other_processes", "faults"):
+            axes[1].plot(steps, [row[name] for row in rows], label=name)
+        for axis in axes:
+            axis.axvline(filled, color="grey", linestyle=":")
+            axis.set_xlabel("agent steps (dotted: the replay buffer is full)")
+            axis.legend(fontsize=7, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
+        save(figure, path, dpi=90)
 
 
 def main() -> None:

@@ -1,0 +1,66 @@
+"""The settings that the page for users of other projects gives: they build, and are those projects'."""
+
+import inspect
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from envs_for_tests import PixelBox
+from stable_baselines3 import SAC
+
+from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.augmentations import Augmentation, RandomCrop, RandomShift
+
+PAGE = (Path(__file__).parents[1] / "docs" / "coming_from.md").read_text(encoding="utf-8")
+SNIPPETS = dict(re.findall(r"^## From (\S+?)\n.*?```python\n(.*?)```", PAGE, re.S | re.M))
+SMALL: dict[str, Any] = dict(
+    policy_kwargs=dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=2)), buffer_size=100, device="cpu"
+)
+
+
+def build(project: str) -> CuReSAC:
+    """The model of a project's lines, of small networks."""
+    names: dict[str, Any] = {"env": PixelBox(), "make_dmc_env": make_dmc_env}
+    lines = re.sub(r"buffer_size=[\d_]+,?", "", SNIPPETS[project].replace("from sb3_cure import", "# "))
+    exec(lines, {**names, "CuReSAC": partial(CuReSAC, **SMALL)}, names)
+    return names["model"]
+
+
+def test_each_project_has_its_lines() -> None:
+    assert list(SNIPPETS) == ["Stable-Baselines3", "SAC-AE", "CURL", "DrQ", "DrQ-v2"]
+
+
+def test_sb3s_lines_have_sb3s_defaults() -> None:
+    """Whatever differs from them is written there."""
+    names: dict[str, Any] = {"env": None, "CuReSAC": lambda policy, env, **given: given}
+    exec(SNIPPETS["Stable-Baselines3"].replace("from sb3_cure import", "# "), names)
+    ours = {name: each.default for name, each in inspect.signature(CuReSAC.__init__).parameters.items()}
+    theirs = {name: each.default for name, each in inspect.signature(SAC.__init__).parameters.items()}
+    given = {**ours, **names["model"]}
+    for name, default in theirs.items():
+        assert given.get(name, default) == default, name
+
+
+@pytest.mark.parametrize(
+    ("project", "augmentation", "sources"),
+    [
+        ("SAC-AE", Augmentation, ["srl", "task"]),
+        ("CURL", RandomCrop, ["srl", "task"]),
+        ("DrQ", RandomShift, ["task"]),
+    ],
+)
+def test_lines_are_the_projects_algorithm(project: str, augmentation: type[Augmentation], sources: list[str]) -> None:
+    model = build(project)
+    assert type(model.policy.augmentation) is augmentation
+    assert model.policy.augmentation.view_space.shape == (9, 84, 84)
+    assert list(model.policy.encoder_update.optimizers) == sources
+    assert model.policy.curious is None and model._computed_precision == "fp32"
+    rates = [group["lr"] for group in model.policy.task.ent_coef_optimizer.param_groups]
+    assert rates == [1e-3 if project == "DrQ" else 1e-4]
+
+
+def test_drq_v2s_recipe_builds() -> None:
+    model = build("DrQ-v2")
+    assert model.n_steps == 3 and model.learning_rate == 1e-4 and type(model.policy.augmentation) is RandomShift

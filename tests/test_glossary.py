@@ -1,0 +1,67 @@
+"""The glossary names what there is: arguments of the constructor, and all that a training logs."""
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from envs_for_tests import PixelBox, tiny_model
+from stable_baselines3.common.logger import KVWriter, Logger
+
+from sb3_cure import CuReSAC
+from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
+from sb3_cure.critics import LatentCritic
+from sb3_cure.encoders import PixelEncoder
+from sb3_cure.policies import CuRePolicy
+from sb3_cure.srl import RAE
+
+GLOSSARY = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text(encoding="utf-8")
+NAMES = set(re.findall(r"`((?:train|rollout|time|eval|diagnostics)/[\w<>]+)`", GLOSSARY))
+
+
+class Keeper(KVWriter):
+    """Remembers the names that a logger was given."""
+
+    def __init__(self) -> None:
+        self.names: set[str] = set()
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        self.names |= key_values.keys()
+
+    def close(self) -> None:
+        pass
+
+
+def as_in_glossary(name: str) -> str:
+    name = re.sub(r"^(eval)/(task|curious|random)_", r"\1/<actor>_", name)
+    return re.sub(r"(norm|share)_(srl|task|curious|intrinsic)$", r"\1_<source>", name)
+
+
+@pytest.fixture(scope="module")
+def logged() -> set[str]:
+    model, keeper = tiny_model("CnnPolicy", PixelBox(), intrinsic="icm"), Keeper()
+    model.set_logger(Logger(None, [keeper]))
+    watching = [EvalBothCallback(PixelBox(), 40, 1), DiagnosticsCallback(every=40, min_updates=1)]
+    model.learn(80, callback=watching, log_interval=1)
+    return {as_in_glossary(name) for name in keeper.names}
+
+
+def test_all_that_is_logged_is_explained(logged: set[str]) -> None:
+    assert logged <= NAMES
+
+
+def test_nothing_else_is_said_to_be_logged(logged: set[str]) -> None:
+    # Which this training has no reason to log
+    elsewhere = {"rollout/bad_transitions", "diagnostics/software_rendering"}
+    assert NAMES - elsewhere <= logged
+
+
+def test_arguments_exist() -> None:
+    owners = [*CuReSAC.__mro__, CuRePolicy, PixelEncoder, RAE, LatentCritic]
+    arguments = {name for owner in owners for name in inspect.signature(owner.__init__).parameters}
+    section = GLOSSARY.split("## Other logged names")[0]
+    cells = [row.split("|")[3] for row in section.splitlines() if row.startswith("| ")]
+    named = {name for cell in cells for name in re.findall(r"`(\w+)(?:=[^`]*)?`", cell)}
+    assert {"curiosity_prob", "srl_kwargs", "update"} <= named
+    assert named - {"CountReward"} <= arguments
