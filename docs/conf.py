@@ -1,0 +1,79 @@
+"""The documentation site: ``make docs`` builds it without network, and it opens from disk."""
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math import latex2mathml
+from sphinx.application import Sphinx
+
+import sb3_cure
+
+HERE = Path(__file__).parent
+
+project = "sb3_cure"
+author = "The sb3_cure developers"
+copyright = author
+version = release = sb3_cure.__version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+exclude_patterns = ["_build", "results/*/**.md"]
+
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+nb_execution_mode = "off"  # the outputs are those of `make notebooks`
+nb_merge_streams = True
+
+autodoc_inherit_docstrings = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+autodoc_typehints_format = "short"
+add_module_names = False
+
+html_theme = "furo"
+html_title = f"sb3_cure {release}"
+html_static_path = ["_static"]
+html_css_files = ["custom.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_theme_options = {"footer_icons": []}
+pygments_style = "friendly"
+pygments_dark_style = "github-dark"
+
+# Pages that lie elsewhere in the repository are copied, so that links between them and these pages work.
+for folder in ("notebooks", "results"):
+    shutil.rmtree(HERE / folder, ignore_errors=True)
+    for page in (HERE.parent / folder).rglob("*"):
+        if page.suffix in {".ipynb", ".md", ".png"} and ".ipynb_checkpoints" not in page.parts:
+            copy = HERE / page.relative_to(HERE.parent)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(page, copy)
+
+
+def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Links that work in the repository lead, on the site, to the pages that `notebooks` and `results` have there."""
+    source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./(?=(?:notebooks|results)/)", r"\1", source[0])
+    if docname.startswith("results/"):
+        source[0] = source[0].replace("](../docs/", "](../")
+
+
+def visit_math(self: Any, node: nodes.math) -> None:
+    """Equations are MathML, which browsers draw without scripts or fonts of ours."""
+    self.body.append(latex2mathml.tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def visit_math_block(self: Any, node: nodes.math_block) -> None:
+    self.body.append(f'<div class="math">{latex2mathml.tex2mathml(node.astext(), as_block=True)}</div>\n')
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", links_into_the_site)
+    app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
+
+
+html_math_renderer = "mathml"
