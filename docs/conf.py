@@ -19,7 +19,8 @@ copyright = author
 version = release = sb3_cure.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
-exclude_patterns = ["_build", "results/*/**.md"]
+exclude_patterns = ["_build"]
+suppress_warnings = ["myst.header"]  # tables begin with small headings
 
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
@@ -55,9 +56,17 @@ for folder in ("notebooks", "results"):
 
 def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
     """Links that work in the repository lead, on the site, to the pages that `notebooks` and `results` have there."""
-    source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./(?=(?:notebooks|results)/)", r"\1", source[0])
+    copied = r"(?=(?:notebooks|results)/[^)#]*\.(?:ipynb|md|png)[)#])"
+    source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./" + copied, r"\1", source[0])
     if docname.startswith("results/"):
         source[0] = source[0].replace("](../docs/", "](../")
+        if not source[0].startswith("# "):
+            source[0] = f"# {Path(docname).parent.name}\n\n{source[0]}"
+
+
+def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Asterisks in shapes, as in [B, *shape], are no emphasis."""
+    lines[:] = [re.sub(r"(\[(?:\w+, )*)\*(?=\w)", r"\1\\*", line) for line in lines]
 
 
 def visit_math(self: Any, node: nodes.math) -> None:
@@ -73,6 +82,7 @@ def visit_math_block(self: Any, node: nodes.math_block) -> None:
 
 def setup(app: Sphinx) -> None:
     app.connect("source-read", links_into_the_site)
+    app.connect("autodoc-process-docstring", escape_shapes)
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
 
 
