@@ -69,6 +69,21 @@ def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lin
     lines[:] = [re.sub(r"(\[(?:\w+, )*)\*(?=\w)", r"\1\\*", line) for line in lines]
 
 
+def mark_tables(app: Sphinx, doctree: nodes.document) -> None:
+    """Tables that hold sentences become lists of cards on a phone (custom.css), with the names of the columns in them."""
+    for table in doctree.findall(nodes.table):
+        head, *rows = ([*row.children] for row in table.findall(nodes.row))
+        if not any(len(cell.astext()) > 40 for row in rows for cell in row[1:]):
+            continue
+        table["classes"].append("sentences")
+        for row in rows:
+            for name, cell in list(zip(head, row, strict=True))[1:]:
+                if not cell.children:
+                    cell["classes"].append("empty")
+                elif name.astext():
+                    cell.children[0].insert(0, nodes.inline("", f"{name.astext()}: ", classes=["column"]))
+
+
 def visit_math(self: Any, node: nodes.math) -> None:
     """Equations are MathML, which browsers draw without scripts or fonts of ours."""
     self.body.append(latex2mathml.tex2mathml(node.astext()))
@@ -83,6 +98,7 @@ def visit_math_block(self: Any, node: nodes.math_block) -> None:
 def setup(app: Sphinx) -> None:
     app.connect("source-read", links_into_the_site)
     app.connect("autodoc-process-docstring", escape_shapes)
+    app.connect("doctree-read", mark_tables)
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
 
 
