@@ -74,7 +74,7 @@ def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lin
 
 
 def mark_tables(app: Sphinx, doctree: nodes.document) -> None:
-    """Tables that hold sentences become lists of cards on a phone (custom.css), with the names of the columns in them."""
+    """Tables of sentences become cards on a phone (custom.css), with the names of the columns in them."""
     for table in doctree.findall(nodes.table):
         head, *rows = ([*row.children] for row in table.findall(nodes.row))
         if not any(len(cell.astext()) > 40 for row in rows for cell in row[1:]):
