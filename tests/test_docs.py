@@ -66,6 +66,24 @@ def test_twenty_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.Monk
     assert names["action"].shape == names["env"].action_space.shape
 
 
+@pytest.mark.parametrize("example", ["Pendulum-v1", "class Reach"])
+def test_own_camera_of_the_guide_trains(example: str) -> None:
+    """Frames are kept once."""
+    block = next(block for block in blocks("docs/guide/environments.md") if example in block)
+    names: dict = {"__name__": "page"}
+    exec(compile(block.replace("5000", "8"), "environments.md", "exec"), names)
+    model = names["model"]
+    assert model.num_timesteps == 8
+    assert model.replay_buffer.frame_stack == 3
+    assert model.observation_space.shape == (9, 48, 48)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_python_of_pages_parses(page: Path) -> None:
+    for block in blocks(str(page.relative_to(ROOT))):
+        compile(block, page.name, "exec")
+
+
 def test_own_head_of_the_guide_trains_saves_and_loads(tmp_path: Path) -> None:
     """Its error falls, both policies survive an archive, it draws images."""
     head = class_of("docs/guide/heads.md", "DropoutAutoencoder")
