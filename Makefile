@@ -4,7 +4,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .ONESHELL:
 .DEFAULT_GOAL := .venv
-.PHONY: .venv gl screens demo test test-all test-oldest check dist bench mutation notebooks clean help
+.PHONY: .venv gl screens demo test test-all test-oldest check docs dist bench mutation notebooks clean help
 
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
@@ -97,6 +97,9 @@ check: .venv/.installed  ## lint, formatting and types
 	$(RUN) ruff format --check
 	$(RUN) mypy
 
+docs: .venv/.installed  ## build the documentation site, docs/_build/html/index.html (warnings are errors)
+	$(RUN) sphinx -q -W --keep-going docs docs/_build/html
+
 dist: .venv/.installed  ## build and check the wheel and the source archive, into dist/
 	rm -rf build dist *.egg-info
 	$(RUN) build --no-isolation
@@ -112,7 +115,7 @@ notebooks: gl  ## execute the notebooks in place
 	$(RUN) nbconvert --to notebook --execute --inplace notebooks/*.ipynb
 
 clean:  ## remove .venv, caches and build products
-	rm -rf .venv .venv-oldest build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-oldest build dist docs/_build docs/notebooks docs/results *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 help:  ## list the targets

@@ -43,7 +43,12 @@ class PixelDecoder(nn.Module):
 
 
 class VectorDecoder(FullPrecision):
-    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]; in fp32, as its target is."""
+    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]; in fp32, as its target is.
+
+    :param latent_dim: Size of the latents
+    :param out_dim: Size of the flat observation
+    :param hidden_dim: Units of the hidden layer
+    """
 
     def __init__(self, latent_dim: int, out_dim: int, hidden_dim: int = 256):
         super().__init__(nn.Linear(latent_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, out_dim))

@@ -30,7 +30,12 @@ class MeanStd(NamedTuple):
 
 
 class MinMeanMax(NamedTuple):
-    """SRL error per step met by a policy."""
+    """SRL error per step met by a policy.
+
+    :param min: Smallest of all steps
+    :param mean: Mean over them
+    :param max: Largest of all steps
+    """
 
     min: float
     mean: float
@@ -101,6 +106,11 @@ def published_method(arguments: dict) -> tuple[str | None, bool]:
 class Comparison:
     """An arm beside a published number at the same environment steps.
 
+    :param experiment: Name of the experiment
+    :param task: As of ``task_key``
+    :param method: Name of the arm
+    :param steps: Environment steps
+    :param seeds: Number of seeds that have got there
     :param ours: Mean return of the seeds at that step
     :param std: Standard deviation over seeds; nan with one
     :param theirs: The published value of the method that the arm is, or builds upon; None if there is none

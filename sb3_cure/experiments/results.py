@@ -137,6 +137,8 @@ class Experiment:
 
     def of_arm(self, task: str, method: str) -> dict[int, CellResult]:
         """
+        :param task: Short name of the task
+        :param method: Name of the arm
         :return: The cells of an arm on a task, by seed
         """
         found = {seed: cell for (at, arm, seed), cell in self.cells.items() if (at, arm) == (task, method)}
@@ -144,6 +146,8 @@ class Experiment:
 
     def done(self, task: str, method: str) -> dict[int, CellResult]:
         """
+        :param task: Short name of the task
+        :param method: Name of the arm
         :return: The finished cells of an arm on a task, by seed
         """
         return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}

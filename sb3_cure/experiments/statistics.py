@@ -84,6 +84,8 @@ def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tu
 class ArmSummary:
     """One arm on one task.
 
+    :param task: Short name of the task (``"cartpole-swingup"``)
+    :param method: Name of the arm
     :param seeds: Seeds that are done and have a curve
     :param areas: Area under the curve by seed
     :param starts: Return of the first evaluation by seed, before training

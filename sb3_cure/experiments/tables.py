@@ -35,6 +35,9 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
+        """
+        :return: Title, table and note in Markdown
+        """
         return render("table.md.j2", table=self)
 
 

@@ -24,6 +24,9 @@ _Key: TypeAlias = tuple[str, str, int]
 class Measured:
     """A number of a policy, by seed, beside those of the policies that it is compared with.
 
+    :param task: Short name of the task (``"cartpole-swingup"``)
+    :param method: Name of the arm
+    :param actor: ``"random"``, ``"task"`` or ``"curious"``
     :param values: [seeds]
     :param ratio: Over the random policy's of the same cell (geometric mean over seeds, t interval of the logarithms);
         nan for the random policy

@@ -503,9 +503,9 @@ def test_statistics_of_a_run_need_trust(folder: Path, played: list[Any]) -> None
 
 
 def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
-    """As the README's example does; what was trained so can be filmed."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    example = next(block for block in re.findall(r"```yaml\n(.*?)```", readme, re.S) if "env_wrapper" in block)
+    """As the guide's example does; what was trained so can be filmed."""
+    guide = (Path(__file__).parents[2] / "docs" / "guide" / "environments.md").read_text()
+    example = next(block for block in re.findall(r"```yaml\n(.*?)```", guide, re.S) if "env_wrapper" in block)
     train("--eval-freq", "-1", "-n", "14", task="Pendulum-v1", **yaml.safe_load(example)["default"])
     assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
     (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")

@@ -1,0 +1,271 @@
+"""The code of README and documentation does what they say, links lead somewhere, and the reference is complete."""
+
+import importlib
+import inspect
+import json
+import pkgutil
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from envs_for_tests import PixelBox, tiny_model
+
+import sb3_cure
+from sb3_cure import CuReSAC
+from sb3_cure.buffers import Samples
+from sb3_cure.intrinsic import INTRINSIC_REWARDS
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+#: What docs/conf.py copies or builds is no page of its own
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "results" / "README.md",
+    *(p for p in DOCS.rglob("*.md") if not {"_build", "notebooks", "results"} & set(p.relative_to(DOCS).parts)),
+]
+#: Modules whose public names users write in their own code; what is not in them is internal
+PUBLIC = """
+    allocator augmentations buffers callbacks critics cure datasets decoders deployment encoders envs envs.counting
+    envs.rendering evaluation experiments.plots experiments.published experiments.results experiments.statistics
+    experiments.video experiments.visit_statistics guards intrinsic metrics mixers observations persistence
+    policies pretraining srl vec_env
+""".split()
+INTERNAL = "arguments cli cure_sac cure_tqc diagnostics encoder_update fast_ops layers precision zoo zoo_files".split()
+
+
+def blocks(page: str, language: str = "python") -> list[str]:
+    """
+    :param page: Path in the repository
+    :param language: As after the fence
+    :return: The page's blocks of code
+    """
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), re.S)
+
+
+def class_of(page: str, name: str) -> Any:
+    """The class as it stands in the page."""
+    block = next(block for block in blocks(page) if f"class {name}" in block)
+    namespace: dict = {"__name__": "page"}
+    exec(compile(block[: block.index("model = CuReSAC")], page, "exec"), namespace)
+    return namespace[name]
+
+
+def test_twenty_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the first page of the documentation has the same."""
+    block = next(block for block in blocks("README.md") if "CuReSAC" in block)
+    assert block in blocks("docs/start.md")
+    assert len(block.splitlines()) <= 20
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(block.replace("12_500", "8"), "README.md", "exec"), names)
+    assert names["model"].num_timesteps == 8
+    assert names["action"].shape == names["env"].action_space.shape
+
+
+@pytest.mark.parametrize("example", ["Pendulum-v1", "class Reach"])
+def test_own_camera_of_the_guide_trains(example: str) -> None:
+    """Frames are kept once."""
+    block = next(block for block in blocks("docs/guide/environments.md") if example in block)
+    names: dict = {"__name__": "page"}
+    exec(compile(block.replace("5000", "8"), "environments.md", "exec"), names)
+    model = names["model"]
+    assert model.num_timesteps == 8
+    assert model.replay_buffer.frame_stack == 3
+    assert model.observation_space.shape == (9, 48, 48)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_python_of_pages_parses(page: Path) -> None:
+    for block in blocks(str(page.relative_to(ROOT))):
+        compile(block, page.name, "exec")
+
+
+def test_own_head_of_the_guide_trains_saves_and_loads(tmp_path: Path) -> None:
+    """Its error falls, both policies survive an archive, it draws images."""
+    head = class_of("docs/guide/heads.md", "DropoutAutoencoder")
+    env = PixelBox(frame_stack=1)
+    model = tiny_model("CnnPolicy", env, srl=head, srl_kwargs=dict(dropped=0.5)).learn(40)
+    sampled = model.replay_buffer.sample(16)
+    batch = Samples(**sampled._asdict(), views=sampled.observations)
+
+    def error() -> float:
+        return float(model.policy.srl.error(batch, model.policy.encode(batch.observations)).mean())
+
+    before = error()
+    model.train(60, batch_size=8)
+    assert error() < 0.8 * before
+    model.save(tmp_path / "model.zip")
+    loaded = CuReSAC.load(tmp_path / "model.zip", custom_objects={"srl": head})
+    observation, _ = env.reset(seed=0)
+    for ours, theirs in ((model.predict, loaded.predict), (model.predict_curious, loaded.predict_curious)):
+        np.testing.assert_array_equal(
+            ours(observation, deterministic=True)[0], theirs(observation, deterministic=True)[0]
+        )
+    drawn = loaded.policy.srl.reconstruct(loaded.policy.encode(batch.observations))
+    assert drawn.shape == batch.observations.shape and drawn.dtype == batch.observations.dtype
+
+
+def test_own_reward_of_the_guide_falls_as_it_is_learned() -> None:
+    model = tiny_model("CnnPolicy", PixelBox(), intrinsic=class_of("docs/guide/rewards.md", "Distillation")).learn(40)
+    assert model.policy.intrinsic is not None
+    batch = model.replay_buffer.sample(32)
+    latents = model.policy.encode(batch.next_observations)
+    rewards = []
+    for _ in range(100):
+        loss, reward = model.policy.intrinsic.loss(batch, latents, latents, None)
+        model._optimize("intrinsic reward", loss, model.policy.intrinsic.optimizer)
+        rewards.append(float(reward.mean()))
+    assert 0 < rewards[-1] < 0.5 * rewards[0]
+
+
+def test_a_policy_leaves_for_the_robot_as_the_guide_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file that its lines write gives the actions of ``predict``."""
+    (block,) = blocks("docs/guide/robot.md")
+    monkeypatch.chdir(tmp_path)
+    model = tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0))
+    names: dict = {"model": model}
+    exec(compile(block, "robot.md", "exec"), names)
+    actions, _ = model.predict(names["images"].numpy(), deterministic=True)
+    for given in (names["actions"], th.export.load("policy.pt2").module()(names["images"])):
+        np.testing.assert_allclose(given.detach(), actions, atol=1e-5)
+
+
+def without_code(page: Path) -> str:
+    """The text of a page but for its blocks of code."""
+    return re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+
+
+def anchors(page: Path) -> set[str]:
+    """What links into a page can name: its headings."""
+    headings = re.findall(r"^#+ (.+)$", without_code(page), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    """To headings of pages, and files of the repository."""
+    text = without_code(page)
+    for target in re.findall(r"\]\(([^)\s]+)\)|^\[[\w-]+\]: (\S+)$", text, re.M):
+        path, _, anchor = "".join(target).partition("#")
+        if path.startswith("http"):
+            continue
+        leads_to = page.parent / path if path else page
+        assert leads_to.exists(), target
+        if anchor:
+            assert anchor in anchors(leads_to), target
+    for name in re.findall(r"\]\[([\w-]+)\]", text):
+        assert f"\n[{name}]: http" in text, name
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_bytes()) <= 12_000
+
+
+def test_table_of_arguments_gives_the_constructors_defaults() -> None:
+    """Every argument of the table exists with the default that the table says, and none of ours is missing."""
+    parameters = inspect.signature(CuReSAC).parameters
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", (DOCS / "arguments.md").read_text(), re.M))
+    ours = {name for name, p in parameters.items() if p.kind is p.KEYWORD_ONLY and not name.startswith("_")}
+    assert ours <= rows.keys()
+    for name, text in rows.items():
+        if name not in parameters:
+            continue
+        default = parameters[name].default
+        shown = text.replace("`", "").replace(" ", "").strip()
+        expected = {"{}"} if name.endswith("_kwargs") else {repr(default).replace("'", '"')}
+        if isinstance(default, int | float) and not isinstance(default, bool):
+            assert float(shown.replace("_", "")) == default, name
+        else:
+            assert shown in expected, name
+
+
+def public_names(module: str) -> list[str]:
+    """Names that a module offers: ``__all__``, or what is defined in it."""
+    found = importlib.import_module(module)
+    if hasattr(found, "__all__"):
+        return [name for name in found.__all__ if not name.startswith("_")]
+    defined = (
+        (name, value) for name, value in vars(found).items() if inspect.isclass(value) or inspect.isfunction(value)
+    )
+    return [name for name, value in defined if value.__module__ == module and not name.startswith("_")]
+
+
+def documented() -> Iterator[tuple[str, str]]:
+    """Module and name of each entry of the reference."""
+    for page in (DOCS / "api").glob("*.md"):
+        module = ""
+        for directive, name in re.findall(r"^\.\. ([\w:]+):: (\S+)$", page.read_text(), re.M):
+            if directive == "currentmodule":
+                module = name
+            else:
+                yield module, name
+
+
+REFERENCE = {(module, name): getattr(importlib.import_module(module), name) for module, name in documented()}
+
+
+@pytest.mark.parametrize("module", ["sb3_cure", *(f"sb3_cure.{name}" for name in PUBLIC)])
+def test_reference_misses_no_public_name(module: str) -> None:
+    """Names that two modules share are described once."""
+    described = {id(value) for value in REFERENCE.values()}
+    names = public_names(module)
+    assert names
+    assert [name for name in names if id(getattr(importlib.import_module(module), name)) not in described] == []
+
+
+def test_every_module_is_public_or_internal() -> None:
+    """So that a new one is not forgotten."""
+    modules = {module.name for module in pkgutil.iter_modules(sb3_cure.__path__)}
+    assert modules - {name.split(".")[0] for name in PUBLIC} <= set(INTERNAL)
+
+
+def test_reference_has_the_classes_of_all_built_in_rewards() -> None:
+    """Their arguments are what ``intrinsic_kwargs`` takes."""
+    names = {name for _, name in REFERENCE}
+    assert {reward.__name__ for reward in INTRINSIC_REWARDS.values()} <= names
+
+
+def test_reference_has_what_pages_and_notebooks_import() -> None:
+    code = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.S)]
+    for notebook in (ROOT / "notebooks").glob("*.ipynb"):
+        code += ["".join(cell["source"]) for cell in json.loads(notebook.read_text())["cells"]]
+    names = {name for _, name in REFERENCE}
+    imports = re.findall(r"^from (sb3_cure[\w.]*) import ([\w, ]+)", "\n".join(code), re.M)
+    assert len(imports) > 20
+    for module, imported in imports:
+        if module != "sb3_cure.experiments":  # whose modules are imported
+            assert set(imported.replace(" ", "").split(",")) <= names, module
+
+
+def undescribed(function: Any, text: str) -> list[str]:
+    """
+    :param function: Function or class
+    :param text: Its docstring
+    :return: Arguments without ``:param x:`` in it
+    """
+    arguments = inspect.signature(function, follow_wrapped=False).parameters.values()
+    named = [each.name for each in arguments if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+    return [name for name in named if not name.startswith(("_", "self", "cls")) and f":param {name}:" not in text]
+
+
+def test_docstrings_describe_every_argument() -> None:
+    """Of functions, of classes, and of methods that override none."""
+    missing = {}
+    for (module, name), found in REFERENCE.items():
+        if inspect.isfunction(found):
+            missing[module, name] = undescribed(found, found.__doc__ or "")
+        if not inspect.isclass(found):
+            continue
+        if {"__init__", "__new__"} & vars(found).keys() and not hasattr(found.__init__, "__wrapped__"):
+            missing[module, name] = undescribed(found, "".join(each.__doc__ or "" for each in found.__mro__))
+        inherited = {each for parent in found.__mro__[1:] for each in vars(parent)}
+        for method, value in vars(found).items():
+            value = getattr(value, "__func__", value)
+            if inspect.isfunction(value) and not method.startswith("_") and method not in inherited:
+                missing[module, f"{name}.{method}"] = undescribed(value, value.__doc__ or "")
+    assert len(missing) > 200
+    assert {name: arguments for name, arguments in missing.items() if arguments} == {}
