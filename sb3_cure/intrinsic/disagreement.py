@@ -19,8 +19,8 @@ class Disagreement(IntrinsicReward):
     """Variance over the members of an ensemble, which predict the next latents (Pathak et al., 2019, eq. 1).
 
     Noise that nobody can predict makes all members expect its mean, where they agree in the end. The members begin
-    differently, and each learns from a random part of all transitions: a hash of a transition's place in the replay
-    buffer says of which. (From a random part of each batch where a replay buffer of one's own does not tell the places.)
+    differently, and each learns from a random part of all transitions, which a hash of their places in the replay
+    buffer chooses. (Where a replay buffer of one's own does not tell the places: from a random part of each batch.)
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space

@@ -165,7 +165,7 @@ class Particle(IntrinsicReward):
         self.cursor = (self.cursor + n) % len(self.places)
 
     def _follow_episodes(self, buffer: SkipsMarked) -> ndarray:
-        """Number the rows that are new since the last update, or at first all: a new number wherever a stream breaks."""
+        """Number the rows that are new since the last update, at first all: another number wherever a stream breaks."""
         size, n_envs = buffer.buffer_size, buffer.n_envs
         n_new = (buffer.pos - self.last_pos) % size
         if self._episodes is None:
