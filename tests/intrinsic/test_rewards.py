@@ -395,10 +395,10 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
 
     for update in range(7):
         for _ in range(3):  # the oldest rows go
-            row, following = buffer.pos, np.random.randn(n_envs, 2)
-            breaks = row % 5 == 2
+            row, breaks = buffer.pos, buffer.pos % 4 == 2
             number += done or breaks
-            seen, episode[row], done = seen + breaks, number, row % 4 == 3
+            seen, episode[row], done = seen + 0.001 * breaks, number, row % 4 == 3
+            following = seen + 0.1 * np.random.randn(n_envs, 2)  # near, so that it matters which of them count
             buffer.add(seen, following, np.zeros((n_envs, 2)), np.zeros(n_envs), np.full(n_envs, done), [{}] * n_envs)
             seen = following
             memory = [None if place is None or place[0] == row else place for place in memory]
