@@ -599,7 +599,7 @@ def test_what_cannot_be_drawn_is_refused(make: Callable[..., BaseCallback], mess
         ),
         (
             lambda env, path: ReconstructionCallback(path),
-            "needs 'CnnPolicy' and images of uint8",
+            "needs a policy of images of uint8",
         ),
     ],
 )
