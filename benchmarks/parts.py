@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from benchmarks import checkpoints, collection, growth, numerics, rendering, replay, rewards, settings, update
+from benchmarks import checkpoints, collection, growth, heads, numerics, rendering, replay, rewards, settings, update
 from sb3_cure.allocator import tune_allocator
 
 
@@ -18,6 +18,7 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
     return {
         "update": partial(update.measure, repeats),
         "update_by_setting": partial(settings.measure, repeats),
+        "update_by_head": partial(heads.costs, repeats),
         "update_by_reward": partial(rewards.costs, repeats),
         "update_by_phase": update.breakdowns,
         "replay": replay.measure,

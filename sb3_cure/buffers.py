@@ -129,14 +129,15 @@ def transitions(
         (buffer.dones[inds] * (1 - buffer.timeouts[inds])).reshape(-1, 1),
         buffer._normalize_reward(buffer.rewards[inds].reshape(-1, 1), env),
     )
-
-    def to_torch(array: Any) -> Any:
-        if isinstance(array, dict):
-            return {key: to_torch(part) for key, part in array.items()}
-        return buffer.to_torch(array, copy=False)  # all of these are fresh arrays already
-
     kind: Any = DictReplayBufferSamples if isinstance(obs, dict) else ReplayBufferSamples
-    return kind(*map(to_torch, data))
+    return kind(*(_to_torch(buffer, array) for array in data))
+
+
+def _to_torch(buffer: ReplayBuffer, array: Any) -> Any:
+    """Fresh arrays, or a dictionary of such, which need no copy, on the buffer's device."""
+    if isinstance(array, dict):
+        return {key: _to_torch(buffer, part) for key, part in array.items()}
+    return buffer.to_torch(array, copy=False)
 
 
 class SkipsMarked(ReplayBuffer):
@@ -218,13 +219,18 @@ class SkipsMarked(ReplayBuffer):
         last = ends.argmax(axis=1)
         counted = steps <= last[:, None]
         rewards = self._normalize_reward(self.rewards[window, envs], env) * gamma**steps * counted
-        final = transitions(self, (rows + last) % self.buffer_size, env_inds, env)
+        final = (rows + last) % self.buffer_size, env_inds
+        next_obs = self._normalize_obs(self._next_observations_at(*final), env)
         return {
             "n_step_rewards": self.to_torch(rewards.sum(axis=1, keepdims=True)),
-            "n_step_next_observations": final.next_observations,
-            "n_step_dones": final.dones,
+            "n_step_next_observations": _to_torch(self, next_obs),
+            "n_step_dones": self.to_torch((self.dones[final] * (1 - self.timeouts[final])).reshape(-1, 1)),
             "n_step_discounts": self.to_torch(gamma ** counted.sum(axis=1, keepdims=True).astype(np.float32)),
         }
+
+    def _next_observations_at(self, rows: ndarray, env_inds: ndarray) -> Any:
+        """The successors alone, of which a gather costs half of both, [n, *shape] or such by key."""
+        return self.next_observations[rows, env_inds]
 
     def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
         """
@@ -449,10 +455,16 @@ class FrameStackReplayBuffer(SkipsMarked):
         :return: Observations, and their successors, [n, *shape] each
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
-        slots = self.slots(rows, env_inds)
-        # One gather for both stacks; `index_select` is threaded, unlike the fancy indexing of NumPy
-        obs, next_obs = th.from_numpy(self.frames).index_select(0, slots).view(2, -1, *self.obs_shape).numpy()
-        return obs, next_obs
+        both = self._gather(self.slots(rows, env_inds))  # at once
+        return both[: len(rows)], both[len(rows) :]
+
+    def _next_observations_at(self, rows: ndarray, env_inds: ndarray) -> ndarray:
+        return self._gather(self.slots(rows, env_inds)[len(rows) * self.frame_stack :])
+
+    def _gather(self, slots: th.Tensor) -> ndarray:
+        """Stacks of the frames at these positions. `index_select` is threaded, unlike the fancy indexing of NumPy."""
+        gathered: ndarray = th.from_numpy(self.frames).index_select(0, slots).view(-1, *self.obs_shape).numpy()
+        return gathered
 
     def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
         # A stack that continues the stored one has its very frames.
@@ -677,6 +689,11 @@ class DictFrameStackReplayBuffer(SkipsMarked):
             keys = self.observation_space.spaces
             found.append({k: images[k][i] if k in images else vectors[k][rows, env_inds] for k in keys})
         return found[0], found[1]
+
+    def _next_observations_at(self, rows: ndarray, env_inds: ndarray) -> dict[str, ndarray]:
+        images = {key: image._next_observations_at(rows, env_inds) for key, image in self.images.items()}
+        vectors = {key: array[rows, env_inds] for key, array in self.next_observations.items()}
+        return {key: (images if key in images else vectors)[key] for key in self.observation_space.spaces}
 
     def _goes_on(self, rows: ndarray, next_rows: ndarray, env_inds: ndarray) -> ndarray:
         goes_on = np.ones(rows.shape, dtype=bool)

@@ -9,6 +9,7 @@ import random
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.preprocessing import is_image_space, maybe_transpose
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.preprocessing import maybe_transpose
+from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
 
 from sb3_cure import diagnostics
 from sb3_cure.buffers import transitions, unmarked
@@ -28,6 +29,7 @@ from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import Episode, evenly_measured, run_episodes, state_probe, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
+from sb3_cure.observations import image_spaces, len_of, rows_of
 from sb3_cure.persistence import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.policies import encoder_of
 
@@ -248,7 +250,8 @@ class PolicyVideoCallback(RolloutCallback):
 
 class ReconstructionCallback(PeriodicCallback):
     """
-    Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations.
+    Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations. Each
+    image of dictionaries has a picture ``reconstructions_<key>.png``.
 
     Where neither head nor intrinsic reward draws, and for SB3's own algorithms, a decoder is fitted to the latents
     for each row, anew so that rows can be compared; the agent does not learn from it. It is fitted to what the replay
@@ -256,9 +259,9 @@ class ReconstructionCallback(PeriodicCallback):
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param observations: Images to reconstruct, uint8 [n, C, H, W]; where the head itself draws, the first row is then
-        that of the untrained model. By default ``columns`` of those that the decoder would be fitted to, spread over
-        the time that they span when the first row is drawn
+    :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; where the head
+        itself draws, the first row is then that of the untrained model. By default ``columns`` of those that the
+        decoder would be fitted to, spread over the time that they span when the first row is drawn
     :param columns: How many observations to take
     :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment or
         ``VecFrameStack`` tells
@@ -274,7 +277,7 @@ class ReconstructionCallback(PeriodicCallback):
         self,
         folder: str | Path,
         every: int = 5000,
-        observations: np.ndarray | None = None,
+        observations: np.ndarray | dict[str, np.ndarray] | None = None,
         columns: int = 8,
         frame_stack: int | None = None,
         decoder_updates: int = 500,
@@ -286,22 +289,23 @@ class ReconstructionCallback(PeriodicCallback):
         self.folder, self.observations, self.columns = Path(folder), observations, columns
         self.frame_stack, self.decoder_updates, self.max_rows = frame_stack, decoder_updates, max_rows
         self.title = title
-        #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W]
-        self.rows: list[tuple[int, np.ndarray]] = []
+        #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W], or such by key
+        self.rows: list[tuple[int, Any]] = []
         self._latest: deque[np.ndarray] = deque(maxlen=LATEST)
         _room("plots")  # a package that is missing is known before training starts
 
     def _init_callback(self) -> None:
         space = self.model.observation_space
-        if encoder_of(self.model.policy) is None or not is_image_space(space):
+        if encoder_of(self.model.policy) is None or not image_spaces(space):
             raise ValueError(
-                "ReconstructionCallback needs 'CnnPolicy' and images of uint8: it draws from their latents."
+                "ReconstructionCallback needs a policy of images of uint8, or of dictionaries with such: it draws from "
+                "their latents."
             )
         if self.observations is not None:
-            if self.observations.shape[1:] != space.shape:
+            if isinstance(self.observations, np.ndarray) and self.observations.shape[1:] != space.shape:
                 self.observations = maybe_transpose(self.observations, space)
-            if not all(map(space.contains, self.observations)):
-                raise ValueError(f"observations must be uint8 [n, *{space.shape}], as the model learns from them.")
+            if not all(space.contains(rows_of(self.observations, i)) for i in range(len_of(self.observations))):
+                raise ValueError(f"observations must be n of {space}, as the model learns from them.")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -321,10 +325,10 @@ class ReconstructionCallback(PeriodicCallback):
         model.policy.set_training_mode(False)
         if self.observations is None:
             self.observations = self._spread(self.columns)
-        if len(self.observations) == 0:  # nothing good has been seen so far
+        if len_of(self.observations) == 0:  # nothing good has been seen so far
             self.observations = None
             return
-        observed = th.as_tensor(self.observations, device=model.device)
+        observed, keys = obs_as_tensor(self.observations, model.device), list(image_spaces(model.observation_space))
         title = "What the agent sees, and what its latents hold of it"
         reconstruct = getattr(model.policy, "reconstruct", lambda observations: None)
         with th.no_grad():
@@ -333,21 +337,27 @@ class ReconstructionCallback(PeriodicCallback):
             if self.decoder_updates == 0:
                 head = getattr(model.policy, "srl", None)
                 warnings.warn(f"{type(head).__name__} does not reconstruct: give decoder_updates=500.", stacklevel=2)
-            if self.decoder_updates == 0 or len(self._spread(1)) == 0:
+            if self.decoder_updates == 0 or len_of(self._spread(1)) == 0:
                 return
             title = "What a decoder fitted afterwards draws from the latents"
-            decoder = _room("decoding").fit_decoder(model, self._sample, self.decoder_updates)
-            pair = _room("decoding").draw_latents(model, decoder, observed)
-        observed, drawn = pair
+            decoding: Any = _room("decoding")
+            decoders = [decoding.fit_decoder(model, self._sample, self.decoder_updates, key) for key in keys]
+            pairs = [decoding.draw_latents(model, *each) for each in zip(decoders, repeat(observed), keys)]
+            pair = tuple(dict(zip(keys, images, strict=True)) for images in zip(*pairs, strict=True))
         frame_stack = self.frame_stack or frame_stack_of(self.training_env)
-        self.rows.append((self.num_timesteps, newest_frames(drawn, frame_stack).cpu().numpy()))
-        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
-        _room("plots").reconstructions_over_training(
-            _file(self, self.folder, "reconstructions.png"),
-            newest_frames(observed, frame_stack).cpu().numpy(),
-            [self.rows[index] for index in shown],
-            f"{title}\n{self.title}" if self.title else title,
+        seen, drawn = (
+            {key: newest_frames(image, frame_stack).cpu().numpy() for key, image in images.items()}
+            for images in (part if isinstance(part, dict) else {"": part} for part in pair)
         )
+        self.rows.append((self.num_timesteps, drawn.get("", drawn)))
+        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
+        for key, images in seen.items():
+            _room("plots").reconstructions_over_training(
+                _file(self, self.folder, f"reconstructions_{key}.png" if key else "reconstructions.png"),
+                images,
+                [(steps, row[key] if key else row) for steps, row in (self.rows[index] for index in shown)],
+                "\n".join(filter(None, (f"{title}: {key}" if key else title, self.title))),
+            )
 
     def draw(self, model: BaseAlgorithm) -> None:
         """Add a row now, outside of a training.
@@ -362,22 +372,23 @@ class ReconstructionCallback(PeriodicCallback):
     def _buffer(self) -> Any:
         return getattr(self.model, "replay_buffer", None)
 
-    def _sample(self, n: int) -> th.Tensor:
-        """Observations that the model has seen, at random, on its device, [n, *shape]."""
+    def _sample(self, n: int) -> Any:
+        """Observations that the model has seen, at random, on its device, [n, *shape] or such by key."""
         if self._buffer is not None:
             return self._buffer.sample(n).observations
         chosen = np.random.randint(len(self._latest), size=n)
         return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
 
-    def _spread(self, n: int) -> np.ndarray:
-        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape]; [0] if
-        it has seen none."""
+    def _spread(self, n: int) -> Any:
+        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape] or such
+        by key; [0] if it has seen none."""
         if self._buffer is None:
             kept = np.array(self._latest)
             return kept[np.linspace(0, len(kept) - 1, n if len(kept) else 0).round().astype(int)]
         rows, env_inds, _ = unmarked(self._buffer)
         chosen = np.linspace(len(rows) - 1, 0, n if len(rows) else 0).round().astype(int)
-        return transitions(self._buffer, rows[chosen], env_inds[chosen]).observations.cpu().numpy()
+        found: Any = transitions(self._buffer, rows[chosen], env_inds[chosen]).observations
+        return {k: v.cpu().numpy() for k, v in found.items()} if isinstance(found, dict) else found.cpu().numpy()
 
 
 def _true_state(

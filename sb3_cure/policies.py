@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel, BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.preprocessing import get_action_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import update_learning_rate
@@ -201,6 +201,8 @@ class CuRePolicy(BasePolicy):
         self.net_arch = [1024, 1024] if net_arch is None else net_arch
         self.activation_fn = activation_fn
         self.critic_kwargs = {"n_critics": 2, **critic_kwargs}
+        #: Whether encoder and head stay as they are
+        self.representation_frozen = False
         #: Who acts in ``predict``
         self.default_agent = default_agent
         if self.optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & self.optimizer_kwargs.keys():
@@ -449,6 +451,21 @@ class CuRePolicy(BasePolicy):
         return self.encoder(self.center(observations))
 
     @property
+    def traits(self) -> dict[str, Any]:
+        """What the shapes of tensors do not tell of encoder, head and intrinsic reward, by name."""
+        encoders: dict[str, Any] = getattr(self.encoder, "images", {"": self.encoder})
+        tanh = {key: getattr(encoder.projection, "tanh", None) for key, encoder in encoders.items()}
+        srl_class = self._choices["srl_class"]
+        return {
+            "observations": _kinds(self.observation_space),
+            "views": _kinds(self.augmentation.view_space),
+            "encoder": self.features_extractor_class.__name__,
+            "tanh": tanh if len(tanh) > 1 else next(iter(tanh.values())),
+            "srl": None if srl_class is None else srl_class.__name__,
+            "intrinsic": None if self.intrinsic is None else self._intrinsic_choice[0].__name__,
+        }
+
+    @property
     def measures_errors(self) -> bool:
         """Whether there is something to measure by: see ``error``."""
         return self.srl is not None or (self.intrinsic is not None and self.intrinsic.measures)
@@ -509,7 +526,15 @@ class CuRePolicy(BasePolicy):
         :param mode: Whether layers that differ between training and evaluation behave as in training
         """
         self.train(mode)
-        self.encoder_target.train(False)
+        still = (self.encoder_target, *((self.encoder, self.srl) if self.representation_frozen else ()))
+        for part in filter(None, still):
+            part.train(False)
+
+    def freeze_representation(self) -> None:
+        """Keep encoder and head as they are; the target encoder, which would follow, becomes the encoder."""
+        self.representation_frozen = True
+        self.encoder.requires_grad_(False)
+        self.encoder_target.load_state_dict(self.encoder.state_dict())
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
@@ -554,6 +579,13 @@ class MultiInputPolicy(CuRePolicy):
         :return: Class of the encoder
         """
         return DictEncoder if image_spaces(observation_space) else VectorEncoder
+
+
+def _kinds(space: spaces.Space) -> Any:
+    """Kind and shape of an observation, of dictionaries of each part in their order."""
+    if isinstance(space, spaces.Dict):
+        return [f"{key}: {_kinds(part)}" for key, part in space.spaces.items()]
+    return f"{'image' if is_image_space(space) else type(space).__name__} {space.shape}"
 
 
 def _channels_last(views: Any) -> Any:

@@ -39,7 +39,8 @@ class Pretraining(CuRe):
         before, self._before_pretraining = self._before_pretraining, None
         if before is None:
             super()._setup_model()
-            self._freeze_if_asked()
+            if self.representation_frozen:
+                self.policy.freeze_representation()
             return
         # Of an archive that was saved while pretraining: its networks are those of before and what came on top of them.
         collector = "curious" if self._has_curious_agent else "random"
@@ -101,15 +102,19 @@ class Pretraining(CuRe):
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
         """Begin with encoder, head and, where both models have one, the curious agent of a model of a sibling task.
 
+        Observations may be augmented otherwise than there: to act, either model sees the centred view.
+
         :param path: A model's archive, of which nothing is executed
-        :param freeze: Whether encoder and head then stay as they are, also when the model is saved and loaded
+        :param freeze: Whether encoder and head then stay as they are, with all their statistics, also when the model is
+            saved and loaded. The target encoder becomes the encoder
         :return: self
         :raises ArchiveError: if the file is damaged or pickled
-        :raises ValueError: if networks of the two models differ in their shapes
+        :raises ValueError: if networks of the two models differ in their shapes, or would mean something else: other
+            kinds or another order of observations, latents with and without tanh, another head or intrinsic reward
         """
         if self._was_over("transfer_from", True):
             return self
-        networks, temperature = archived_networks(path)
+        networks, temperature, their_traits = archived_networks(path)
         parts = ["encoder.", "encoder_target."] + (["srl."] if self.srl is not None else [])
         curious: Any = getattr(self.policy, "curious", None)
         if curious is not None and any(name.startswith("curious.") for name in networks):
@@ -127,22 +132,25 @@ class Pretraining(CuRe):
                     f"{path} has {name} of shape {theirs}, and this model of shape {ours}: transfer needs equal "
                     "images, encoders and heads, and for a curious agent equal actions and rewards."
                 )
+        not_compared = ({"srl"} if self.srl is None else set()) | ({"intrinsic"} if "curious." not in parts else set())
+        for name, trait in self.policy.traits.items():
+            if name not in not_compared and trait != their_traits.get(name):
+                raise ValueError(
+                    f"{path} has {name}={their_traits.get(name)!r}, and this model {trait!r}: of equal shapes, its "
+                    "networks would mean something else here."
+                )
         with self._run.calling("transfer_from"):
             self.policy.load_state_dict({**own, **there})
             if "curious." in parts and curious.log_ent_coef is not None and temperature is not None:
                 curious.log_ent_coef.data.copy_(temperature)
             self.representation_frozen = self.representation_frozen or freeze
-            self._freeze_if_asked()
+            if self.representation_frozen:
+                self.policy.freeze_representation()
         return self
 
     def _phase(self) -> tuple[bool, bool]:
         learns_srl, learns_rl = super()._phase()
         return learns_srl and not self.representation_frozen, learns_rl
-
-    def _freeze_if_asked(self) -> None:
-        for part in (self.policy.encoder, self.policy.srl) if self.representation_frozen else ():
-            if part is not None:
-                part.requires_grad_(False)
 
     def pretrain(
         self: Self,

@@ -57,11 +57,8 @@ def refusal(head: str | None, reward: str, sensors: str) -> str | None:
     head_class = get_srl_class(head)
     if head == "curl" and sensors == "vector":
         return "two views of one image"
-    if arguments.get("per_pixel"):
-        if sensors == "dictionary" and not (head_class.needs_next_latents or head_class.models_transitions):
-            return "one image"
-        if head_class.reconstruct is SRLHead.reconstruct:
-            return "draw|one image"
+    if arguments.get("per_pixel") and head_class.reconstruct is SRLHead.reconstruct:
+        return "does not draw"
     return None
 
 

@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import Samples
-from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
+from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback, ReconstructionCallback
 from sb3_cure.deployment import DeterministicActor
 from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, srl_errors, state_probe
 from sb3_cure.guards import NonFiniteError
@@ -67,6 +67,26 @@ def first_rows(part: Any, i: int) -> Any:
     if isinstance(part, dict):
         return {key: value[i : i + 1] for key, value in part.items()}
     return None if part is None else part[i : i + 1]
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_each_image_has_a_picture_of_reconstructions(srl: str, tmp_path: Path) -> None:
+    """Drawn by its head, or by a decoder that is fitted afterwards; of the same observations at all times."""
+    callback = ReconstructionCallback(tmp_path, every=15, columns=3, decoder_updates=40)
+    model = sensor_model(srl=srl).learn(30, callback=callback)
+    callback.draw(model)
+    files = sorted(path.name for path in tmp_path.iterdir())
+    assert files == [f"reconstructions_{key}.png" for key in ("front", "wrist")]
+    steps, (*_, drawn) = zip(*callback.rows, strict=True)
+    assert steps == (15, 30, 30) and {key: image.shape[2] for key, image in drawn.items()} == {"front": 36, "wrist": 28}
+    seen: Any = callback.observations
+    if srl == "rae":
+        expected = model.policy.reconstruct({key: th.as_tensor(part) for key, part in seen.items()})[1]  # type: ignore[index]
+        np.testing.assert_array_equal(drawn["wrist"], expected["wrist"][:, 3:].numpy())
+    else:
+        for key, image in drawn.items():
+            there = seen[key][:, 3:].astype(float)
+            assert np.abs(image - there).mean() < 0.75 * np.abs(127.5 - there).mean()
 
 
 def test_negatives_are_taken_of_each_image() -> None:

@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 from torch.nn import functional as F
-from updates_for_tests import BATCH, StraightLine, prepare, train_once
+from updates_for_tests import BATCH, StraightLine, prepare, sampled, train_once
 
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.augmentations import Augmentation, RandomCrop, RandomShift
@@ -287,6 +287,28 @@ def test_error_is_the_mean_over_images_in_their_own_deviations() -> None:
     th.testing.assert_close(head.mean_error(alike, learns=False), expected)
     head.mean_error(th.full((2, 16), th.inf), learns=True)
     assert head.mean_error.variances.isfinite().all()
+
+
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_error_per_pixel_is_that_of_each_images_own_head(target: str) -> None:
+    """Over the running deviation of each pixel; then the mean over images, each in its own deviation."""
+    settings: dict[str, Any] = dict(intrinsic_kwargs={"per_pixel": True}, curiosity_target=target)
+    model = sensor_model(**settings, learning_rate=0.0, learning_starts=40).learn(40)
+    policy, found = model.policy, []
+    policy.scale.register_forward_pre_hook(lambda _, args: found.append(args[0].clone()))
+    batch = sampled(model)
+    about: Any = batch.observations if target == "observation" else batch.next_observations
+    latents, errors = policy.encode(about), []
+    for key, head in zip(("front", "wrist"), policy.srl.heads, strict=True):  # type: ignore[arg-type, union-attr]
+        drawn = head.reconstruct(latents[:, policy.encoder.slices[key]]).float() / 255  # type: ignore[operator, index]
+        seen = about[key].float() / 255
+        errors.append(((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1))
+    train_once(model)
+    # A spread below a thousandth of the errors' size counts as rounding.
+    expected = sum(e / th.maximum(e.var(correction=0), 1e-6 * e.square().mean()).sqrt() for e in errors) / 2
+    th.testing.assert_close(found[0], expected.detach(), rtol=1e-3, atol=1e-5)  # type: ignore[union-attr]
+    measured = policy.samples(model.replay_buffer.sample(5), random=False)  # type: ignore[union-attr]
+    assert policy.error(measured).shape == (5,)
 
 
 class Dynamics(SRLHead):

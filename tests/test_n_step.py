@@ -121,6 +121,17 @@ def test_draws_are_sb3s(n_envs: int) -> None:
         )
 
 
+def test_one_stack_is_gathered_per_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The observation of what comes last is never read."""
+    model = tiny_model("CnnPolicy", PixelBox(), n_steps=3, srl=None, curiosity=None, augmentation="shift").learn(10)
+    buffer: Any = model.replay_buffer
+    buffer.sample(8)
+    gathered, gather = [], th.Tensor.index_select
+    monkeypatch.setattr(th.Tensor, "index_select", lambda *args: gathered.append(len(args[2])) or gather(*args))
+    buffer.look_ahead(3, GAMMA)
+    assert gathered == [8 * buffer.frame_stack]
+
+
 def test_sums_end_before_a_mark() -> None:
     """The last good observation is bootstrapped from, and nothing of the marked transition is in the sum."""
     space = VectorBox().observation_space

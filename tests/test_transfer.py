@@ -6,14 +6,42 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import SensorBox, sensor_model
 from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from gymnasium import spaces
 from stable_baselines3 import SAC
 from updates_for_tests import ALGORITHMS
 
+from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.persistence import ArchiveError
+from sb3_cure.srl import RAE
+
+
+class Doubtful(RAE):
+    """An autoencoder of one's own."""
+
+
+class Norms(RAE):
+    """With layers that follow their inputs while they train."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.norm = th.nn.BatchNorm1d(self.encoder.features_dim)
+
+    def loss(self, batch: Any, latents: th.Tensor, next_latents: Any = None) -> Any:
+        return super().loss(batch, self.norm(latents))
+
+
+class Constant(IntrinsicReward):
+    """A reward without tensors."""
+
+    def loss(self, batch: Any, *_: Any) -> Any:
+        return None, th.ones(len(batch.actions))
+
 
 both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
 REPRESENTATION = ("encoder.", "encoder_target.", "srl.")
+CROP_33: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=33))
 CURIOUS = ("curious.", "intrinsic.", "scale.")
 
 
@@ -49,23 +77,36 @@ def test_parts_are_taken_and_the_task_begins_anew(algorithm: str, curiosity: str
 
 
 @both_algorithms
-@pytest.mark.parametrize(("update", "srl"), [("joint", "rae"), ("sequential", "rae"), ("joint", "spr")])
-def test_frozen_representation_stays(algorithm: str, update: str, srl: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("update", "srl"), [("joint", "rae"), ("sequential", "rae"), ("joint", "spr"), ("joint", "curl"), ("joint", Norms)]
+)
+def test_frozen_representation_stays(algorithm: str, update: str, srl: Any, tmp_path: Path) -> None:
     """While all agents learn; also in a model that was saved and loaded; with its statistics and moving averages."""
     saved(tmp_path / "model", algorithm, srl=srl)
     model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], seed=5, update=update, srl=srl)
-    model.transfer_from(tmp_path / "model", freeze=True)
-    kept, agents = tensors(model, ("encoder.", "srl.")), tensors(model, ("task.", "curious."))
+    source = tensors(model.transfer_from(tmp_path / "model", freeze=True), ("encoder.", "srl."))
+    kept, agents = tensors(model, REPRESENTATION), tensors(model, ("task.", "curious."))
     model.learn(16)
     model.save(tmp_path / "frozen")
-    loaded = ALGORITHMS[algorithm].load(tmp_path / "frozen", env=PixelBox()).learn(12, reset_num_timesteps=False)
+    objects = {"srl": srl} if srl is Norms else None
+    loaded = ALGORITHMS[algorithm].load(tmp_path / "frozen", env=PixelBox(), custom_objects=objects)
+    loaded.learn(12, reset_num_timesteps=False)
     for each in (model, loaded):
-        assert each._n_updates > 0 and differences(kept, tensors(each, ("encoder.", "srl."))) == []
+        assert each._n_updates > 0 and differences(kept, tensors(each, REPRESENTATION)) == []
+        assert differences(source, tensors(each, ("encoder.", "srl."))) == []
     moved = {name.split(".")[1] for name in agents if not th.equal(agents[name], tensors(model, (name,))[name])}
     assert {"actor", "critic", "critic_target"} <= moved
     for call in (model.pretrain, model.fit_representation):
         with pytest.raises(ValueError, match="keeps as it is"):
             call(5)
+
+
+def test_frozen_representation_of_a_dictionary_stays(tmp_path: Path) -> None:
+    """The deviations by which errors of images are compared, too."""
+    sensor_model(SensorBox(("front", "wrist"))).learn(12).save(tmp_path / "model")
+    model = sensor_model(SensorBox(("front", "wrist")), curiosity_target="next_observation", seed=5)
+    kept = tensors(model.transfer_from(tmp_path / "model", freeze=True), REPRESENTATION)
+    assert model.learn(16)._n_updates > 0 and differences(kept, tensors(model, REPRESENTATION)) == []
 
 
 def test_encoder_goes_to_a_model_without_head(tmp_path: Path) -> None:
@@ -97,6 +138,72 @@ def test_other_networks_are_refused_in_one_sentence(
     with pytest.raises(ValueError, match=f"has {name}.* of shape .*: transfer needs equal images"):
         model.transfer_from(tmp_path / "model")
     assert differences(before, dict(model.policy.state_dict())) == []
+
+
+class Sensors(SensorBox):
+    """Two cameras of one size and a number, in the order of the keys that are given."""
+
+    def __init__(self, *keys: str, mode: Any = None):
+        super().__init__(("front", "mode"))
+        kinds = {"left": self.observation_space["front"], "right": self.observation_space["front"]}
+        kinds["mode"] = self.observation_space["mode"] if mode is None else mode
+        self.keys, self.observation_space = keys, spaces.Dict([(key, kinds[key]) for key in keys])
+
+    def observe(self, first: bool = False) -> Any:
+        image = PixelBox.observe(self, first)
+        return {key: self.observation_space[key].sample() if key == "mode" else image for key in self.keys}
+
+
+@pytest.mark.parametrize(
+    ("make", "there", "here", "sentence"),
+    [
+        (
+            sensor_model,
+            dict(env=Sensors("left", "right")),
+            dict(env=Sensors("right", "left")),
+            r"observations=\['left: image .*and this model \['right: image",
+        ),
+        (
+            sensor_model,
+            dict(env=Sensors("left", "mode")),
+            dict(env=Sensors("left", "mode", mode=spaces.Box(-1, 1, (3,)))),
+            r"observations=.*'mode: Discrete .*'mode: Box",
+        ),
+        (
+            tiny_model,
+            CROP_33,
+            dict(augmentation="crop", augmentation_kwargs=dict(size=34)),
+            r"views='image \(6, 33, 33\)', and this model 'image \(6, 34, 34\)'",
+        ),
+        (
+            tiny_model,
+            dict(srl="curl", **CROP_33),
+            dict(srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True), **CROP_33),
+            "tanh=False, and this model True",
+        ),
+        (tiny_model, dict(), dict(srl=Doubtful), "srl='RAE'.* 'Doubtful'"),
+        (tiny_model, dict(), dict(intrinsic=Constant), "intrinsic='SRLError', and this model 'Constant'"),
+    ],
+    ids=["cameras", "number", "crop", "tanh", "head", "reward"],
+)
+def test_what_would_mean_something_else_is_refused(
+    make: Any, there: dict[str, Any], here: dict[str, Any], sentence: str, tmp_path: Path
+) -> None:
+    """All shapes are equal."""
+    pixels = () if make is sensor_model else ("CnnPolicy", PixelBox())
+    make(*pixels, **there).save(tmp_path / "model")
+    model = make(*pixels, **here)
+    before = tensors(model, ("",))
+    with pytest.raises(ValueError, match=f"{sentence}.*: of equal shapes.*here.$"):
+        model.transfer_from(tmp_path / "model")
+    assert differences(before, tensors(model, ("",))) == []
+
+
+def test_other_augmentations_are_taken(tmp_path: Path) -> None:
+    """An encoder that has learned from shifted images sees the same to act."""
+    source = saved(tmp_path / "model", augmentation="shift")
+    model = tiny_model("CnnPolicy", PixelBox(), seed=5).transfer_from(tmp_path / "model")
+    assert differences(tensors(source, REPRESENTATION), tensors(model, REPRESENTATION)) == []
 
 
 def test_pickles_are_refused(tmp_path: Path) -> None:

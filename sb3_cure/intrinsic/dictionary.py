@@ -13,12 +13,13 @@ from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.layers import MeanError
 from sb3_cure.observations import image_spaces
 from sb3_cure.srl.base import SRLHead
+from sb3_cure.srl.dictionary import DictHead, heads_by_key
 
 
 class DictReward(IntrinsicReward):
     """A reward of one class for each image of a dictionary: their mean, each divided by its running deviation.
 
-    All of them read the joined latents.
+    All of them read the joined latents; those that are made of the SRL error read their own image's, as its head does.
 
     :param reward_class: Class of the rewards, which says ``per_image = True``
     :param observation_space: Space of the stored observations
@@ -45,6 +46,8 @@ class DictReward(IntrinsicReward):
             for key, space in images.items()
         )
         self.mean_reward = MeanError(len(images))
+        # Which of the joined latents each reward reads
+        self._slices = dict.fromkeys(self.keys, slice(None))
         for name in ("needs_srl", "reads", "trains_encoder", "mixed_precision", "measures"):
             setattr(self, name, getattr(self.rewards[0], name))
 
@@ -52,8 +55,11 @@ class DictReward(IntrinsicReward):
         """
         :param srl: The SRL head
         """
-        for _, reward in self._parts():
-            reward.bind(srl)
+        if self.needs_srl and isinstance(srl, DictHead):
+            self._slices = dict(zip(srl.keys, srl.slices, strict=True))
+        heads = heads_by_key(srl)
+        for key, reward in self._parts():
+            reward.bind(heads.get(key, srl))
 
     def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """
@@ -79,7 +85,10 @@ class DictReward(IntrinsicReward):
         :param srl_error: SRL error of each sample, [B]
         :return: Sum of the losses, and the mean reward, [B]
         """
-        found = [reward.loss(batch.of(key), latents, next_latents, srl_error) for key, reward in self._parts()]
+        found = []
+        for key, reward in self._parts():
+            read = [None if each is None else each[:, self._slices[key]] for each in (latents, next_latents)]
+            found.append(reward.loss(batch.of(key), *read, srl_error))
         losses = [loss.float() for loss, _ in found if loss is not None]
         rewards = self.mean_reward([reward for _, reward in found], learns=True)
         return th.stack(losses).sum() if losses else None, rewards
@@ -90,7 +99,8 @@ class DictReward(IntrinsicReward):
         :param latents: Joined latents, [B, features_dim]
         :return: [B]
         """
-        return self.mean_reward([reward.error(observations[key], latents) for key, reward in self._parts()], False)
+        parts = [(observations[key], latents[:, self._slices[key]], reward) for key, reward in self._parts()]
+        return self.mean_reward([reward.error(seen, own) for seen, own, reward in parts], learns=False)
 
     def reconstruct(self, latents: th.Tensor) -> dict[str, th.Tensor] | None:  # type: ignore[override]
         """

@@ -16,12 +16,16 @@ from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.networks import make_network, scaled
 from sb3_cure.layers import full_precision
 
+#: Rows of the replay buffer that are looked at in one go
+CHUNK = 1000
+
 
 class Particle(IntrinsicReward):
     """log(1 + mean distance to the k nearest neighbours) of where the step leads (Liu & Abbeel, 2021, eq. 5).
 
     Neighbours are sought in the batch and in a memory of what was sampled last. States of the same episode, the state
-    itself among them, are no neighbours: else most of them would be the steps before and after it.
+    itself among them, are no neighbours: else most of them would be the steps before and after it. An episode is also
+    over where the stored stream breaks, as in another ``learn()``.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
@@ -66,6 +70,8 @@ class Particle(IntrinsicReward):
         self._remembered: th.Tensor | None = None
         # Where the next ones go, and where the replay buffer was in the last update
         self.cursor = self.last_pos = 0
+        # Number of the episode of each stored transition, of no two environments alike, [buffer_size, n_envs]
+        self._episodes: ndarray | None = None
 
     def get_extra_state(self) -> dict[str, Any]:
         """
@@ -107,10 +113,10 @@ class Particle(IntrinsicReward):
         size, pos, n_rows = replay_buffer.buffer_size, replay_buffer.pos, replay_buffer.size()
         overwritten = (rows - self.last_pos) % size < (pos - self.last_pos) % size
         rows[overwritten | ((pos - 1 - rows) % size >= n_rows)] = -1
+        episodes = self._follow_episodes(replay_buffer)
         self.last_pos = pos
         self._sampled = np.stack(replay_buffer.last_sampled, axis=1)
         known = np.flatnonzero(rows >= 0)
-        episodes = _episodes(replay_buffer)
         own, others = episodes[*self._sampled.T], episodes[rows[known], env_inds[known]]
         self._may_be_near = own[:, None] != np.concatenate([own, others])
         if self.encoder is not None:
@@ -123,6 +129,7 @@ class Particle(IntrinsicReward):
     def forget(self) -> None:
         """The memory is of the replay buffer."""
         self.places[:] = -1
+        self._episodes = None
 
     @th.no_grad()
     def loss(
@@ -157,11 +164,16 @@ class Particle(IntrinsicReward):
             self.features[th.from_numpy(where).to(features.device)] = features[-n:]
         self.cursor = (self.cursor + n) % len(self.places)
 
-
-def _episodes(buffer: ReplayBuffer) -> ndarray:
-    """Number of the episode of each stored transition, of no two environments alike, [buffer_size, n_envs]."""
-    oldest_first = (buffer.pos - buffer.size() + np.arange(buffer.size())) % buffer.buffer_size
-    ends = buffer.dones[oldest_first].astype(int)
-    numbers = np.zeros((buffer.buffer_size, buffer.n_envs), dtype=int)
-    numbers[oldest_first] = (ends.cumsum(axis=0) - ends) * buffer.n_envs + np.arange(buffer.n_envs)
-    return numbers
+    def _follow_episodes(self, buffer: SkipsMarked) -> ndarray:
+        """Number the rows that are new since the last update, at first all: another number wherever a stream breaks."""
+        size, n_envs = buffer.buffer_size, buffer.n_envs
+        n_new = (buffer.pos - self.last_pos) % size
+        if self._episodes is None:
+            self._episodes, n_new = np.tile(np.arange(n_envs), (size, 1)), buffer.size()
+        for start in range(0, n_new, CHUNK):
+            rows = (buffer.pos - n_new + np.arange(start, min(start + CHUNK, n_new))) % size
+            before = (rows - 1) % size
+            goes_on = buffer._goes_on(*np.broadcast_arrays(before, rows, np.arange(n_envs)[:, None])).T
+            begins = ~goes_on | (buffer.dones[before] > 0)
+            self._episodes[rows] = self._episodes[before[:1]] + n_envs * begins.cumsum(axis=0)
+        return self._episodes

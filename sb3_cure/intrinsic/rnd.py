@@ -13,8 +13,8 @@ from sb3_cure.buffers import Samples, unmarked
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.networks import DITHER, make_network, scaled
 
-#: Most observations that the statistics are taken of, and how many at a time
-OBSERVATIONS, CHUNK = 1000, 100
+#: Least and most observations that the statistics are taken of, and how many at a time
+ENOUGH, OBSERVATIONS, CHUNK = 256, 1000, 100
 #: Numbers of vectors that vary by less than this count as constant
 SMALLEST = 1e-6
 
@@ -23,7 +23,8 @@ class RND(IntrinsicReward):
     """Error of a predictor of a fixed random network, on where the step leads (Burda et al., 2018, section 2.2).
 
     Inputs are whitened pixel by pixel and clipped to +-5, as there. The statistics are those of what the replay buffer
-    holds at the first update, which is the random warm-up, and then frozen: drift would move the target.
+    holds at the first update, which is the random warm-up, and then frozen: drift would move the target. Of a warm-up
+    of less than ``ENOUGH`` transitions they are taken anew in each update, until there are as many.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
@@ -61,11 +62,12 @@ class RND(IntrinsicReward):
         shape = scaled(th.as_tensor(self.space.sample())[None], self.space).shape[1:]
         self.register_buffer("mean", th.zeros(shape))
         self.register_buffer("variance", th.zeros(shape))
+        #: Whether the statistics are final
         self.measured = False
 
     def get_extra_state(self) -> th.Tensor:
         """
-        :return: Whether there are statistics
+        :return: Whether the statistics are final
         """
         return th.tensor(self.measured)
 
@@ -76,7 +78,7 @@ class RND(IntrinsicReward):
         self.measured = bool(state)
 
     def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
-        """Take the statistics, once.
+        """Take the statistics, until they are of enough.
 
         :param replay_buffer: The replay buffer
         :param look_up: What it holds
@@ -94,7 +96,7 @@ class RND(IntrinsicReward):
         mean = total / len(chosen)
         self.mean.copy_(mean)
         self.variance.copy_((squares / len(chosen) - mean.square()).clamp(min=0))
-        self.measured = True
+        self.measured = len(rows) >= ENOUGH or replay_buffer.full
 
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None

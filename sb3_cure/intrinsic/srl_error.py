@@ -1,5 +1,7 @@
 """The paper's reward: the error of the state representation (section "CuRe")."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
@@ -44,15 +46,22 @@ class SRLError(IntrinsicReward):
             self.reads = ("next_latents" if self.about_next else "latents",)
             self.mixed_precision = self.measures = True
 
+    @classmethod
+    def configured(cls, per_pixel: bool = False, **kwargs: Any) -> type[IntrinsicReward]:
+        """
+        :param per_pixel: As of the constructor
+        :param kwargs: Its other arguments
+        :return: This class, or one that reads images
+        """
+        return PerPixel if per_pixel else cls
+
     def bind(self, srl: SRLHead | None) -> None:
         """
-        :param srl: The SRL head
+        :param srl: The SRL head, of dictionaries that of one image
         :raises ValueError: if pixels are to be compared, and the head does not draw
         """
         if not self.per_pixel or srl is None:
             return
-        if isinstance(srl.observation_space, spaces.Dict):
-            raise ValueError("per_pixel=True compares the pixels of one image: of dictionaries, use 'reconstruction'.")
         if type(srl).reconstruct is SRLHead.reconstruct:
             raise ValueError(
                 f"per_pixel=True compares pixels, but {type(srl).__name__} does not draw: use srl='rae', another head "
@@ -108,3 +117,9 @@ class SRLError(IntrinsicReward):
         drawn = drawn.float().div_(255) if drawn.dim() == 4 else drawn.float()
         variance = self.variance / self.weight.clamp(min=1 - self.decay) + DITHER
         return (drawn.sub_(seen).square_() / variance).flatten(1).mean(dim=1)
+
+
+class PerPixel(SRLError):
+    """What ``SRLError`` declares with ``per_pixel=True``."""
+
+    per_image = True

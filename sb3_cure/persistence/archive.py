@@ -88,7 +88,7 @@ class ModelArchive:
 
     def read(self, part: str) -> dict[str, Any]:
         """
-        :param part: ``"parameters"``, ``"variables"`` or ``"parts"``
+        :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"traits"``
         :return: States by name
         """
         with refusing(self.name):
@@ -125,17 +125,19 @@ def is_pickled_model(path: PathOrFile) -> bool:
         return ModelArchive(file, name).is_pickled
 
 
-def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None]:
+def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None, dict[str, Any]]:
     """
     :param path: A model's file
-    :return: The tensors of its policy by name, and the logarithm of its curious agent's temperature, if it learns that
+    :return: The tensors of its policy by name; the logarithm of its curious agent's temperature, if it learns that; and
+        the ``traits`` of its policy
     :raises ArchiveError: if it is damaged or pickled
     """
     with reading(path, "zip") as (file, name):
         archive = ModelArchive(file, name)
     if archive.is_pickled:
         raise ArchiveError(f"{name} was pickled by SB3's save: load it with trusted=True, and save it again.")
-    return archive.read("parameters")["policy"], archive.read("variables").get("policy.curious.log_ent_coef")
+    temperature = archive.read("variables").get("policy.curious.log_ent_coef")
+    return archive.read("parameters")["policy"], temperature, archive.read("traits")
 
 
 class SavesModels(OffPolicyAlgorithm):
@@ -183,6 +185,7 @@ class SavesModels(OffPolicyAlgorithm):
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
             "variables": {name: recursive_getattr(self, name) for name in variables},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
+            "traits": getattr(self.policy, "traits", {}),  # of SB3's own policies: none
         }
         data = {"format": VERSION, "settings": settings}
         data |= {name: encode(part, name, tensors) for name, part in content.items()}

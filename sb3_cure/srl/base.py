@@ -105,6 +105,9 @@ class SRLHead(nn.Module):
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """The training loss. It may be noisy and may use the other samples of the batch.
 
+        Where the head does not learn (in phases of RL, or frozen) its error alone is asked for, without gradients:
+        statistics move only ``if th.is_grad_enabled()``.
+
         :param batch: Samples of the replay buffer; ``batch.views`` is what the encoder saw
         :param latents: The encoder's output for ``batch.views``, fp32, [B, encoder.features_dim]
         :param next_latents: The same for views of the next observations, if ``needs_next_latents``

@@ -89,7 +89,8 @@ class CURL(SRLHead):
         :param next_latents: Unused
         :return: Loss, and the cross-entropy (or the distance of the two views) of each anchor, [B]
         """
-        self._fill_bank(batch.observations)
+        if th.is_grad_enabled():  # where it learns
+            self._fill_bank(batch.observations)
         keys = self._keys(self.augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
         with full_precision(keys):

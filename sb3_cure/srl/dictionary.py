@@ -63,7 +63,7 @@ class DictHead(SRLHead):
         :return: Sum of the losses, and the mean error of each sample, [B]
         """
         outputs = [head.loss(batch.of(key), part) for key, head, part in self._parts(latents)]
-        error = self.mean_error([output.error for output in outputs], learns=True)
+        error = self.mean_error([output.error for output in outputs], learns=th.is_grad_enabled())
         return SRLOutput(th.stack([output.loss.float() for output in outputs]).sum(), error)
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:

@@ -58,8 +58,7 @@ class NextLatents(SRLHead):
         :param next_latents: Unused
         :return: Mean error, and the error of each prediction, [B]
         """
-        learns = th.is_grad_enabled()  # not in the phases of RL, and not if it is frozen
-        error = self._error(batch, latents, self.augment(batch.next_observations), learns)
+        error = self._error(batch, latents, self.augment(batch.next_observations), learns=th.is_grad_enabled())
         return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()

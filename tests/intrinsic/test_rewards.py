@@ -22,7 +22,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.buffers import transitions
 from sb3_cure.callbacks import CuriosityMapCallback, ExactCheckpoint
 from sb3_cure.experiments.grid import load_grid
-from sb3_cure.intrinsic import INTRINSIC_REWARDS, IntrinsicReward
+from sb3_cure.intrinsic import INTRINSIC_REWARDS, IntrinsicReward, OwnGenerator, disagreement, rnd
 from sb3_cure.intrinsic.networks import make_network
 
 #: Every reward by its name, and variants of some
@@ -220,7 +220,8 @@ def test_what_cannot_be_computed_is_refused(arguments: dict[str, Any], sentence:
 @pytest.mark.parametrize("pixels", [True, False])
 def test_rnd_is_the_error_on_the_whitened_newest_frame(pixels: bool) -> None:
     """By the statistics of the warm-up's newest frames, clipped; they are frozen, and so is the target."""
-    model = filled_model(pixels=pixels, srl=None, intrinsic="rnd", learning_rate=0.01 if pixels else 0.2)
+    rate = 0.01 if pixels else 0.2
+    model = filled_model(pixels=pixels, srl=None, intrinsic="rnd", learning_rate=rate, buffer_size=40)
     reward, found, buffer = reward_of(model), captured(model), model.replay_buffer
     everything: Any = transitions(buffer, np.arange(40), np.zeros(40, int))  # type: ignore[arg-type]
 
@@ -244,6 +245,17 @@ def test_rnd_is_the_error_on_the_whitened_newest_frame(pixels: bool) -> None:
         buffer.add(new, new, np.zeros((1, 2)), np.zeros(1), np.ones(1), [{}])  # type: ignore[union-attr]
     train_once(model)
     assert th.equal(reward.mean, mean)
+
+
+def test_rnd_without_warm_up_measures_until_it_has_seen_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a single transition everything else would be clipped."""
+    monkeypatch.setattr(rnd, "ENOUGH", 20)
+    model = tiny_model("MlpPolicy", VectorBox(), srl=None, task=False, intrinsic="rnd", learning_starts=0)
+    for steps, seen in ((12, 12), (12, 20), (5, 20)):
+        model.learn(steps, reset_num_timesteps=False)
+        reward, stored = reward_of(model), model.replay_buffer.next_observations[:seen, 0]  # type: ignore[union-attr]
+        th.testing.assert_close(reward.mean, th.as_tensor(stored).mean(dim=0), rtol=1e-4, atol=1e-5)
+        th.testing.assert_close(reward.variance, th.as_tensor(stored).var(dim=0, correction=0), rtol=1e-4, atol=1e-5)
 
 
 def test_rnd_whitens_normalised_observations() -> None:
@@ -296,12 +308,10 @@ def test_icm_is_the_forward_error_in_features_of_the_inverse_model(encoder: str)
 
 
 def test_disagreement_is_the_variance_of_members_that_learn_apart() -> None:
-    """One member after the other, each on its part of the batch by a generator of its own."""
+    """One member after the other, each on its part of the transitions."""
     model = filled_model(srl=None, intrinsic="disagreement", intrinsic_kwargs=dict(n_members=3), learning_rate=0.05)
     reward, found, batch = reward_of(model), captured(model), sampled(model)
-    generator = th.Generator()
-    generator.set_state(reward.random.generator.get_state())
-    parts = th.rand(3, 8, generator=generator) < 0.5
+    parts = th.from_numpy(disagreement._uniform(model.replay_buffer.last_sampled[0], 3) < 0.5)  # type: ignore[union-attr]
     first, second = reward.members[0], reward.members[2]
     with th.no_grad():
         here, there = model.policy.encode(batch.observations), model.policy.encode(batch.next_observations)
@@ -320,6 +330,40 @@ def test_disagreement_is_the_variance_of_members_that_learn_apart() -> None:
     assert not th.equal(parts[0], parts[1])
 
 
+def test_bootstrap_masks_belong_to_transitions() -> None:
+    """Whatever the batch, a member never learns from transitions that are not its own."""
+    env = DummyVecEnv([lambda: VectorBox()] * 2)
+    arguments: dict[str, Any] = dict(intrinsic="disagreement", intrinsic_kwargs=dict(n_members=1))
+    model = tiny_model("MlpPolicy", env, srl=None, learning_starts=200, **arguments).learn(200)
+    reward, buffer = reward_of(model), model.replay_buffer
+    assert buffer is not None
+    learned: dict[tuple[int, int], set[tuple[bool, ...]]] = {}
+    for _ in range(40):
+        batch = model.policy.samples(buffer.sample(32))
+        reward.attach(buffer, model._look_up, model._encode_centred)
+        latents = th.zeros(32, model.policy.encoder.features_dim)
+        target = latents.clone().requires_grad_(True)
+        reward.loss(batch, latents, target, None)[0].backward()
+        for i, place in enumerate(zip(*buffer.last_sampled, strict=True)):  # type: ignore[attr-defined]
+            learned.setdefault(place, set()).add(bool(target.grad[i].any()))  # type: ignore[index, arg-type, union-attr]
+    assert len(learned) > 150 and all(len(each) == 1 for each in learned.values())
+    assert 0.3 < np.mean([each == {True} for each in learned.values()]) < 0.7
+
+
+def test_bootstrap_masks_are_as_if_drawn() -> None:
+    """In shares, members and neighbours, within five deviations of 20 000 coins."""
+    drawn = disagreement._uniform(np.arange(20_000), 5)
+    assert 0 <= drawn.min() and drawn.max() < 1 and len(np.unique(drawn)) == drawn.size
+    for share in (0.1, 0.5, 0.9):
+        part = drawn < share
+        deviation = math.sqrt(share * (1 - share) / 20_000)
+        assert np.abs(part.mean(axis=1) - share).max() < 5 * deviation
+    coins = np.where(drawn < 0.5, 1, -1)
+    for lag in (0, 1, 2, 5, 128):
+        alike = coins[:, lag:] @ coins[:, : 20_000 - lag].T / (20_000 - lag)
+        assert np.abs(alike - (np.eye(5) if lag == 0 else 0)).max() < 5 / math.sqrt(20_000 - lag)
+
+
 # ---------------------------------------------------------------- particle
 
 
@@ -331,7 +375,8 @@ def nearest_mean(own: th.Tensor, others: list[th.Tensor], k: int) -> float:
 @pytest.mark.parametrize("space", ["random", "latents"])
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_envs: int) -> None:
-    """Over batch and memory, update after update, while the replay buffer overwrites its oldest rows."""
+    """Over batch and memory, update after update, while the replay buffer overwrites its oldest rows, and where the
+    stream breaks without an end, as in another ``learn()``."""
     env = DummyVecEnv([lambda: VectorBox(episode_length=4)] * n_envs)
     kwargs = dict(space=space, n_neighbours=3, memory=20)
     arguments: dict[str, Any] = dict(intrinsic="particle", intrinsic_kwargs=kwargs, buffer_size=24 * n_envs)
@@ -339,7 +384,8 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
     model.learn(24 * n_envs)
     reward, found, buffer = reward_of(model), captured(model), model.replay_buffer
     assert buffer is not None
-    episode, step = np.arange(24) // 4, 24  # of each row; of the next one
+    episode, number, done = np.arange(24) // 4, 5, True  # of each row; of the latest one, and whether it is its last
+    seen = np.zeros((n_envs, 2))
     memory: list[Any] = [None] * 20  # row, environment and features of each place
 
     def encode(row: int, env_ind: int) -> th.Tensor:
@@ -349,10 +395,12 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
 
     for update in range(7):
         for _ in range(3):  # the oldest rows go
-            row, following = buffer.pos, np.random.randn(n_envs, 2)
-            done = np.full(n_envs, step % 4 == 3)
-            buffer.add(following, following, np.zeros((n_envs, 2)), np.zeros(n_envs), done, [{}] * n_envs)
-            episode[row], step = step // 4, step + 1
+            row, breaks = buffer.pos, buffer.pos % 4 == 2
+            number += done or breaks
+            seen, episode[row], done = seen + 0.001 * breaks, number, row % 4 == 3
+            following = seen + 0.1 * np.random.randn(n_envs, 2)  # near, so that it matters which of them count
+            buffer.add(seen, following, np.zeros((n_envs, 2)), np.zeros(n_envs), np.full(n_envs, done), [{}] * n_envs)
+            seen = following
             memory = [None if place is None or place[0] == row else place for place in memory]
         if space == "latents":  # stored ones would be stale
             memory = [None if place is None else (*place[:2], encode(*place[:2])) for place in memory]
@@ -388,7 +436,9 @@ def test_particle_forgets_rows_whose_frames_were_lost() -> None:
 def test_particle_of_a_single_episode_earns_nothing() -> None:
     model = filled_model(srl=None, intrinsic="particle")
     found = captured(model)
-    model.replay_buffer.dones[:] = 0  # type: ignore[union-attr]
+    buffer: Any = model.replay_buffer
+    buffer.dones[:] = 0
+    buffer.observations[1:] = buffer.next_observations[:-1]
     train_once(model)
     assert not found[0].any()
 
@@ -498,7 +548,12 @@ def test_shuffled_is_the_other_reward_for_the_wrong_samples(of: str) -> None:
 
 
 def test_shuffled_draws_apart_from_what_it_shuffles() -> None:
-    model = filled_model(intrinsic="shuffled", intrinsic_kwargs=dict(of="disagreement"))
+    class Drawing(IntrinsicReward):
+        def __init__(self, *args: Any):
+            super().__init__(*args)
+            self.random = OwnGenerator()
+
+    model = tiny_model("MlpPolicy", VectorBox(), intrinsic="shuffled", intrinsic_kwargs=dict(of=Drawing))
     generators = [reward_of(model).random.generator, reward_of(model).of.random.generator]
     assert not th.equal(*(th.rand(4, generator=each) for each in generators))
 
