@@ -225,7 +225,11 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
     ),
     "fixed hot": (lambda: box(PixelBox(), ent_coef=1e6), "temperature", r"task agent is fixed at 1\.0e\+06"),
     "fixed cold": (lambda: box(PixelBox(), ent_coef=1e-8), "temperature", r"task agent is fixed at 1\.0e-08"),
-    "SB3's": (lambda: pixel_sac(learning_starts=10, batch_size=8, seed=0, ent_coef=1e6), "temperature", r"is fixed at 1\.0e\+06"),
+    "SB3's": (
+        lambda: pixel_sac(learning_starts=10, batch_size=8, seed=0, ent_coef=1e6),
+        "temperature",
+        r"is fixed at 1\.0e\+06",
+    ),
     "curious": (
         lambda: box(PixelBox(), curiosity_beta=1e-2, normalize_curiosity=False),
         "curious_reward",
