@@ -7,11 +7,35 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 # For the processes that tests start; see below.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import multiprocessing
+
 import pytest
 import torch as th
 
+# What workers of vectorised environments need is imported once by the server that forks them, not by each of them.
+multiprocessing.get_context("forkserver").set_forkserver_preload(["sb3_cure", "stable_baselines3.common.vec_env"])
+
 # The networks of the tests are so small that more threads only cost time; and some sums depend on their number.
 th.set_num_threads(1)
+
+
+#: Tests that take longest, by the beginnings of their names. They are begun first: of two processes neither is to be
+#: left alone with one of them at the end.
+LONGEST = (
+    "tests/test_learning.py",
+    "tests/test_determinism.py",
+    "tests/test_curious_returns.py",
+    "tests/test_diagnostics.py::test_real_pixels",
+    "tests/test_sb3_parity.py::test_500_updates",
+    "tests/experiments/test_run.py::test_killed",
+    "tests/experiments/test_cells.py::test_pictures_show_every_policy",
+    "tests/test_notebooks.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests go first, the others as they stand."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 
 @pytest.fixture(autouse=True, scope="session")

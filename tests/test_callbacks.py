@@ -339,18 +339,19 @@ class Compass(gym.ActionWrapper):
         return np.array([(-1, 0), (1, 0), (0, -1), (0, 1)][action], np.float32)
 
 
+SAC_ARGUMENTS: dict[str, Any] = dict(learning_starts=30, batch_size=8, buffer_size=100, seed=0)
 PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed=0)
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: SAC("CnnPolicy", PixelBox(), seed=0, learning_starts=30, policy_kwargs=dict(net_arch=[8])),
+        lambda: SAC("CnnPolicy", PixelBox(), policy_kwargs=dict(net_arch=[8]), **SAC_ARGUMENTS),
         lambda: DQN("CnnPolicy", Compass(PixelBox()), seed=0, learning_starts=10, buffer_size=100),
         lambda: PPO("CnnPolicy", PixelBox(), **PPO_ARGUMENTS),
         lambda: PPO("CnnPolicy", PixelBox(), policy_kwargs=dict(share_features_extractor=False), **PPO_ARGUMENTS),
         lambda: RecurrentPPO("CnnLstmPolicy", PixelBox(), **PPO_ARGUMENTS),
-        lambda: CuReSAC("CnnPolicy", PixelBox(), srl=None, curiosity=None, seed=0, learning_starts=30),
+        lambda: CuReSAC("CnnPolicy", PixelBox(), srl=None, curiosity=None, **SAC_ARGUMENTS),
     ],
     ids=["SAC", "DQN", "PPO", "PPO, nothing shared", "RecurrentPPO", "CuReSAC as SAC"],
 )

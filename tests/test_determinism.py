@@ -31,23 +31,25 @@ def cartpole() -> TimeLimit:
     return TimeLimit(make_dmc_env("cartpole", "swingup", image_size=40), 3)
 
 
+#: Agent steps by number of environments: all of an episode of three steps end together, and log one loss
+STEPS = {1: 24, 4: 48}
 #: Environment, kind and number of them, agent steps, arguments of the model
 RUNS: dict[str, tuple[Any, str, int, int, dict[str, Any]]] = {
-    f"box-{srl}-{kind}-{n_envs}": (BOX, kind, n_envs, 60, dict(srl=srl))
+    f"box-{srl}-{kind}-{n_envs}": (BOX, kind, n_envs, STEPS[n_envs], dict(srl=srl))
     for srl in ("rae", "curl")
     for kind in KINDS
     for n_envs in (1, 4)
 }
 RUNS.update(
     {
-        "box-rae-subproc-4-overlap": (BOX, "subproc", 4, 60, dict(srl="rae", overlap=True)),
-        "box-rae-dummy-1-bf16": (BOX, "dummy", 1, 40, dict(srl="rae", precision="bf16")),
-        "box-plain-dummy-4": (BOX, "dummy", 4, 60, dict(srl=None, curiosity=None)),
-        "dmc-rae-dummy-1": (cartpole, "dummy", 1, 50, dict(srl="rae")),
-        "dmc-curl-dummy-4": (cartpole, "dummy", 4, 60, dict(srl="curl")),
-        "dmc-curl-subproc-1": (cartpole, "subproc", 1, 40, dict(srl="curl")),
-        "dmc-rae-subproc-4": (cartpole, "subproc", 4, 60, dict(srl="rae")),
-        "dmc-curl-subproc-4-overlap": (cartpole, "subproc", 4, 60, dict(srl="curl", overlap=True)),
+        "box-rae-subproc-4-overlap": (BOX, "subproc", 4, STEPS[4], dict(srl="rae", overlap=True)),
+        "box-rae-dummy-1-bf16": (BOX, "dummy", 1, STEPS[1], dict(srl="rae", precision="bf16")),
+        "box-plain-dummy-4": (BOX, "dummy", 4, STEPS[4], dict(srl=None, curiosity=None)),
+        "dmc-rae-dummy-1": (cartpole, "dummy", 1, STEPS[1], dict(srl="rae")),
+        "dmc-curl-dummy-4": (cartpole, "dummy", 4, STEPS[4], dict(srl="curl")),
+        "dmc-curl-subproc-1": (cartpole, "subproc", 1, STEPS[1], dict(srl="curl")),
+        "dmc-rae-subproc-4": (cartpole, "subproc", 4, STEPS[4], dict(srl="rae")),
+        "dmc-curl-subproc-4-overlap": (cartpole, "subproc", 4, STEPS[4], dict(srl="curl", overlap=True)),
     }
 )
 

@@ -29,6 +29,12 @@ def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
 
 
+@pytest.fixture
+def few_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture of reconstructions is drawn anew for each of its rows, which takes half a second each time."""
+    monkeypatch.setattr(media, "ROWS_OF_RECONSTRUCTIONS", 1)
+
+
 def only_cell(folder: Path, **changes: Any) -> Cell:
     (cell,) = load_grid(write_grid(folder, **changes)).cells
     return cell
@@ -111,6 +117,7 @@ class Head(RAE):
 """
 
 
+@pytest.mark.usefixtures("few_rows")
 def test_own_environment_and_head_are_named_by_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Images have the channels last, and frames lie on disk; the model that is kept loads with what the cell names."""
     (tmp_path / "camera_of_a_grid.py").write_text(OWN)
@@ -229,6 +236,7 @@ def test_pretrained_arms_have_the_same_warm_up(
     assert len(differences(warm_ups[0], warm_ups[3])) == 2, "another seed has another warm-up"
 
 
+@pytest.mark.usefixtures("few_rows")
 def test_common_generators_do_not_break_pairs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warm_ups: list[Any]
 ) -> None:
@@ -386,6 +394,7 @@ def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: p
     assert len(np.unique(observed[0], axis=0)) == len(observed[0]) == 8
 
 
+@pytest.mark.usefixtures("few_rows")
 def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Films of both policies; the map is that of the measured visits, of sampled and random actions."""
     maps: list[dict[str, Any]] = []
@@ -412,6 +421,7 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "map.png").exists()
 
 
+@pytest.mark.usefixtures("few_rows")
 @pytest.mark.parametrize(("channels", "wraps", "shown"), [(3, False, 3), (4, True, 1), (4, False, 1)])
 def test_pictures_are_drawn_of_any_channels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, wraps: bool, shown: int
@@ -439,6 +449,7 @@ def test_pictures_are_drawn_of_any_channels(
     assert set(drawn) == {shown}
 
 
+@pytest.mark.usefixtures("few_rows")
 def test_failing_pictures_cost_no_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

@@ -100,17 +100,17 @@ def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 @every_reward
 def test_resumed_training_is_the_uninterrupted_one(arm: str, curiosity: str, tmp_path: Path) -> None:
     """Bit for bit, with a replay buffer and memories that have gone round, from a model that was loaded."""
-    arguments: dict[str, Any] = dict(curiosity=curiosity, buffer_size=25, **ARMS[arm])
+    arguments: dict[str, Any] = dict(curiosity=curiosity, buffer_size=14, **ARMS[arm])
 
     def env() -> DummyVecEnv:
         return make_vec_env(PixelBox, 1, env_kwargs=dict(episode_length=7, size=24))
 
-    whole = tiny_model("CnnPolicy", env(), **arguments).learn(45)
+    whole = tiny_model("CnnPolicy", env(), **arguments).learn(24)
     with pytest.raises(Killed):
-        tiny_model("CnnPolicy", env(), **arguments).learn(45, callback=[ExactCheckpoint(6, tmp_path), KillAt(35)])
+        tiny_model("CnnPolicy", env(), **arguments).learn(24, callback=[ExactCheckpoint(6, tmp_path), KillAt(21)])
     np.random.seed(99)
     th.manual_seed(99)
-    resumed = CuReSAC.resume(tmp_path, env(), device="cpu").learn(45, callback=ExactCheckpoint(100, tmp_path))
+    resumed = CuReSAC.resume(tmp_path, env(), device="cpu").learn(24, callback=ExactCheckpoint(100, tmp_path))
     assert any("intrinsic" in name for name in state_of(whole)["policy"]) == bool(reward_of(whole).state_dict())
     assert differences(state_of(whole), state_of(resumed)) == []
     assert whole._mixer.state_dict()["rng"] == resumed._mixer.state_dict()["rng"]
@@ -120,17 +120,18 @@ def test_resumed_training_is_the_uninterrupted_one(arm: str, curiosity: str, tmp
 @every_reward
 def test_trains_without_a_task_and_in_pretraining(arm: str, pixels: bool) -> None:
     """A reward that is finite and differs between samples pays the curious critics, and the head still learns."""
-    policy, env = ("CnnPolicy", PixelBox(size=24)) if pixels else ("MlpPolicy", VectorBox())
-    model = tiny_model(policy, env, task=False, **ARMS[arm]).learn(50)
+    short: dict[str, Any] = dict(episode_length=7)  # so that particles find some of other episodes
+    policy, env = ("CnnPolicy", PixelBox(size=24, **short)) if pixels else ("MlpPolicy", VectorBox(**short))
+    model = tiny_model(policy, env, task=False, **ARMS[arm]).learn(20)
     latest = model._metrics.latest
     assert all(math.isfinite(value) for value in map(float, latest.values()))
     assert float(latest["train/curious_reward_std"]) > 0
     model = tiny_model(policy, env, curiosity=None, **ARMS[arm])
     before, sources = groups(model), set(model.policy.encoder_update.weights)
-    model.pretrain(20)
+    model.pretrain(14)
     assert "head" in moved(before, groups(model)) and "actor" not in moved(before, groups(model))
     assert set(model.policy.encoder_update.weights) == sources and model.policy.intrinsic is None
-    model.learn(14)
+    model.learn(12)
 
 
 @every_reward

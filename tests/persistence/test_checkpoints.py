@@ -320,7 +320,7 @@ SCRIPT = textwrap.dedent(
             policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
         )
     model.set_logger(configure(str(folder / "logs"), ["csv"]))
-    model.learn(180, callback=ExactCheckpoint(20, folder / "checkpoints"), log_interval=1)
+    model.learn(130, callback=ExactCheckpoint(10, folder / "checkpoints"), log_interval=1)
     model.save(folder / "final")
     """
 )
