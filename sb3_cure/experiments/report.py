@@ -113,9 +113,15 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     parts: list[Part] = []
     if experiment.kind == "visitation":
         headlines, parts = _visitation(experiment)
+    explored = _stacked(experiment, "cells")
+    if explored:
+        label, caption = "cells of the true state\nreached in training", words("cells_reached", list(explored))
+        parts.append(_figure("cells_reached", caption, plots.learning_curves, explored, colors, label))
+        parts.append(tables.cells_reached_table(experiment, explored))
     parts += curve_figures(experiment, colors)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
-        headlines, more = _comparison(experiment, colors, thresholds)
+        compared, more = _comparison(experiment, colors, thresholds)
+        headlines = [*_exploration_headlines(experiment, list(explored)), *compared]
         parts = [tables.pretraining_table(experiment)] * (experiment.kind == "pretraining") + parts + more
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
@@ -206,6 +212,14 @@ def _visitation_headlines(experiment: Experiment, measures: Sequence[tuple[Measu
         if found:
             policy = "random policy" if other == "ratio" else f"task policy of {experiment.baseline_of(method)}"
             yield words("visits", method, task, policy, found)
+
+
+def _exploration_headlines(experiment: Experiment, tasks: Sequence[str]) -> Iterator[str]:
+    """Of each arm a sentence: how many of the cells of its baseline it reached."""
+    for task, method in itertools.product(tasks, experiment.methods):
+        baseline, ratio = experiment.baseline_of(method), statistics.cells_ratio(experiment, task, method)
+        if method != baseline and ratio.n:
+            yield words("explores", method, task, baseline, ratio_text(ratio), ratio.n)
 
 
 def _comparison(

@@ -35,6 +35,7 @@ class CellResult:
     :param run: ``run.json``
     :param evaluations: ``eval.csv`` (missing values are nan)
     :param visitation: ``visitation.csv``
+    :param coverage: ``coverage.csv``
     """
 
     task: str
@@ -46,6 +47,7 @@ class CellResult:
     run: dict[str, Any] = field(default_factory=dict)
     evaluations: pd.DataFrame = field(default_factory=pd.DataFrame)
     visitation: pd.DataFrame = field(default_factory=pd.DataFrame)
+    coverage: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @property
     def done(self) -> bool:
@@ -63,12 +65,13 @@ class CellResult:
 
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """
-        :param column: A column of ``eval.csv``
+        :param column: A column of ``eval.csv``, or ``"cells"`` of ``coverage.csv``
         :return: Environment steps and values where there are any, [n] each
         """
-        if column not in self.evaluations:
+        table = self.coverage if column == "cells" else self.evaluations
+        if column not in table:
             return np.zeros(0), np.zeros(0)
-        known = self.evaluations[np.isfinite(self.evaluations[column])]
+        known = table[np.isfinite(table[column])]
         return known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
 
     def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -244,7 +247,8 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kin
     if "eval.csv" in needed or (own_budget > 0 and len(evaluations)):
         _check_whole(folder / "eval.csv", evaluations, own_budget, config)
     visits = _read_table(folder / "visitation.csv", "error_min", "error_mean", "error_max", text=("actor", "head"))
-    return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits)
+    covered = _read_table(folder / "coverage.csv", "environment_steps", "cells")
+    return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits, covered)
 
 
 def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, config: dict[str, Any]) -> None:
@@ -284,7 +288,7 @@ def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
 def _read_table(path: Path, *numbers: str, text: tuple[str, ...] = ()) -> pd.DataFrame:
     """A CSV file with at least these columns; an empty table if there is none."""
     if not path.exists():
-        return pd.DataFrame(columns=[*numbers, *text])
+        return pd.DataFrame({**dict.fromkeys(numbers, np.zeros(0)), **{name: [] for name in text}})
     try:
         rows = [
             {name: np.nan if value == "" else value for name, value in row.items()}

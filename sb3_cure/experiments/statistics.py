@@ -67,7 +67,7 @@ def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tu
     """The curves of several seeds on the same steps (linear in between, where evaluations fell on different ones).
 
     :param cells: Finished cells
-    :param column: A column of ``eval.csv``
+    :param column: As of ``CellResult.curve``
     :return: Environment steps [n], within what all of them span, and values [seeds, n]
     """
     curves = [cell.curve(column) for cell in cells]
@@ -218,6 +218,18 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
     found = t_interval([np.log(ratios)])
     low, high = (None if end is None else float(np.exp(end)) for end in (found.low, found.high))
     return Estimate(float(np.exp(found.value)), low, high, found.n)
+
+
+def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
+    """
+    :param experiment: An experiment
+    :param task: Short name of a task
+    :param method: Name of an arm
+    :return: Cells of the true state that it had reached in the end, over those of its baseline, see ``paired_ratio``
+    """
+    arms = (experiment.done(task, arm) for arm in (method, experiment.baseline_of(method)))
+    curves = ({seed: cell.curve("cells")[1] for seed, cell in cells.items()} for cells in arms)
+    return paired_ratio(*({seed: cells[-1] for seed, cells in arm.items() if len(cells)} for arm in curves))
 
 
 @dataclass(frozen=True)

@@ -347,6 +347,26 @@ def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
     return _table("Coverage of the true state space", columns, shown, note)
 
 
+def cells_reached_table(
+    experiment: Experiment, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
+) -> Table:
+    """
+    :param experiment: An experiment
+    :param curves: By task and arm: environment steps [n], and cells reached until then [seeds, n]
+    :return: Cells at these steps, and how many of the baseline's in the end
+    """
+    steps = next(iter(next(iter(curves.values())).values()))[0]
+    columns = ["task", "arm", ">seeds", *(f">at {number_text(step)}" for step in steps), ">/ baseline"]
+    shown = []
+    for task, arms in curves.items():
+        for method, (_, cells) in arms.items():
+            ratio = NONE
+            if method != experiment.baseline_of(method):
+                ratio = ratio_text(statistics.cells_ratio(experiment, task, method))
+            shown.append([task, method, str(len(cells)), *map(_mean_std, cells.T), ratio])
+    return _table("Cells of the true state", columns, shown, words("cells_note", _baselines(experiment)))
+
+
 def pretraining_table(experiment: Experiment) -> Table:
     """
     :param experiment: An experiment of kind ``"pretraining"``

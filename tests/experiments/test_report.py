@@ -14,11 +14,11 @@ import pytest
 import yaml
 from PIL import Image
 from programs_for_tests import find_program
-from results_for_tests import CURE, RAE, write_cell, write_grid
+from results_for_tests import CURE, RAE, write_cell, write_csv, write_grid
 
 from sb3_cure.experiments import plots, report, statistics
 from sb3_cure.experiments.results import read_results
-from sb3_cure.experiments.tables import conditions_table
+from sb3_cure.experiments.tables import NONE, conditions_table
 
 TASK = "cartpole-swingup"
 HOSTILE = '<img src=x onerror=alert(1)>|$x$ "quoted" [a](b)'
@@ -157,6 +157,27 @@ def test_pairs_with_other_starts_are_told(tmp_path: Path) -> None:
         write_cell(tmp_path, TASK, "cure_sac_ae", seed, curve(10 + seed, 200), arguments=CURE)
     assert report.main([str(tmp_path)]) == 0
     assert "2 pairs of seeds, 1 with the same start, on cartpole-swingup" in (tmp_path / "table.md").read_text()
+
+
+def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
+    """Also of arms without a task, which have no returns; a seed that only one arm has done does not count."""
+    write_grid(tmp_path, seeds=[0, 1, 2])
+    reached = {"sac_ae": {0: (10, 100), 1: (20, 200)}, "cure_sac_ae": {0: (10, 400), 1: (20, 200), 2: (10, 999)}}
+    for method, seeds in reached.items():
+        for seed, cells in seeds.items():
+            cell = write_cell(tmp_path, TASK, method, seed, curve(0, 0))
+            rows = [(50_000 * (index + 1), 0, count, 1.0) for index, count in enumerate(cells)]
+            write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
+    assert report.main([str(tmp_path)]) == 0
+    header, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Cells of the true state")
+    assert header[3:] == ["at 50,000", "at 100,000", "/ baseline"]
+    assert baseline[2:] == ["2", "15 ± 7", "150 ± 71", NONE]
+    assert cure[2:5] == ["3", "13 ± 6", "533 ± 416"]
+    assert cure[5].startswith("2.00 [")  # of 4 and 1
+    assert (tmp_path / "cells_reached.png").exists()
+    assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in (tmp_path / "table.md").read_text().replace(
+        "\\", ""
+    )
 
 
 def test_headlines_tell_how_many_seeds(tmp_path: Path) -> None:
