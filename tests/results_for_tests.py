@@ -10,7 +10,7 @@ import numpy as np
 
 EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
-    "task_srl_error", "curious_return_mean", "curious_srl_error",
+    "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
 )  # fmt: skip
 RAE = {"policy": "CnnPolicy", "srl": "rae", "curiosity": None}
 CURE = {"policy": "CnnPolicy", "srl": "rae"}
@@ -61,6 +61,7 @@ def write_cell(
     states: Mapping[str, np.ndarray] | None = None,
     state_units: Sequence[str] | None = None,
     curious: bool = False,
+    rewards_met: float | str = "",
     **config: Any,
 ) -> Path:
     """One cell.
@@ -77,6 +78,7 @@ def write_cell(
     :param states: True states by actor
     :param state_units: Units of their coordinates
     :param curious: Whether the columns of a curious actor are filled
+    :param rewards_met: Rewards that training met
     :param config: Further keys of ``config.json``
     :return: Its folder
     """
@@ -96,6 +98,7 @@ def write_cell(
     rows = [
         [step, step // 8, step // 8, step / 100, value, 5.0, "" if step == 0 else 1e-3 / (1 + step / 5e4), 0.001]
         + ([value / 2, 0.002] if curious else ["", ""])
+        + [rewards_met]
         for step, value in curve.items()
     ]
     write_csv(cell / "eval.csv", EVAL_COLUMNS, rows)

@@ -35,7 +35,7 @@ ERROR = "error.txt"
 PROGRESS_SECONDS = 2.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
-    "task_srl_error", "curious_return_mean", "curious_srl_error",
+    "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
 )  # fmt: skip
 _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 
@@ -205,6 +205,8 @@ class _Record(BaseCallback):
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
         self.loss_sum, self.n_losses = th.zeros(()), 0
+        #: Sum of the rewards of all transitions that training has collected
+        self.rewards_met = 0.0
         self._now, self._reported_at = time.monotonic(), -np.inf
         self._is_known = False
 
@@ -226,6 +228,8 @@ class _Record(BaseCallback):
             value = th.as_tensor(loss)
             self.loss_sum = self.loss_sum.to(value.device) + value
             self.n_losses += 1
+        if self.evaluates:
+            self.rewards_met += float(np.sum(self.locals["rewards"]))
         self._tick()
         self.report(self.model)  # type: ignore[arg-type]
         return True
@@ -275,7 +279,7 @@ class _Record(BaseCallback):
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
-        row["seconds"] = round(self.seconds, 1)
+        row["seconds"], row["rewards_met"] = round(self.seconds, 1), round(self.rewards_met, 3)
         self.evaluations.append(row)
         self.write_tables()
 

@@ -228,6 +228,8 @@ def _comparison(
     """Headlines and tables of returns."""
     differences = statistics.paired_differences(experiment)
     parts: list[Part] = [tables.curves_table(experiment, thresholds)]
+    met = tables.rewards_met_table(experiment)
+    parts += [met] * (len(met.rows) > 0)
     several = {row.method for row in differences if row.task is None}
     headlines = []
     for row in differences:

@@ -227,9 +227,35 @@ def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
     :param method: Name of an arm
     :return: Cells of the true state that it had reached in the end, over those of its baseline, see ``paired_ratio``
     """
-    arms = (experiment.done(task, arm) for arm in (method, experiment.baseline_of(method)))
-    curves = ({seed: cell.curve("cells")[1] for seed, cell in cells.items()} for cells in arms)
-    return paired_ratio(*({seed: cells[-1] for seed, cells in arm.items() if len(cells)} for arm in curves))
+    return paired_ratio(
+        *(final_values(experiment, task, arm, "cells") for arm in (method, experiment.baseline_of(method)))
+    )
+
+
+def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Estimate:
+    """
+    :param experiment: An experiment
+    :param task: Short name of a task
+    :param method: Name of an arm
+    :return: log(1 + c), c the sum of rewards that training met, minus that of its baseline: mean over the seeds that
+        both have done, with its t interval
+    """
+    ours, theirs = (
+        final_values(experiment, task, arm, "rewards_met") for arm in (method, experiment.baseline_of(method))
+    )
+    return t_interval([np.array([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours if seed in theirs])])
+
+
+def final_values(experiment: Experiment, task: str, method: str, column: str) -> dict[int, float]:
+    """
+    :param experiment: An experiment
+    :param task: Short name of a task
+    :param method: Name of an arm
+    :param column: As of ``CellResult.curve``
+    :return: The last value of each finished cell that has one, by seed
+    """
+    curves = {seed: cell.curve(column)[1] for seed, cell in experiment.done(task, method).items()}
+    return {seed: float(values[-1]) for seed, values in curves.items() if len(values)}
 
 
 @dataclass(frozen=True)

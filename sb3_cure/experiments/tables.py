@@ -367,6 +367,24 @@ def cells_reached_table(
     return _table("Cells of the true state", columns, shown, words("cells_note", _baselines(experiment)))
 
 
+def rewards_met_table(experiment: Experiment) -> Table:
+    """
+    :param experiment: An experiment
+    :return: Rewards that training met, and their logarithm beside the baseline's; no row where they were not recorded
+        or are negative
+    """
+    shown = []
+    for task, method in _arms(experiment):
+        met = np.array(list(statistics.final_values(experiment, task, method, "rewards_met").values()))
+        if len(met) and (met >= 0).all():
+            against = statistics.rewards_met_difference(experiment, task, method)
+            text = NONE if method == experiment.baseline_of(method) else ratio_text(against)
+            logarithms = f"{np.log1p(met).mean():.2f}"
+            shown.append([task, method, str(len(met)), _mean_std(met), logarithms, text])
+    columns = ["task", "arm", ">seeds", ">rewards met, c", ">log(1 + c)", ">minus baseline's"]
+    return _table("Rewards met in training", columns, shown, words("rewards_met", _baselines(experiment)))
+
+
 def pretraining_table(experiment: Experiment) -> Table:
     """
     :param experiment: An experiment of kind ``"pretraining"``

@@ -71,6 +71,22 @@ def test_cell_keeps_its_curve(finished: tuple[Cell, Path]) -> None:
     assert not (out / cell.folder / "checkpoint").exists()
 
 
+def test_cell_keeps_the_rewards_that_training_met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored: list[float] = []
+    save = CuReSAC.save
+
+    def noting_save(model: CuReSAC, path: Any) -> None:
+        stored.append(float(model.replay_buffer.rewards[: model.num_timesteps].sum()))
+        save(model, path)
+
+    monkeypatch.setattr(CuReSAC, "save", noting_save)
+    cell = only_cell(tmp_path)
+    run_cell(cell, tmp_path, pictures=False)
+    rows = read_rows(tmp_path / cell.folder / "eval.csv")
+    assert rows[0]["rewards_met"] == 0 != rows[1]["rewards_met"] != rows[-1]["rewards_met"]
+    assert rows[-1]["rewards_met"] == pytest.approx(stored[-1], abs=1e-3)
+
+
 def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
     """Versions, commit, and every argument: as given, by default, and as the model resolved it."""
     cell, out = finished
@@ -373,7 +389,7 @@ def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: p
     """Reconstructed observations are those of all arms, so that their errors compare; and a cell that is drawn is
     trained as one that is not."""
     fit = decoding.fit_decoder
-    monkeypatch.setattr(decoding, "fit_decoder", lambda model, sample, updates: fit(model, sample, 1))  # not 500
+    monkeypatch.setattr(decoding, "fit_decoder", lambda model, sample, *rest: fit(model, sample, 1))  # not 500
     observed, rows, titles = [], [], []
 
     def keep(path: Path, shown: np.ndarray, drawn: Any, title: str) -> None:

@@ -180,6 +180,22 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     )
 
 
+def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
+    """On logarithms, seed by seed; where the sum can be negative there is no such table."""
+    write_grid(tmp_path, seeds=[0, 1, 2])
+    for method, sums in {"sac_ae": [0, 9], "cure_sac_ae": [9, 99, 5]}.items():
+        for seed, met in enumerate(sums):
+            write_cell(tmp_path, TASK, method, seed, curve(0, 0), rewards_met=met)
+    assert report.main([str(tmp_path)]) == 0
+    _, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Rewards met in training")
+    assert baseline[2:] == ["2", "4 ± 6", "1.15", NONE]
+    assert cure[2:5] == ["3", "38 ± 53", "2.90"]
+    assert cure[5] == "2.30 [2.30, 2.30]"  # log(10) in both pairs
+    write_cell(tmp_path, TASK, "cure_sac_ae", 2, curve(0, 0), rewards_met=-1)
+    assert report.main([str(tmp_path)]) == 0
+    assert "38 ±" not in (tmp_path / "table.md").read_text()
+
+
 def test_headlines_tell_how_many_seeds(tmp_path: Path) -> None:
     """Common heads judge only some seeds here."""
     write_visitation(tmp_path)
