@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure import diagnostics
 from sb3_cure.buffers import transitions, unmarked
@@ -118,6 +119,11 @@ class RolloutCallback(PeriodicCallback):
 
     def _init_callback(self) -> None:
         """Refuse now what would end the training when the callback is due."""
+        if isinstance(self.eval_env, VecEnv):
+            raise ValueError(
+                "eval_env is a VecEnv, but policies are rolled out in one environment: give a gymnasium.Env "
+                "(sb3_cure.envs.StackFrames stacks frames as VecFrameStack does)."
+            )
         model, space = self.model, self.eval_env.observation_space
         if self.eval_env.action_space != model.action_space or not _same_shapes(space, model.observation_space):
             raise ValueError(

@@ -630,6 +630,12 @@ def test_images_of_another_format_are_known_before_training() -> None:
         model.learn(5, callback=EvalBothCallback(Wide((6, 48, 36))))
 
 
+def test_vectorised_evaluation_environment_is_refused() -> None:
+    model = tiny_model("CnnPolicy", PixelBox())
+    with pytest.raises(ValueError, match=r"eval_env is a VecEnv, .* give a gymnasium\.Env"):
+        model.learn(5, callback=EvalBothCallback(DummyVecEnv([PixelBox])))  # type: ignore[arg-type]
+
+
 def test_stacked_by_sb3_watched_in_one_environment() -> None:
     """In ``StackFrames``; the unstacked one is refused."""
     single = partial(PixelBox, frame_stack=1, channels_last=True, tells_frame_stack=False)

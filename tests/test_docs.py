@@ -78,6 +78,21 @@ def test_own_camera_of_the_guide_trains(example: str) -> None:
     assert model.observation_space.shape == (9, 48, 48)
 
 
+def test_own_camera_of_the_guide_is_watched_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = blocks("docs/guide/environments.md")
+    block = next(block for block in page if "CuriosityMapCallback" in block)
+    small = "verbose=1, policy_kwargs=dict(net_arch=[16]), learning_starts=30"
+    block = block.replace("5000", "20").replace("1000", "20").replace("verbose=1", small)
+    monkeypatch.chdir(tmp_path)
+    imports = "from sb3_cure import CuReSAC\nfrom sb3_cure.envs import make_pixel_env\n"
+    assert imports in page[1]
+    names: dict = {"__name__": "page"}
+    exec(compile(imports + block, "environments.md", "exec"), names)
+    assert names["model"].num_timesteps == 20
+    made = {path.name for path in tmp_path.rglob("*.*")}
+    assert made >= {"pendulum.zip", "curiosity_map_20_steps.png", "curious_policy_20_steps.mp4"}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_python_of_pages_parses(page: Path) -> None:
     for block in blocks(str(page.relative_to(ROOT))):

@@ -462,7 +462,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GridError(f"{path} cannot be read ({' '.join(str(error).split())}): give a YAML file.") from None
+        raise GridError(
+            f"{path} cannot be read ({' '.join(str(error).split())}): "
+            "give the path of a YAML file, or a name of the package's without suffix."
+        ) from None
     if not isinstance(content, dict):
         raise GridError(f"{path} holds {content!r:.60}, but it must be a mapping (key: value).")
     return content
