@@ -25,13 +25,12 @@ import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.callbacks import EvalBothCallback
 from sb3_cure.evaluation import run_episodes
-from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, TASK
-from sb3_cure.experiments.demo import SETTINGS as DEMO
+from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, PROFILE, TASK
 from sb3_cure.experiments.files import describe_run, write_csv
 from sb3_cure.experiments.plots import in_style, save
 
 MODES = ("sequential", "joint")
-SETTINGS = {**DEMO, "intrinsic": "srl_error", "intrinsic_kwargs": {}}
+SETTINGS = {**PROFILE, "intrinsic": "srl_error", "intrinsic_kwargs": {}, "curiosity_encoder_grad": False}
 HEADS: dict[str, dict[str, Any]] = {
     "curl": {},
     # As in SAC-AE: no augmentation, and the burst of 1000 updates after the warm-up.

@@ -46,6 +46,7 @@ def test_curls_logits_are_in_full_precision(curl: Any, method: str) -> None:
         output = getattr(head, method)(batch, anchors)
         return output.error if method == "loss" else output
 
+    head.loss(batch, anchors)  # whose views the bank of `error` holds from now on
     with th.no_grad():
         exact = errors()
         with as_in_training:
