@@ -46,9 +46,8 @@ def measure(n_envs: tuple[int, ...] = (1, 2, 4), steps: int = 20, repeats: int =
     results = {f"n_envs={number}, renderer=fast": _measure(number, steps, repeats, {}) for number in n_envs}
     small, threads = SETTINGS[0], th.get_num_threads()
     th.set_num_threads(small.threads)
-    env = {"image_size": small.size, "grayscale": small.grayscale}
-    networks = {"net_arch": [small.hidden] * 2, "features_extractor_kwargs": {"n_filters": small.filters}}
-    results[f"n_envs=1, renderer=fast, {small}"] = _measure(1, 2 * steps, repeats, env, policy_kwargs=networks)
+    own = _measure(1, 2 * steps, repeats, small.env_kwargs, policy_kwargs=small.policy_kwargs)
+    results[f"n_envs=1, renderer=fast, {small}"] = own
     th.set_num_threads(threads)
     return results
 

@@ -139,7 +139,7 @@ def checkout_argument(parser: argparse.ArgumentParser) -> None:
 
 def _agents(checkout: Path, setting: Setting) -> tuple[Any, PlainSacAe, Any]:
     """A filled buffer, the plain update and the public one."""
-    env = dict(image_size=setting.size, grayscale=setting.grayscale)
+    env = setting.env_kwargs
     plain = PlainSacAe(setting.channels, hidden=setting.hidden, size=setting.size, filters=setting.filters)
     shape, own = (setting.channels, setting.size, setting.size), dict(hidden_dim=setting.hidden)
     public = public_agent(checkout, shape, n_actions=1, num_filters=setting.filters, **own)

@@ -24,8 +24,8 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
-from benchmarks.harness import interleaved, make_model
-from benchmarks.settings import BLOCK
+from benchmarks.harness import make_model
+from benchmarks.settings import SETTINGS, added_costs
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import transitions
 from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json
@@ -180,21 +180,14 @@ def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
     :param repeats: Rounds that count
     :return: By reward: milliseconds of an update, and how many more these are than with the error of the same head
     """
-    networks = dict(net_arch=[256, 256], features_extractor_kwargs=dict(n_filters=16))
-    common: dict[str, Any] = dict(env_kwargs=dict(image_size=36, grayscale=True), warmup_updates=0)
-    common["policy_kwargs"] = networks
+    small = SETTINGS[0]
+    common: dict[str, Any] = dict(env_kwargs=small.env_kwargs, policy_kwargs=small.policy_kwargs, warmup_updates=0)
     arms = {"without curiosity": dict(curiosity=None), **ARMS}
     shift: dict[str, Any] = dict(augmentation="shift")
     models = {
         name: make_model(**common, **arm, **(shift if arm.get("srl") == "curl" else {})) for name, arm in arms.items()
     }
-    calls = {name: (lambda model=model: model.train(BLOCK, 128)) for name, model in models.items()}
-    times = interleaved(calls, repeats, 1)
-    median = {name: 1e3 * statistics.median(values) / BLOCK for name, values in times.items()}
-    plain = {name: median["srl_error of curl" if "curl" in name else "srl_error"] for name in median}
-    return {
-        name: {"update_ms": round(each, 2), "added_ms": round(each - plain[name], 2)} for name, each in median.items()
-    }
+    return added_costs(models, lambda name: "srl_error of curl" if "curl" in name else "srl_error", repeats)
 
 
 def table(rows: Sequence[Row]) -> list[str]:

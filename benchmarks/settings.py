@@ -6,7 +6,7 @@ number formats at these very shapes: no update of these layers can be faster wit
 
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -40,6 +40,16 @@ class Setting(NamedTuple):
         """Of stacks of three frames."""
         return 3 if self.grayscale else 9
 
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """For ``make_dmc_env``."""
+        return {"image_size": self.size, "grayscale": self.grayscale}
+
+    @property
+    def policy_kwargs(self) -> dict[str, Any]:
+        """For ``CuReSAC``."""
+        return {"net_arch": [self.hidden] * 2, "features_extractor_kwargs": {"n_filters": self.filters}}
+
     def __str__(self) -> str:
         color, s = ("grey" if self.grayscale else "colour"), "s" if self.threads > 1 else ""
         return f"{self.size} px {color}, {self.filters} filters, hidden {self.hidden}, {self.threads} thread{s}"
@@ -70,9 +80,8 @@ def measure(repeats: int = 7, settings: tuple[Setting, ...] = SETTINGS) -> dict[
 
 def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
     th.set_num_threads(setting.threads)
-    networks = dict(net_arch=[setting.hidden] * 2, features_extractor_kwargs=dict(n_filters=setting.filters))
-    own: dict[str, Any] = dict(warmup_updates=0, policy_kwargs=networks)
-    env = dict(image_size=setting.size, grayscale=setting.grayscale)
+    own: dict[str, Any] = dict(warmup_updates=0, policy_kwargs=setting.policy_kwargs)
+    env = setting.env_kwargs
     arms: dict[str, dict[str, Any]] = {
         "CuRe-RAE": {},
         "CuRe-RAE, fp32": dict(precision="fp32"),
@@ -105,6 +114,21 @@ def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
     return {
         "times": {name: summary(values) for name, values in times.items()},
         "ratios": {**ratios, "floor_ms": round(floor, 2), "floor / CuRe-RAE": round(share, 2)},
+    }
+
+
+def added_costs(models: Mapping[str, Any], beside: Callable[[str], str], repeats: int) -> dict[str, dict[str, float]]:
+    """
+    :param models: Models by name
+    :param beside: Name of the model that another one's update is compared with
+    :param repeats: Rounds that count
+    :return: By name: milliseconds of an update, and how many more these are
+    """
+    times = interleaved({name: _block(model) for name, model in models.items()}, repeats, 1)
+    median = {name: 1e3 * statistics.median(values) / BLOCK for name, values in times.items()}
+    return {
+        name: {"update_ms": round(each, 2), "added_ms": round(each - median[beside(name)], 2)}
+        for name, each in median.items()
     }
 
 
