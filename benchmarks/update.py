@@ -12,6 +12,7 @@ from stable_baselines3 import SAC
 from benchmarks.harness import BATCH_SIZE, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
 from sb3_cure import CuReSAC
+from sb3_cure.experiments.grid import constructor_defaults
 
 YARDSTICK, SB3_SAC = "plain SAC-AE, fp32", "SB3 SAC (NatureCNN, 1024)"
 
@@ -36,7 +37,7 @@ def measure(repeats: int = 7, precisions: tuple[str, ...] = ("fp32", "bf16")) ->
         YARDSTICK: _yardstick_call(),
         SB3_SAC: _train_call(make_model(SAC, policy_kwargs=dict(net_arch=[1024, 1024]))),
     }
-    default = CuReSAC.__init__.__kwdefaults__["update"]  # type: ignore[index]
+    default = constructor_defaults(CuReSAC)["update"]
     arms: list[tuple[str, str, str, str | None]] = [
         (head, mode, precision, "separate")
         for head in ("rae", "curl")
