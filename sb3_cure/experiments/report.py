@@ -118,10 +118,11 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
         label, caption = "cells of the true state\nreached in training", words("cells_reached", list(explored))
         parts.append(_figure("cells_reached", caption, plots.learning_curves, explored, colors, label))
         parts.append(tables.cells_reached_table(experiment, explored))
+        headlines += _exploration_headlines(experiment, list(explored))
     parts += curve_figures(experiment, colors)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
-        headlines = [*_exploration_headlines(experiment, list(explored)), *compared]
+        headlines += compared
         parts = [tables.pretraining_table(experiment)] * (experiment.kind == "pretraining") + parts + more
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))

@@ -180,6 +180,24 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     )
 
 
+def test_coverage_comes_first_where_no_arm_has_a_return(tmp_path: Path) -> None:
+    """Of curious agents alone."""
+    write_grid(tmp_path)
+    for method, cells in {"sac_ae": 100, "cure_sac_ae": 300}.items():
+        for seed in (0, 1):
+            cell = write_cell(tmp_path, TASK, method, seed, curve(0, 0), arguments={**CURE, "task": False})
+            table = (cell / "eval.csv").read_text().splitlines()
+            without = [
+                ",".join(["" if i in (4, 5) else each for i, each in enumerate(row.split(","))]) for row in table[1:]
+            ]
+            (cell / "eval.csv").write_text("\n".join([table[0], *without]) + "\n")
+            rows = [(steps, 0, cells, 1.0) for steps in (50_000, 100_000)]
+            write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
+    assert report.main([str(tmp_path)]) == 0
+    told = (tmp_path / "table.md").read_text().replace("\\", "")
+    assert "- cure_sac_ae on cartpole-swingup, 2 seeds: it reached 3.00 [3.00, 3.00] times the cells of sac_ae." in told
+
+
 def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
     """On logarithms, seed by seed; where the sum can be negative there is no such table."""
     write_grid(tmp_path, seeds=[0, 1, 2])
