@@ -30,7 +30,7 @@ from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import Episode, evenly_measured, run_episodes, state_probe, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
-from sb3_cure.observations import image_spaces, len_of, rows_of
+from sb3_cure.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.persistence import ExactCheckpoint as ExactCheckpoint
 from sb3_cure.policies import encoder_of
 
@@ -353,7 +353,7 @@ class ReconstructionCallback(PeriodicCallback):
         frame_stack = self.frame_stack or frame_stack_of(self.training_env)
         seen, drawn = (
             {key: newest_frames(image, frame_stack).cpu().numpy() for key, image in images.items()}
-            for images in (part if isinstance(part, dict) else {"": part} for part in pair)
+            for images in map(by_key, pair)
         )
         self.rows.append((self.num_timesteps, drawn.get("", drawn)))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))

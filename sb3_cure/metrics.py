@@ -8,7 +8,7 @@ from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoard
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.buffers import Samples, frame_stack_of
-from sb3_cure.observations import image_spaces, rows_of
+from sb3_cure.observations import by_key, image_spaces, rows_of
 from sb3_cure.policies import CuRePolicy
 
 #: Updates between two pictures of reconstructions
@@ -108,7 +108,7 @@ def reconstruction_strips(
     if not image_spaces(policy.sensed_space):
         return {}
     pair = policy.reconstruct(rows_of(batch.observations, slice(columns))) or ({}, {})
-    seen, drawn = (part if isinstance(part, dict) else {"": part} for part in pair)
+    seen, drawn = map(by_key, pair)
     strips = {}
     for key in drawn:
         rows = [th.cat(list(newest_frames(images[key], frame_stack)), dim=2) for images in (seen, drawn)]

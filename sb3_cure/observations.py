@@ -30,6 +30,14 @@ def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
     return {key: observations[key] if isinstance(observations, dict) else observations for key in image_spaces(space)}
 
 
+def by_key(images: Any) -> dict[str, Any]:
+    """
+    :param images: Images, or a dictionary of them
+    :return: The dictionary; images that are none have the key ``""``, as in ``image_spaces``
+    """
+    return images if isinstance(images, dict) else {"": images}
+
+
 def rows_of(observations: Any, rows: Any) -> Any:
     """
     :param observations: [n, *shape], or a dictionary of such
