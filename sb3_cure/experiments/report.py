@@ -113,6 +113,9 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     parts: list[Part] = []
     if experiment.kind == "visitation":
         headlines, parts = _visitation(experiment)
+    updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
+    if len(updates) and not updates.any():
+        headlines.insert(0, words("untrained"))
     explored = _stacked(experiment, "cells")
     if explored:
         label, caption = "cells of the true state\nreached in training", words("cells_reached", list(explored))

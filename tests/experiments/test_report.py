@@ -159,6 +159,16 @@ def test_pairs_with_other_starts_are_told(tmp_path: Path) -> None:
     assert "2 pairs of seeds, 1 with the same start, on cartpole-swingup" in (tmp_path / "table.md").read_text()
 
 
+def test_an_experiment_without_an_update_says_so_first(tmp_path: Path) -> None:
+    for budget, says in ((7, True), (100_000, False)):
+        folder = tmp_path / str(budget)
+        write_grid(folder, budget=budget)
+        for method in ("sac_ae", "cure_sac_ae"):
+            write_cell(folder, TASK, method, 0, {0: 10, budget: 10}, budget=budget)
+        assert report.main([str(folder)]) == 0
+        assert (folder / "table.md").read_text().split("\n- ")[1].startswith("No update was made") == says
+
+
 def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     """Also of arms without a task, which have no returns; a seed that only one arm has done does not count."""
     write_grid(tmp_path, seeds=[0, 1, 2])
