@@ -34,7 +34,11 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest tests go first, the others as they stand."""
+    """The longest tests go first, the others as they stand; those marked as long only in ``make test-all``."""
+    if not os.environ.get("SB3_CURE_TEST_ALL"):
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(reason="takes long: make test-all"))
     items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
 
 

@@ -106,7 +106,7 @@ def test_a_good_run_is_warned_of_nothing(srl: str, curiosity: str) -> None:
     assert logged["curious_reward"] > 10 * diagnostics.CURIOUS_SHARE
 
 
-@pytest.mark.parametrize("srl, min_updates", [("rae", 200), ("curl", 580)])
+@pytest.mark.parametrize("srl, min_updates", [("rae", 200), pytest.param("curl", 580, marks=pytest.mark.long)])
 def test_real_pixels_are_warned_of_nothing(srl: str, min_updates: int) -> None:
     """Some hundred updates on DeepMind Control, judged when the latents have unfolded, which takes CURL longer.
 

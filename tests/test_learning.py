@@ -44,7 +44,9 @@ def mean_return(model: CuReSAC, env: gym.Env, actor: str, n_episodes: int = 30) 
     return float(np.mean([episode.total_reward for episode in run_episodes(model, env, n_episodes, actor, seed=1)]))
 
 
-@pytest.mark.parametrize(("srl", "update"), [("rae", "joint"), ("curl", "sequential")])
+@pytest.mark.parametrize(
+    ("srl", "update"), [("rae", "joint"), pytest.param("curl", "sequential", marks=pytest.mark.long)]
+)
 def test_task_return_rises_well_above_random(srl: str, update: str) -> None:
     """Random earns about 7 of 20, the best possible is about 18; a policy that ignores what it sees stays below 10."""
     model = tiny_model(

@@ -291,7 +291,7 @@ def test_killed_ray_worker_costs_nothing(tmp_path: Path, slow_grid: Any, monkeyp
     rows, also those of the common heads that follow, are those of one process without a kill."""
     pytest.importorskip("ray")
     (tmp_path / "seen").mkdir()
-    path = slow_grid(kind="visitation", seeds=2, budget=240, evaluation=dict(every=60, episodes=1))
+    path = slow_grid(kind="visitation", seeds=2, budget=120, evaluation=dict(every=40, episodes=1))
     grid, out = load_grid(path), tmp_path / "out"
     with monkeypatch.context() as card:
         card.setenv("CARDS", str(tmp_path / "seen"))

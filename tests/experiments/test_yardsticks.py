@@ -7,6 +7,7 @@ import pytest
 from benchmarks import yardsticks, zero_decoder
 
 
+@pytest.mark.long
 def test_autoencoder_leaves_zero_with_first_updates() -> None:
     """Untrained it errs like a prediction of zero, as the paper reports; then it learns."""
     rows = yardsticks.measure_task("dmc_pixels/cartpole-swingup-v0", (0,), (0, 1, 6), 40, frame_stack=1)
