@@ -18,7 +18,9 @@ from PIL import Image
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
 from sb3_cure.evaluation import Uncomfortable, binned_errors
 
+#: Matplotlib style file of all figures: ``plt.style.use(STYLE)``
 STYLE = Path(__file__).parent / "templates" / "plots.mplstyle"
+#: Colour of each policy
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
 #: Where colours are taken by arms
 LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
