@@ -347,8 +347,11 @@ PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed
     "make",
     [
         lambda: SAC("CnnPolicy", PixelBox(), policy_kwargs=dict(net_arch=[8]), **SAC_ARGUMENTS),
-        lambda: DQN("CnnPolicy", Compass(PixelBox()), seed=0, learning_starts=10, buffer_size=100),
-        lambda: PPO("CnnPolicy", PixelBox(), **PPO_ARGUMENTS),
+        pytest.param(
+            lambda: DQN("CnnPolicy", Compass(PixelBox()), seed=0, learning_starts=10, buffer_size=100),
+            marks=pytest.mark.long,
+        ),
+        pytest.param(lambda: PPO("CnnPolicy", PixelBox(), **PPO_ARGUMENTS), marks=pytest.mark.long),
         lambda: PPO("CnnPolicy", PixelBox(), policy_kwargs=dict(share_features_extractor=False), **PPO_ARGUMENTS),
         lambda: RecurrentPPO("CnnLstmPolicy", PixelBox(), **PPO_ARGUMENTS),
         lambda: CuReSAC("CnnPolicy", PixelBox(), srl=None, curiosity=None, **SAC_ARGUMENTS),
@@ -439,7 +442,7 @@ def test_map_counts_the_steps_of_each_policy(tmp_path: Path) -> None:
     assert np.asarray(Image.open(tmp_path / "curiosity_map_25_steps.png").convert("L")).std() > 5
 
 
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize("srl", ["rae", pytest.param("curl", marks=pytest.mark.long)])
 def test_images_with_the_channels_last(srl: str, tmp_path: Path) -> None:
     """SB3 moves the channels for training: policies are watched, and errors measured, as if they had come first."""
     seen: list[dict[str, Any]] = []
