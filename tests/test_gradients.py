@@ -157,7 +157,7 @@ def test_each_agent_sees_its_own_reward(update: str) -> None:
         ("tqc", False, {"curiosity": "bonus"}),
         ("sac", True, {"srl": "curl"}),
         ("tqc", False, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
-        ("sac", True, {"srl": "vae", "srl_kwargs": {"beta": 0.03}}),
+        ("sac", True, {"srl": "vae", "srl_kwargs": {"beta": 0.03}, "augmentation": "shift"}),
         ("tqc", False, {"srl": "spr"}),
         ("sac", True, {"srl": "spr"}),
         ("tqc", False, {"srl": "forward"}),

@@ -300,9 +300,9 @@ def rae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th
 
 
 def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor) -> th.Tensor:
-    goal = line.scaled(batch.views)
-    if batch.views.dtype == th.uint8:
-        goal = from_cells(line.head.target(to_cells(batch.views), dither=True))
+    goal = line.scaled(batch.observations)
+    if batch.observations.dtype == th.uint8:
+        goal = from_cells(line.head.target(to_cells(batch.observations), dither=True))
     return ((line.head.decoder(latents) - goal) ** 2).flatten(1).mean(dim=1)
 
 

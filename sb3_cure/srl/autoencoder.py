@@ -20,6 +20,8 @@ class RAE(SRLHead):
     The paper's eq. 2 gives the log-likelihood a plus sign; what is meant, and done here, is to *minimise*
     the squared error. Images are reduced to 5 bits and dithered with uniform noise, as in SAC-AE (after Glow).
 
+    Of shifted or cropped views the decoder draws the centred one, so that latents need not hold the shift.
+
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images, or anything that SB3 can flatten
     :param latent_penalty: lambda_z, on half the squared norm of the latents
@@ -60,7 +62,7 @@ class RAE(SRLHead):
     def target(self, views: th.Tensor, dither: bool) -> th.Tensor:
         """What the decoder is to draw.
 
-        :param views: What the encoder saw, [B, *view shape], images in 0-255
+        :param views: Centred views, [B, *view shape], images in 0-255
         :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
         :return: Images in [-0.5, 0.5], [B, C, H, W]; flat vectors as they are, [B, out_dim]
         """
@@ -84,7 +86,7 @@ class RAE(SRLHead):
         :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, [B]
         """
-        error = squared_error(self.decoder, latents, batch.views, partial(self.target, dither=True))
+        error = self._squared_error(batch, latents, dither=True)
         penalty = 0.5 * latents.square().sum(dim=1).mean()
         return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
 
@@ -95,7 +97,11 @@ class RAE(SRLHead):
         :param latents: [B, features_dim]
         :return: [B]
         """
-        return squared_error(self.decoder, latents, batch.views, partial(self.target, dither=False)).detach()
+        return self._squared_error(batch, latents, dither=False).detach()
+
+    def _squared_error(self, batch: Samples, latents: th.Tensor, dither: bool) -> th.Tensor:
+        centred = self.augment.center(batch.observations)
+        return squared_error(self.decoder, latents, centred, partial(self.target, dither=dither))
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         """
