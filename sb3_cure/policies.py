@@ -23,7 +23,7 @@ from sb3_cure.critics import LatentCritic, TwinQ
 from sb3_cure.encoder_update import EncoderUpdate
 from sb3_cure.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.intrinsic import DictReward, IntrinsicReward, RewardScale
-from sb3_cure.layers import full_precision, init_weights, preprocess, run_mlp
+from sb3_cure.layers import full_precision, init_weights, preprocess, run_mlp, set_mode
 from sb3_cure.observations import image_spaces, images_of, join, sensed_space
 from sb3_cure.precision import compile_while_training
 from sb3_cure.srl import DictHead, SRLHead, heads_by_key
@@ -109,15 +109,6 @@ class ActorCritic(nn.Module):
         :return: Temperature alpha, detached, [1] or []
         """
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()  # type: ignore[return-value]
-
-    def train(self, mode: bool = True) -> "ActorCritic":
-        """
-        :param mode: Whether layers behave as in training; those of the target critics never do
-        :return: self
-        """
-        super().train(mode)
-        self.critic_target.train(False)
-        return self
 
 
 class CuRePolicy(BasePolicy):
@@ -523,12 +514,14 @@ class CuRePolicy(BasePolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: Whether layers that differ between training and evaluation behave as in training
+        :param mode: Whether layers that differ between training and evaluation behave as in training; those of targets
+            and of a frozen representation never do
         """
-        self.train(mode)
-        still = (self.encoder_target, *((self.encoder, self.srl) if self.representation_frozen else ()))
-        for part in filter(None, still):
-            part.train(False)
+        set_mode(self, mode)
+        targets = (self.encoder_target, *(agent.critic_target for agent in self.agents.values()))
+        frozen = (self.encoder, self.srl) if self.representation_frozen else ()
+        for still in filter(None, (*targets, *frozen)):
+            set_mode(still, False)
 
     def freeze_representation(self) -> None:
         """Keep encoder and head as they are; the target encoder, which would follow, becomes the encoder."""
