@@ -10,7 +10,7 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 #: What replaces the parameter cell of each notebook: it names all parameters, with values that take seconds.
 TINY = {
     "01_quickstart": """
-STEPS = 300
+STEPS = 100
 # Fifty episodes are evaluated: of 20 steps instead of 125
 import gymnasium, sb3_cure
 make = sb3_cure.make_dmc_env
