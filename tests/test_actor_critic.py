@@ -5,8 +5,10 @@ from typing import Any
 import pytest
 import torch as th
 from envs_for_tests import VectorBox, tiny_model
+from torch import nn
 from updates_for_tests import ALGORITHMS, filled_model, train_once
 
+from sb3_cure.layers import set_mode
 from sb3_cure.policies import ActorCritic
 
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
@@ -127,6 +129,23 @@ def test_target_critics_begin_equal_and_never_learn(algorithm: Any) -> None:
     assert not policy.encoder_target.training
     policy.set_training_mode(False)
     assert not policy.task.critic.training
+
+
+def test_modes_change_as_torch_changes_them() -> None:
+    """Of all modules, also of those that came later, and as a module that has a mind of its own will have it."""
+
+    class Frozen(nn.Dropout):
+        def train(self, mode: bool = True) -> "Frozen":
+            return super().train(False)
+
+    modules = nn.Sequential(nn.Linear(2, 2), nn.Sequential(nn.Dropout()), Frozen().eval())
+    modules.register_module("missing", None)
+    for mode in (False, True):
+        set_mode(modules, mode)
+        assert [module.training for module in modules.modules()] == [mode, mode, mode, mode, False]
+    modules.eval().append(nn.Dropout())
+    set_mode(modules, False)
+    assert not modules[-1].training
 
 
 def test_the_two_agents_begin_differently() -> None:
