@@ -54,7 +54,8 @@ def main() -> None:
     options = parser.parse_args()
     machine = describe_machine()
     processor = machine["gpu"] or machine["processor"]
-    name = re.sub(r"[^a-z0-9]+", "-", f"{processor}-{machine['cores']}-cores".lower()).strip("-")
+    title = f"{processor}, {machine['cores']} cores"
+    name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
     path = options.out / f"{name}.json"
     measured = json.loads(path.read_text()) if options.only and path.exists() else {}
     options.out.mkdir(parents=True, exist_ok=True)
@@ -66,7 +67,7 @@ def main() -> None:
             measured[part] = {"peak_memory_mb": round(peak), **results}
             report = {"machine": machine, **{key: measured[key] for key in names if key in measured}}
             path.write_text(json.dumps(report, indent=2) + "\n")
-            path.with_suffix(".md").write_text("\n".join(["# Benchmarks", "", *to_markdown(report, 2)]))
+            path.with_suffix(".md").write_text("\n".join([f"# Benchmarks: {title}", "", *to_markdown(report, 2)]))
     print(f"Wrote {path} and {path.with_suffix('.md').name}")
 
 
