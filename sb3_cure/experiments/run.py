@@ -252,7 +252,7 @@ def tell(units: Sequence[Unit], results: Path) -> dict[Path, str]:
     """
     lines: dict[Path, str] = {}
     states: dict[type, list[str]] = {}
-    speed, left, best = 0.0, 0, (-np.inf, "")
+    left, made, spent, best = 0, 0, 0.0, (-np.inf, "")
     for unit in units:
         state, progress = read_progress(unit, results)
         states.setdefault(type(unit), []).append(state)
@@ -266,12 +266,14 @@ def tell(units: Sequence[Unit], results: Path) -> dict[Path, str]:
             line += f", best return {own:.4g}"
             best = max(best, (own, str(unit.folder)))
         lines[unit.folder] = line
-        if isinstance(unit, Cell) and state not in ("done", "failed"):
-            left += total - done
-            speed += rate if state == "running" else 0.0
+        if isinstance(unit, Cell):
+            left += 0 if state in ("done", "failed") else total - done
+            made, spent = made + done, spent + seconds
     told = [f"{each.count('done')} of {len(each)} {_PLURALS[kind]} done" for kind, each in states.items()]
     running = sum(each.count("running") for each in states.values())
     told += [f"{running} running"] if running else []
+    # As fast as all cells so far, on average: one that has just begun tells little of its speed.
+    speed = states.get(Cell, []).count("running") * made / spent if spent else 0.0
     told += [f"{speed:.1f} environment steps/s, about {_duration(left / speed)} left"] if speed else []
     told += [f"best return {best[0]:.4g} ({best[1]})"] if best[1] else []
     return {**lines, _ALL: ", ".join(told)}

@@ -144,8 +144,8 @@ def test_logs_tell_how_far_everything_is(
     (tmp_path / done.folder / "DONE").touch()
     cells.write_progress(tmp_path / done.folder, done=400, seconds=80, best_return=4.2)
     cells.write_progress(tmp_path / running.folder, done=100, seconds=10, best_return=7.4)
-    line = "1 of 3 cells done, 1 running, 10.0 environment steps/s, about 1 min left, best return 7.4 "
-    line += f"({running.folder})\n"  # 300 and 400 steps are left: 70 s
+    line = "1 of 3 cells done, 1 running, 5.6 environment steps/s, about 2 min left, best return 7.4 "
+    line += f"({running.folder})\n"  # 500 steps took 90 s, 700 are left
     looks = threading.Semaphore(0)
 
     def list_units() -> list[heads.Unit]:
