@@ -401,7 +401,8 @@ def tables(runs: Runs) -> str:
         Table("Minutes to a return", pd.DataFrame(by_arm, columns=columns), note),
         Table("Each seed", pd.DataFrame(by_seed, columns=["arm", ">return", "minutes"]), "; ".join(told)),
     )
-    return "\n".join(each.markdown() for each in both)
+    head = "# Time to a return\n\n![Return over minutes of training](time_to_return.png)\n"
+    return "\n".join((head, *(each.markdown() for each in both)))
 
 
 @in_style
