@@ -89,7 +89,7 @@ def test_noise_of_the_vae_is_that_of_its_own_variance() -> None:
     model = filled_model(srl="vae", curiosity=None)
     head: Any = model.policy.srl
     head.decoder = drawn = nn.Identity()
-    batch = Samples(*[None] * 6, views=th.zeros(20_000, 8))  # type: ignore[arg-type]
+    batch = Samples(th.zeros(20_000, 8), *[None] * 4)  # type: ignore[arg-type]
     head.preprocess = lambda views: views
     with th.no_grad():
         head.log_variance.bias.copy_(th.linspace(-6, 1, 8))
