@@ -166,12 +166,12 @@ def test_each_fast_file_trains_from_the_command_line(
     method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """By its name and with its own networks, as users type it; the log shows the burst and the updates after it."""
-    small = ["learning_starts:240", "warmup_updates:5", "batch_size:16"]
+    small = ["learning_starts:100", "warmup_updates:20", "batch_size:16"]
     arguments = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", f"fast/{method}"]
-    arguments += ["-n", "260", "-params", *small, "--eval-freq", "-1", "--log-interval", "1", "-f", str(tmp_path)]
+    arguments += ["-n", "300", "-params", *small, "--eval-freq", "-1", "--log-interval", "1", "-f", str(tmp_path)]
     assert main([*arguments, "--device", "cpu"]) == 0
     printed = re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)
-    assert int(printed[-1]) == 5 + 9  # up to the last step of two episodes of 125
+    assert int(printed[-1]) == 20 + 149  # up to the last step of two episodes of 125
 
 
 @pytest.mark.parametrize("path", FILES)
