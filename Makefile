@@ -74,10 +74,8 @@ demo: gl  ## train on cartpole-swingup from pixels and write demo/ (about ten mi
 test: gl  ## run the tests in two processes (options for pytest: make test PYTEST_ARGS="-x -k buffer")
 	$(RUN) pytest -n 2 --dist worksteal $(PYTEST_ARGS)
 
-test-all: gl  ## run all combinations of algorithms, heads, rewards and sensors, of which test runs a set, and long tests
-	SB3_CURE_TEST_ALL=1 $(RUN) pytest -n 2 --dist worksteal \
-		tests/test_combinations.py tests/test_curious_returns.py tests/test_determinism.py tests/test_learning.py \
-		tests/test_diagnostics.py tests/test_callbacks.py tests/experiments/test_yardsticks.py $(PYTEST_ARGS)
+test-all: export SB3_CURE_TEST_ALL := 1
+test-all: test  ## the same, with all combinations of algorithms, heads, rewards and sensors, and with long tests
 
 # What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
 # the replay buffer, CuRe's own arguments, and the pixels of dm_control.
