@@ -232,6 +232,7 @@ def test_decoder_is_to_draw_the_centred_views(augmentation: str) -> None:
     assert head.reconstruct(latents).shape == views.shape == (8, *policy.augmentation.view_space.shape)
     head.decoder = Draw(head.target(centred, dither=False))
     assert float(head.error(batch_of(observations, views), latents).max()) < 1e-12
+    assert float(head.error(batch_of(observations.roll(1, 0), views), latents).min()) > 1e-3
     assert float(head.loss(batch_of(observations, views), latents).error.max()) < 1e-3
     head.decoder = Draw(head.target(views, dither=False))
     assert float(head.loss(batch_of(observations, views), latents).error.mean()) > 1e-3
