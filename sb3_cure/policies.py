@@ -49,6 +49,16 @@ class TrunkActor(Actor):
             log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
             return self.mu(latent), log_std, {}
 
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :param deterministic: Whether to return the mean actions
+        :return: Actions in [-1, 1], [B, action_dim]
+        """
+        mean, log_std, _ = self.get_action_dist_params(obs)
+        with full_precision(mean):
+            return th.tanh(mean if deterministic else mean + th.randn_like(mean) * log_std.exp())
+
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param obs: Trunk features of the encoder, [B, trunk_dim]

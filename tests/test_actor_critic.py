@@ -8,6 +8,7 @@ from envs_for_tests import VectorBox, tiny_model
 from torch import nn
 from updates_for_tests import ALGORITHMS, filled_model, train_once
 
+from sb3_cure import CuReSAC
 from sb3_cure.layers import set_mode
 from sb3_cure.policies import ActorCritic
 
@@ -146,6 +147,24 @@ def test_modes_change_as_torch_changes_them() -> None:
     modules.eval().append(nn.Dropout())
     set_mode(modules, False)
     assert not modules[-1].training
+
+
+def test_actions_are_those_of_the_log_probabilities() -> None:
+    """Acting draws what learning takes for the policy's actions: SB3's squashed Gaussian, from the same stream."""
+    model = model_of(CuReSAC)
+    actor, features = model.policy.task.actor, th.randn(5, model.policy.encoder.trunk_dim)
+    with th.no_grad():
+        mean, log_std, _ = actor.get_action_dist_params(features)
+        th.manual_seed(3)
+        acted = actor(features)
+        th.manual_seed(3)
+        learned, _ = actor.action_log_prob(features)
+        th.manual_seed(3)
+        of_sb3 = actor.action_dist.actions_from_params(mean, log_std)
+        th.testing.assert_close(actor(features, deterministic=True), th.tanh(mean))
+    assert th.equal(acted, learned)
+    th.testing.assert_close(acted, of_sb3)
+    assert not th.equal(acted, th.tanh(mean))
 
 
 def test_the_two_agents_begin_differently() -> None:

@@ -282,7 +282,7 @@ def make_dmc_env(
             proprioception=proprioception,
         ),
     )
-    env = ActionRepeat(NormalizeActions(env), action_repeat)
+    env = NormalizeActions(ActionRepeat(env, action_repeat))
     seen: dict[str, Any] = dict(grayscale=grayscale, renderer=renderer, background=background, seed=seed)
     if cameras or proprioception:
         views = {f"camera{index}": index for index in cameras} if cameras else {"image": camera_id}

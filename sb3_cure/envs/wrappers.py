@@ -241,7 +241,7 @@ def make_pixel_env(
     """
     if isinstance(env, str):
         env = gym.make(env, render_mode="rgb_array")
+    env = ActionRepeat(env, action_repeat)
     if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):
         env = NormalizeActions(env)
-    env = PixelObservation(ActionRepeat(env, action_repeat), image_size, grayscale)
-    return StackFrames(env, frame_stack)
+    return StackFrames(PixelObservation(env, image_size, grayscale), frame_stack)
