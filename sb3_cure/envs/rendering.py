@@ -40,6 +40,12 @@ def _glfw_has_a_display() -> bool:
         return bool(glfw.init())
 
 
+def choose_backend() -> None:
+    """Let MuJoCo, which asks when it is imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display."""
+    if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
+        os.environ["MUJOCO_GL"] = "egl"
+
+
 def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
@@ -50,8 +56,7 @@ def load_gl() -> None:
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
-    if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
-        os.environ["MUJOCO_GL"] = "egl"
+    choose_backend()
     # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     # pygame, which opens windows for render_mode="human", would draw with OpenGL, too: that ends the process (EGL), or

@@ -10,6 +10,8 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
+from sb3_cure.envs.rendering import choose_backend
+
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
 
@@ -240,6 +242,7 @@ def make_pixel_env(
     :raises ValueError: If an argument is out of range or, when first reset, ``env`` does not render RGB frames
     """
     if isinstance(env, str):
+        choose_backend()
         env = gym.make(env, render_mode="rgb_array")
     env = ActionRepeat(env, action_repeat)
     if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):

@@ -543,9 +543,10 @@ def test_egl_is_chosen_only_without_display(environment, chosen):
         assert os.environ.get("MUJOCO_GL") == chosen
 
 
-def test_display_that_cannot_be_opened_is_none():
+@pytest.mark.parametrize("made", ["make_dmc_env('cartpole', 'swingup')", "make_pixel_env('InvertedPendulum-v5')"])
+def test_display_that_cannot_be_opened_is_none(made):
     """As that of an ssh connection that has ended: frames are drawn, without a word about displays."""
-    code = "from sb3_cure import make_dmc_env as make; print(make('cartpole', 'swingup').reset()[0].std())"
+    code = f"from sb3_cure.envs import make_dmc_env, make_pixel_env; print({made}.reset()[0].std())"
     result = run_python(code, DISPLAY=":77")
     assert result.returncode == 0 and float(result.stdout) > 1, result.stderr
     assert "isplay" not in result.stderr
