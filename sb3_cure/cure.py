@@ -61,8 +61,8 @@ class CuRe(OffPolicyAlgorithm):
         ``"forward"``, ``"inverse"`` (see ``sb3_cure.srl``), a subclass of ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
-        agent steps, two updates per step, in turn: after whole periods both were updated as often as simultaneously
-    :param srl_period: Updates of the counter per phase when alternating
+        gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
+    :param srl_period: Gradient steps per phase when alternating
     :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"disagreement"``, ``"particle"``,
         ``"shuffled"`` (another one without its information, as a control), or a subclass of ``IntrinsicReward``
