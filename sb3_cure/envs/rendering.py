@@ -41,7 +41,7 @@ def _glfw_has_a_display() -> bool:
 
 
 def choose_backend() -> None:
-    """Let MuJoCo, which asks when it is imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display."""
+    """Let MuJoCo, which asks when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display."""
     if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
         os.environ["MUJOCO_GL"] = "egl"
 
