@@ -45,7 +45,7 @@ PROFILE: dict[str, Any] = dict(
 SETTINGS: dict[str, Any] = dict(
     PROFILE,
     intrinsic="reconstruction",
-    intrinsic_kwargs=dict(n_filters=8),
+    intrinsic_kwargs=dict(n_filters=8, n_layers=2),  # a fifth of an update less than with four layers
     curiosity_encoder_grad=False,  # in so few updates the curious critic's gradient slows the task down
     # Curious by episodes, ever fewer: among single curious steps the task's agent hardly sees a pole that stays up.
     curiosity_prob=LinearSchedule(0.2, 0, 1),
@@ -55,8 +55,9 @@ SETTINGS: dict[str, Any] = dict(
     train_freq=2,
     gradient_steps=1,
     learning_rate=LinearSchedule(1.5e-3, 2e-5, 1),
+    n_steps=3,
 )
-TOTAL_STEPS = 20_000
+TOTAL_STEPS = 22_000
 EVALUATIONS, ROWS = 8, 4
 #: Episodes of each policy in the end, and the share of the time that is kept for them and for the pictures
 EPISODES, MEASURING = 10, 0.1
