@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch as th
 from envs_for_tests import PixelBox, tiny_model
 
 import sb3_cure
@@ -139,14 +138,15 @@ def test_own_reward_of_the_guide_falls_as_it_is_learned() -> None:
 
 def test_a_policy_leaves_for_the_robot_as_the_guide_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The file that its lines write gives the actions of ``predict``."""
-    (block,) = blocks("docs/guide/robot.md")
+    here, on_the_robot = blocks("docs/guide/robot.md")
     monkeypatch.chdir(tmp_path)
     model = tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0))
     names: dict = {"model": model}
-    exec(compile(block, "robot.md", "exec"), names)
+    for block in (here, on_the_robot):
+        exec(compile(block, "robot.md", "exec"), names)
     actions, _ = model.predict(names["images"].numpy(), deterministic=True)
-    for given in (names["actions"], th.export.load("policy.pt2").module()(names["images"])):
-        np.testing.assert_allclose(given.detach(), actions, atol=1e-5)
+    np.testing.assert_allclose(names["actions"].detach(), actions, atol=1e-5)
+    np.testing.assert_allclose(names["action"], actions[0], atol=1e-5)
 
 
 def without_code(page: Path) -> str:
