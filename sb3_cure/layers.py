@@ -95,9 +95,11 @@ def preprocess(observations: Any, observation_space: spaces.Space) -> Any:
     return images / 255 if observations.is_floating_point() else images.div_(255)
 
 
-def full_precision(tensor: th.Tensor) -> th.autocast:
+def full_precision(tensor: th.Tensor) -> contextlib.AbstractContextManager[Any]:
     """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
-    return th.autocast(tensor.device.type, enabled=False)
+    device = tensor.device.type
+    # Where it is off, entering one more context would cost as much as a small operation, dozens of times in an update.
+    return th.autocast(device, enabled=False) if th.is_autocast_enabled(device) else contextlib.nullcontext()
 
 
 class FullPrecision(nn.Sequential):

@@ -258,6 +258,9 @@ def make_dmc_env(
     )
     base: Any = env.unwrapped
     base.np_random = np.random.RandomState(seed)
+    # What nobody sees would be computed in every step of physics: a tenth of cartpole's time in 36 px.
+    base.task.get_observation = _no_observation
+    base.observation_space = gym.spaces.Dict()
     # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.
     base.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / base.control_timestep()}
     # As gymnasium.make would set it, so that loggers and copies see this environment and not the one underneath.
@@ -290,6 +293,11 @@ def make_dmc_env(
     else:
         env = DMCPixels(env, image_size, camera_id=camera_id, **seen)
     return StackFrames(env, frame_stack)
+
+
+def _no_observation(physics: Any) -> dict[str, Any]:
+    """In place of a task's own: observations are what the cameras see."""
+    return {}
 
 
 # With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) when it is asked for "human".

@@ -146,6 +146,17 @@ def test_one_frame_is_rendered_per_agent_step(make):
         assert render.call_count == 4
 
 
+def test_states_that_nobody_sees_are_not_computed(make, monkeypatch):
+    from dm_control.suite.cartpole import Balance
+
+    env = make()
+    computed = mock.Mock()
+    monkeypatch.setattr(Balance, "get_observation", computed)
+    env.reset()
+    env.step(env.action_space.sample())
+    computed.assert_not_called()
+
+
 def test_lqr_actions_are_clipped_to_the_unit_box(make):
     env = make("lqr", "lqr_6_2")
     assert env.action_space == spaces.Box(-1, 1, (2,), np.float32)
