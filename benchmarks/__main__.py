@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import describe_machine
+from benchmarks.harness import describe_machine, machine_title
 from benchmarks.parts import parts, run_part
 
 
@@ -53,8 +53,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     machine = describe_machine()
-    processor = machine["gpu"] or machine["processor"]
-    title = f"{processor}, {machine['cores']} cores"
+    title = machine_title(machine)
     name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
     path = options.out / f"{name}.json"
     measured = json.loads(path.read_text()) if options.only and path.exists() else {}

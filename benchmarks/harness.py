@@ -16,15 +16,20 @@ import stable_baselines3
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.utils import get_device
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.precision import has_fast_bf16
 
 Times = dict[str, list[float]]
 
 #: The paper's setting: 9x84x84 observations, batches of 128; 32 filters and 1024 hidden units are the defaults
 BATCH_SIZE = 128
 N_FRAMES = 600
+
+#: Number formats that this machine computes natively; bf16 is emulated elsewhere, a hundred times slower
+PRECISIONS = ("fp32", "bf16") if has_fast_bf16(get_device("auto")) else ("fp32",)
 
 
 def interleaved(variants: Mapping[str, Callable[[], object]], repeats: int, calls: int = 2) -> Times:
@@ -116,6 +121,15 @@ def describe_machine() -> dict[str, Any]:
             "sb3_cure": sb3_cure.__version__,
         },
     }
+
+
+def machine_title(machine: dict[str, Any]) -> str:
+    """
+    :param machine: Result of ``describe_machine``
+    :return: What tells its report from others: processors of one name may have other instructions
+    """
+    instructions = machine["bf16_instructions"] or machine["instructions"]
+    return machine["gpu"] or f"{machine['processor']} with {instructions}, {machine['cores']} cores"
 
 
 def make_env(**kwargs: Any) -> gym.Env:

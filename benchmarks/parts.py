@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 from benchmarks import checkpoints, collection, growth, heads, numerics, rendering, replay, rewards, settings, update
+from benchmarks.harness import PRECISIONS
 from sb3_cure.allocator import tune_allocator
 
 
@@ -28,7 +29,7 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
         "growth_with_batch": growth.by_batch,
         "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,
-        "bfloat16_against_float32": numerics.measure,
+        **({"bfloat16_against_float32": numerics.measure} if "bf16" in PRECISIONS else {}),
         **({"buffer_on_disk": partial(growth.on_disk, 1_000_000, disk)} if disk is not None else {}),
     }
 

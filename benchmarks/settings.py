@@ -14,7 +14,7 @@ import torch as th
 from stable_baselines3 import SAC
 from torch.nn import functional as F
 
-from benchmarks.harness import BATCH_SIZE, interleaved, make_model, median_ratio, summary
+from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import FEATURES, PlainSacAe
 from sb3_cure.layers import conv_sizes
 
@@ -173,9 +173,9 @@ def _product(inputs: int, outputs: int) -> float:
 def _best(
     call: Callable[..., object], inputs: tuple[int, ...], weight: tuple[int, ...], outputs: tuple[int, ...]
 ) -> float:
-    """Least seconds of a call, of both number formats."""
+    """Least seconds of a call, of the number formats that the machine computes natively."""
     seconds = []
-    for dtype in (th.float32, th.bfloat16):
+    for dtype in (th.float32, th.bfloat16)[: len(PRECISIONS)]:
         made = [th.randn(shape).to(dtype) for shape in ((BATCH_SIZE, *inputs), weight, (BATCH_SIZE, *outputs))]
         made = [each.contiguous(memory_format=th.channels_last) if each.dim() == 4 else each for each in made]
         for _ in range(20):

@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from stable_baselines3 import SAC
 
-from benchmarks.harness import BATCH_SIZE, interleaved, make_model, median_ratio, summary
+from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
 from sb3_cure import CuReSAC
 from sb3_cure.experiments.grid import constructor_defaults
@@ -27,7 +27,7 @@ def _yardstick_call() -> Callable[[], object]:
     return lambda: agent.update(buffer.sample(BATCH_SIZE))
 
 
-def measure(repeats: int = 7, precisions: tuple[str, ...] = ("fp32", "bf16")) -> dict[str, Any]:
+def measure(repeats: int = 7, precisions: tuple[str, ...] = PRECISIONS) -> dict[str, Any]:
     """
     :param repeats: Rounds
     :param precisions: Number formats to measure

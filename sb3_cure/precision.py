@@ -16,7 +16,11 @@ from sb3_cure.observations import image_spaces
 NOT_COMPILED = "compiled updates were slower on the CPU they were measured on, and not measured on a GPU yet"
 
 
-def _has_fast_bf16(device: th.device) -> bool:
+def has_fast_bf16(device: th.device) -> bool:
+    """
+    :param device: Device of the networks
+    :return: Whether it computes bf16 natively
+    """
     if device.type == "cuda":
         return th.cuda.is_bf16_supported(including_emulation=False)
     # Without these instructions bf16 on a CPU is emulated and slower than fp32.
@@ -32,7 +36,7 @@ def resolve_precision(precision: str, device: th.device, observation_space: spac
     :return: ``"fp32"`` or ``"bf16"``; auto chooses bf16 for images, where the device computes it natively
     """
     if precision == "auto":
-        return "bf16" if image_spaces(observation_space) and _has_fast_bf16(device) else "fp32"
+        return "bf16" if image_spaces(observation_space) and has_fast_bf16(device) else "fp32"
     return precision
 
 
