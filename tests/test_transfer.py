@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from updates_for_tests import ALGORITHMS
 
-from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure.intrinsic import IntrinsicReward, rnd
 from sb3_cure.persistence import ArchiveError
 from sb3_cure.srl import RAE
 
@@ -107,6 +107,15 @@ def test_frozen_representation_of_a_dictionary_stays(tmp_path: Path) -> None:
     model = sensor_model(SensorBox(("front", "wrist")), curiosity_target="next_observation", seed=5)
     kept = tensors(model.transfer_from(tmp_path / "model", freeze=True), REPRESENTATION)
     assert model.learn(16)._n_updates > 0 and differences(kept, tensors(model, REPRESENTATION)) == []
+
+
+def test_statistics_of_rnd_stay_final(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of another whitening the predictor would know nothing."""
+    monkeypatch.setattr(rnd, "ENOUGH", 8)
+    source = saved(tmp_path / "model", intrinsic="rnd")
+    model = tiny_model("CnnPolicy", PixelBox(), intrinsic="rnd", seed=5).transfer_from(tmp_path / "model").learn(16)
+    for name in ("mean", "variance"):
+        assert th.equal(getattr(source.policy.intrinsic, name), getattr(model.policy.intrinsic, name))
 
 
 def test_encoder_goes_to_a_model_without_head(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
+from torch import nn
 
 from sb3_cure.buffers import Samples, unmarked
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
@@ -41,6 +42,7 @@ class RND(IntrinsicReward):
 
     mean: th.Tensor
     variance: th.Tensor
+    measured: th.Tensor
 
     def __init__(
         self,
@@ -62,20 +64,14 @@ class RND(IntrinsicReward):
         shape = scaled(th.as_tensor(self.space.sample())[None], self.space).shape[1:]
         self.register_buffer("mean", th.zeros(shape))
         self.register_buffer("variance", th.zeros(shape))
-        #: Whether the statistics are final
-        self.measured = False
+        # Whether the statistics are final; the same as a Python bool, which waits for no device (None: to be read)
+        self.register_buffer("measured", th.tensor(False))
+        self._is_measured: bool | None = None
+        self.register_load_state_dict_post_hook(self._read_anew)
 
-    def get_extra_state(self) -> th.Tensor:
-        """
-        :return: Whether the statistics are final
-        """
-        return th.tensor(self.measured)
-
-    def set_extra_state(self, state: th.Tensor) -> None:
-        """
-        :param state: Of ``get_extra_state``
-        """
-        self.measured = bool(state)
+    @staticmethod
+    def _read_anew(reward: nn.Module, incompatible_keys: object) -> None:
+        reward._is_measured = None  # type: ignore[assignment]
 
     def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
         """Take the statistics, until they are of enough.
@@ -84,7 +80,9 @@ class RND(IntrinsicReward):
         :param look_up: What it holds
         :param encode: Unused
         """
-        if self.measured:
+        if self._is_measured is None:
+            self._is_measured = bool(self.measured)
+        if self._is_measured:
             return
         rows, env_inds, _ = unmarked(replay_buffer)
         chosen = np.linspace(0, len(rows) - 1, min(len(rows), OBSERVATIONS)).astype(int)
@@ -96,7 +94,8 @@ class RND(IntrinsicReward):
         mean = total / len(chosen)
         self.mean.copy_(mean)
         self.variance.copy_((squares / len(chosen) - mean.square()).clamp(min=0))
-        self.measured = len(rows) >= ENOUGH or replay_buffer.full
+        self._is_measured = len(rows) >= ENOUGH or replay_buffer.full
+        self.measured.fill_(self._is_measured)
 
     def loss(
         self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
