@@ -1,6 +1,8 @@
 """A replay buffer of dictionaries equals SB3's, bit for bit, in a fraction of its memory."""
 
 import pickle
+import warnings
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -138,6 +140,19 @@ def test_rows_that_one_image_loses_are_lost_for_all() -> None:
         twins.ours.observations_at(np.array([(twins.ours.pos - 1 - twins.ours.size()) % 100]), np.array([0]))
     twins.ours.reset()
     assert twins.ours.size() == 0 and all(image.size() == 0 for image in twins.ours.images.values())
+
+
+def test_an_image_that_is_no_stack_is_told_of() -> None:
+    """Three channels are three grey frames, or one in colour: told of the wrong ones, the buffer holds fewer rows."""
+    space = spaces.Dict(goal=spaces.Box(0, 255, (3, 36, 36), np.uint8))
+    images = np.random.default_rng(0).integers(0, 256, (131, 1, 3, 36, 36), dtype=np.uint8)
+    for stack, told in ((1, False), (3, True)):
+        buffer = DictFrameStackReplayBuffer(100, space, spaces.Box(-1, 1, (2,)), frame_stack=stack)
+        with warnings.catch_warnings(record=True) as caught:
+            for before, after in pairwise(images):
+                buffer.add({"goal": before}, {"goal": after}, np.zeros((1, 2)), np.zeros(1), np.zeros(1), [{}])
+        assert ["frame_stack=" in str(each.message) for each in caught][:1] == [True] * told
+        assert (buffer.size() == 100) is not told
 
 
 def test_bytes_per_transition() -> None:
