@@ -125,7 +125,11 @@ class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.ut
         self, env: gym.Env, cameras: dict[str, int], proprioception: bool, image_size: int = 84, **kwargs: Any
     ) -> None:
         gym.utils.RecordConstructorArgs.__init__(
-            self, cameras=list(cameras.items()), proprioception=proprioception, image_size=image_size, **kwargs
+            self,
+            cameras=list(cameras.items()),
+            proprioception=proprioception,
+            image_size=image_size,
+            **{name: value for name, value in kwargs.items() if name != "seed"},  # as of `DMCPixels`
         )
         super().__init__(env)
         self._cameras = {key: DMCPixels(env, image_size, camera_id=index, **kwargs) for key, index in cameras.items()}

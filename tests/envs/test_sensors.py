@@ -114,13 +114,14 @@ def test_it_is_an_environment_as_others_are() -> None:
 
 
 def test_state_is_restored_exactly() -> None:
-    """Between two steps, stacks included."""
+    """Between two steps, stacks included, in environments that were made with another seed."""
     from stable_baselines3.common.env_util import make_vec_env
 
-    def make() -> Any:
-        return make_vec_env(lambda: make_dmc_env("reacher", "easy", cameras=[0, 1], proprioception=True, **SMALL), 1)
+    def make(seed: int) -> Any:
+        arguments: Any = dict(cameras=[0, 1], proprioception=True, seed=seed, **SMALL)
+        return make_vec_env(lambda: make_dmc_env("reacher", "easy", **arguments), 1)
 
-    env, other = make(), make()
+    env, other = make(0), make(1)
     env.seed(0)
     env.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 1, 2)).astype(np.float32)
