@@ -314,5 +314,5 @@ def test_rae_learns_to_draw_real_frames(frames: th.Tensor) -> None:
 
     assert not any(well_below_the_mean_image(value) for value in errors.values())
     assert not well_below_the_mean_image(error())
-    model.train(300, batch_size=16)  # of two updates each
+    model.train(500, batch_size=16)  # of two updates each
     assert well_below_the_mean_image(error())
