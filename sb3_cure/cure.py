@@ -438,7 +438,7 @@ class CuRe(OffPolicyAlgorithm):
         self.policy.set_learning_rate(learning_rate, self.ent_coef_lr_factor)
         for _ in range(gradient_steps):
             learns_srl, learns_rl = self._phase()
-            for _ in range(2 if self.srl_schedule == "alternating" else 1):
+            for _ in range(2 if self._takes_turns else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
                 batch = self.policy.samples(sampled)
                 if self.n_steps > 1 and self.task and learns_rl and isinstance(self.replay_buffer, SkipsMarked):
@@ -454,11 +454,16 @@ class CuRe(OffPolicyAlgorithm):
         self.logger.record("train/learning_rate", learning_rate)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    @property
+    def _takes_turns(self) -> bool:
+        """Whether SRL and RL alternate, which takes one of each."""
+        return self.srl_schedule == "alternating" and self.srl is not None and (self.task or self._has_curious_agent)
+
     def _phase(self) -> tuple[bool, bool]:
         """Whether the next update is one of SRL, and whether it is one of actors and critics."""
         if not (self.task or self._has_curious_agent):
             return True, False
-        if self.srl is None or self.srl_schedule == "simultaneous":
+        if not self._takes_turns:
             return True, True
         in_turn = bool(self._n_updates // self.srl_period % 2 == 0)
         return in_turn, not in_turn
@@ -470,10 +475,11 @@ class CuRe(OffPolicyAlgorithm):
             views, next_views = policy.preprocess(batch.views), {"next ": policy.augment(batch.next_observations)}
             if batch.n_step_next_observations is not None:
                 next_views["n-step "] = policy.augment(batch.n_step_next_observations)
-            # Where each agent bootstraps: the task's after n steps, the curious one after one
-            goals = {"curious": "next ", "task": list(next_views)[-1]}
-            read = {goals[name] for name in policy.agents}
-            next_latents = {goal: policy.encoder_target(next_views[goal]).float() for goal in read}
+            # Where each agent that learns bootstraps: the task's after n steps, the curious one after one
+            goals = {"task": list(next_views)[-1]} if self.task and learns_rl else {}
+            if self._has_curious_agent and learns_rl:
+                goals["curious"] = "next "
+            next_latents = {goal: policy.encoder_target(next_views[goal]).float() for goal in set(goals.values())}
         encoder.begin(views, *next_views.values())
 
         srl_error, rewards, curious_rewards = None, batch.rewards, None
@@ -483,10 +489,10 @@ class CuRe(OffPolicyAlgorithm):
             curious_rewards = self._update_intrinsic(policy.intrinsic, batch, srl_error)
             if self.curiosity == "bonus":
                 rewards = rewards + curious_rewards
-        if self.task and learns_rl:
+        if "task" in goals:
             goal = goals["task"]
             self._update_actor_critic("task", batch, *self._task_return(batch, rewards), next_latents[goal], goal)
-        if self._has_curious_agent and learns_rl:
+        if "curious" in goals:
             assert curious_rewards is not None
             goes_on = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
             discounts, goal = goes_on * self.curiosity_gamma, goals["curious"]

@@ -191,13 +191,14 @@ class EncoderUpdate:
         self._pulls, self._runs, self._next_features = {}, {}, {}
 
     def end(self) -> dict[str, th.Tensor]:
-        """End an update.
+        """End an update. No graph is left of it: it would fill memory while environments step, and forbid copies.
 
         :return: Norms of each source's gradient, before anything is scaled: at the latents, and, when that was measured
             last, at the encoder's parameters, with the share of each source there: what a plain sum of the losses would
             be made of. By their logged names, detached scalars
         """
         self._n_updates += 1
+        self._inputs, self._runs, self._next_features, self._pulls = {}, {}, {}, {}
         if self._measured:
             self.parameter_norms = self._measured
         metrics = {f"latent_grad_norm_{source}": norm for source, norm in self.gradient_norms.items()}

@@ -73,7 +73,7 @@ class Pretraining(CuRe):
 
         Keeps what ``pretrain`` keeps, and the replay buffer as well.
 
-        :param updates: Updates of encoder and head (pairs of them where ``srl_schedule`` alternates)
+        :param updates: Updates of encoder and head
         :param log_interval: Updates between two dumps of the logger
         :return: self
         :raises ValueError: if there is no SRL head, or nothing in the replay buffer
@@ -263,6 +263,8 @@ class Pretraining(CuRe):
             for source in policy.encoder_update.mean_squares.keys() - set(self._policy_choices()["encoder_sources"]):
                 policy.encoder_update.remove_source(source)
         policy.default_agent = self._policy_choices()["default_agent"]
+        if self.curiosity == "bonus":
+            policy.scale.forget()  # a bonus is divided by its size, the reward of pretraining by its spread
         if not keeps_transitions:
             self.replay_buffer.reset()  # type: ignore[union-attr]
             if policy.intrinsic is not None:

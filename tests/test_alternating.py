@@ -54,6 +54,23 @@ def test_each_phase_makes_two_updates_per_step() -> None:
         assert steps["task actor"] == steps["curious actor"] == max(0, step - PERIOD)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [dict(srl=None, intrinsic="rnd"), dict(srl=None, curiosity=None, policy_kwargs={"share_encoder": True})],
+)
+def test_without_two_to_take_turns_one_update_is_made(settings: dict[str, Any]) -> None:
+    """Where there is no head, or, while pretraining with random actions, nothing else."""
+    model = model_with_transitions(srl_schedule="alternating", **settings)
+    model.train(PERIOD, batch_size=8)
+    assert steps_of(model.policy.critic.optimizer) == PERIOD
+
+
+def test_pretraining_with_random_actions_makes_single_updates() -> None:
+    model = model_with_transitions(srl_schedule="alternating")
+    model.fit_representation(PERIOD)
+    assert numbers_of_steps(model)["srl"] == PERIOD
+
+
 @both_updates
 def test_critics_targets_rest_while_critics_do(update: str) -> None:
     """In phases of SRL only the target encoder follows; in those of RL all targets do."""

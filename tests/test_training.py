@@ -1,5 +1,6 @@
 """A training run as a user sees it: who acts, what is stored, what is updated when, and what is logged."""
 
+import copy
 import csv
 from collections.abc import Callable
 from pathlib import Path
@@ -533,6 +534,32 @@ def test_pretraining_with_fixed_temperature_bonus_and_burst() -> None:
     model.learn(14)
     assert model._n_updates == 5 + 4
     assert state_of(model)["policy.srl.optimizer"]["state"][0]["step"] == 2 * (5 + 4)
+
+
+def test_a_bonus_is_scaled_anew_after_pretraining() -> None:
+    """By its size and not by the spread of the pretraining's reward, of which it would be many, and clipped to one."""
+    model = tiny_model("MlpPolicy", VectorBox(), curiosity="bonus").pretrain(30)
+    assert float(model.policy.scale.weight) == 0
+    model.learn(11)
+    assert float(model.logger.name_to_value["train/curious_reward_mean"]) < 2
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        dict(update="joint"),
+        dict(update="sequential"),
+        dict(srl=None, intrinsic="rnd", task=False, curiosity_encoder_grad=False),
+    ],
+)
+def test_a_copy_learns_as_its_original(settings: dict[str, Any]) -> None:
+    model = tiny_model("MlpPolicy", VectorBox(), **settings).learn(15)
+    twin = copy.deepcopy(model)
+    for each in (model, twin):
+        np.random.seed(0)
+        th.manual_seed(0)
+        each.train(2, batch_size=8)
+    assert differences(state_of(model), state_of(twin)) == []
 
 
 def test_pretraining_needs_a_head_and_a_known_collector() -> None:

@@ -152,6 +152,11 @@ class RewardScale(nn.Module):
         self.register_buffer("variance", th.zeros(()))
         self.register_buffer("weight", th.zeros(()))
 
+    def forget(self) -> None:
+        """Begin the average anew."""
+        self.variance.zero_()
+        self.weight.zero_()
+
     @th.no_grad()
     def forward(self, reward: th.Tensor, beta: float, normalize: bool, center: bool) -> th.Tensor:
         """
