@@ -1,4 +1,4 @@
-"""Sequential updates beside SAC-AE (``benchmarks/sac_ae.py``) and CURL written plainly: same weights, batches, noise."""
+"""Sequential updates beside SAC-AE (``benchmarks/sac_ae.py``) and CURL, written plainly: equal weights and batches."""
 
 from typing import Any
 
