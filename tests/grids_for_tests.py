@@ -17,7 +17,8 @@ TINY: dict[str, Any] = dict(
     policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
 )  # fmt: skip
 DMC_TASK = "dmc_pixels/cartpole-swingup-v0"
-DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale": True}}
+#: 25 steps per episode
+DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale": True, "action_repeat": 40}}
 
 
 def write_grid(folder: Path, **changes: Any) -> Path:

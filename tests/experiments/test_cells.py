@@ -432,7 +432,7 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for actor, (states, errors) in drawn.items():
         np.testing.assert_allclose(states, measured[f"{actor}_states"], rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(errors, measured[f"{actor}_errors"], rtol=1e-4, atol=1e-6)
-        assert len(states) == len(errors) == 125
+        assert len(states) == len(errors) == 25
     draw(tmp_path / "map.png", drawn, [str(number) for number in range(4)], "", coordinates=("0", "1"))
     assert (tmp_path / "map.png").exists()
 

@@ -29,8 +29,8 @@ def _gl() -> None:
 
 def grid(folder: Path, **changes: Any) -> Any:
     methods = {"oracle": method(env_wrapper=[ORACLE], curiosity=None, **QUICK)}
-    coverage = dict(widths=WIDTHS, at=[400, 1200])
-    arguments = dict(tasks=[DMC_TASK], methods=methods, budget=1200, evaluation=dict(every=1200, episodes=1))
+    coverage = dict(widths=WIDTHS, at=[2000, 6000])
+    arguments = dict(tasks=[DMC_TASK], methods=methods, budget=6000, evaluation=dict(every=6000, episodes=1))
     return load_grid(write_grid(folder, **{**arguments, "coverage": coverage, **changes}))
 
 
@@ -47,7 +47,7 @@ def test_cells_of_all_collected_states_are_counted(tmp_path: Path, monkeypatch: 
     [cell] = grid(tmp_path).cells
     folder = run_cell(cell, tmp_path / "out", pictures=False)
     rows = read_rows(folder / "coverage.csv")
-    assert [(row["environment_steps"], row["agent_steps"]) for row in rows] == [(400, 50), (1200, 150)]
+    assert [(row["environment_steps"], row["agent_steps"]) for row in rows] == [(2000, 50), (6000, 150)]
     assert len(states) == 150
     names = physics_state_names(cell.make_env())
     seen = np.array(states)[:, [names.index(name) for name in WIDTHS]]

@@ -224,7 +224,7 @@ def test_visits_are_measured_by_three_yardsticks(tmp_path: Path, monkeypatch: py
             assert 0.02 < error[actor, "zero"] < 0.08
             assert error[actor, "mean_image"] < error[actor, "zero"] / 5
             assert error[actor, "common"] < error[actor, "zero"] / 2, "the common head has learned something"
-            assert visits[f"{actor}_states"].shape == (125, 4) and visits[f"{actor}_errors"].shape == (125,)
+            assert visits[f"{actor}_states"].shape == (25, 4) and visits[f"{actor}_errors"].shape == (25,)
             assert visits[f"{actor}_errors"].mean() == pytest.approx(error[actor, "own"], rel=1e-4)
     # The arms of a seed are measured on the same random episodes, another seed on others.
     tables = [read_rows(tmp_path / "out" / cell.folder / "visitation.csv") for cell in grid.cells]
