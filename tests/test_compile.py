@@ -111,6 +111,7 @@ def test_compiled_models_are_saved_loaded_and_copied(compiled: CuReSAC, tmp_path
     assert set(FORWARDS.values()) == run_in_python(eager)
 
 
+@pytest.mark.long
 @needs_compiler
 def test_compiled_bfloat16_gradients_point_where_those_of_float32_do() -> None:
     """Cosine of at least 0.99 for every part of the agent, compiled in bfloat16 against eager in float32."""
