@@ -10,6 +10,7 @@ curious agent without a task spend its time? Beside each reward stands what cost
 
 import argparse
 import itertools
+import json
 import statistics
 import time
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from benchmarks.harness import make_model
 from benchmarks.settings import SETTINGS, added_costs
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import transitions
-from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json
+from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json
 
 ROOMS = ("known", "television", "new")
 #: Where each begins and ends along the first axis
@@ -199,7 +200,7 @@ def table(rows: Sequence[Row]) -> list[str]:
         "| reward | television ÷ known | new ÷ known | visits: known | television | new |",
         "|---|---|---|---|---|---|",
     ]
-    for arm in ARMS:
+    for arm in [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]:
         own = [row for row in rows if row["arm"] == arm]
         ratios = [
             f"{statistics.geometric_mean(row[room] / row['known'] for row in own if row['measure'] == 'paid'):.2f}"
@@ -222,19 +223,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=3, help="seeds of each reward (default: 3)")
     parser.add_argument("--updates", type=int, default=300, help="updates before rewards are compared (default: 300)")
     parser.add_argument("--steps", type=int, default=1000, help="agent steps of each visit (default: 1000)")
+    parser.add_argument("--only", nargs="+", choices=ARMS, help="measure these anew and keep the others' rows")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    chosen, csv, run = options.only or list(ARMS), options.out / "rewards.csv", options.out / "run.json"
+    kept = [row for row in read_rows(csv) if row["arm"] not in chosen] if options.only else []
+    of_the_kept = json.loads(run.read_text()) if kept else None
     measures = {"paid": partial(paid, updates=options.updates), "visits": partial(visits, steps=options.steps)}
-    rows: list[Row] = []
+    rows: list[Row] = kept
     for measure, measured in measures.items():
-        for seed, arm in itertools.product(range(options.seeds), ARMS):
+        for seed, arm in itertools.product(range(options.seeds), chosen):
             start = time.monotonic()
             rows.append({"arm": arm, "seed": seed, "measure": measure, **measured(arm, seed)})
             print(f"{measure}, seed {seed}, {arm}: {time.monotonic() - start:.0f} s", flush=True)
-            write_csv(options.out / "rewards.csv", ("arm", "seed", "measure", *ROOMS), rows)
+            write_csv(csv, ("arm", "seed", "measure", *ROOMS), rows)
         (options.out / "table.md").write_text("\n".join([*table(rows), ""]))
     settings = {"seeds": options.seeds, "updates": options.updates, "steps": options.steps}
-    write_json(options.out / "run.json", {**describe_run(), "settings": settings})
+    before = {} if of_the_kept is None else {"the other arms": of_the_kept}
+    write_json(run, {**describe_run(), "settings": settings, "arms": chosen, **before})
     return 0
 
 
