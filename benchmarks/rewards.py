@@ -45,6 +45,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "rnd": dict(intrinsic="rnd"),
     "icm": dict(intrinsic="icm"),
     "icm, encoder='own'": dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="own")),
+    "impact": dict(intrinsic="impact"),
     "disagreement": dict(intrinsic="disagreement"),
     "particle": dict(intrinsic="particle"),
     "particle, space='latents'": dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents")),

@@ -64,8 +64,9 @@ class CuRe(OffPolicyAlgorithm):
         gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Gradient steps per phase when alternating
     :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), ``"reconstruction"`` (what
-        the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"disagreement"``, ``"particle"``,
-        ``"shuffled"`` (another one without its information, as a control), or a subclass of ``IntrinsicReward``
+        the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
+        ``"particle"``, ``"shuffled"`` (another one without its information, as a control), or a subclass of
+        ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
         task's; ``"random"``: the second actor draws a uniform action for each bout (control); None: off

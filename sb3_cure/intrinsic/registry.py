@@ -3,6 +3,7 @@
 from sb3_cure.intrinsic.base import IntrinsicReward
 from sb3_cure.intrinsic.disagreement import Disagreement
 from sb3_cure.intrinsic.icm import ICM
+from sb3_cure.intrinsic.impact import Impact
 from sb3_cure.intrinsic.particle import Particle
 from sb3_cure.intrinsic.reconstruction import Reconstruction
 from sb3_cure.intrinsic.rnd import RND
@@ -13,6 +14,7 @@ INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
     "reconstruction": Reconstruction,
     "rnd": RND,
     "icm": ICM,
+    "impact": Impact,
     "disagreement": Disagreement,
     "particle": Particle,
 }

@@ -164,7 +164,7 @@ def test_optimiser_has_what_is_trained_and_the_encoder_what_is_declared(arm: str
     """Frozen networks are not stepped; a source of the encoder is there exactly where the reward trains it."""
     model = filled_model(pixels=True, curiosity_encoder_grad=False, **ARMS[arm])
     reward = reward_of(model)
-    assert ("intrinsic" in model.policy.encoder_update.weights) == reward.trains_encoder == (arm == "icm")
+    assert ("intrinsic" in model.policy.encoder_update.weights) == reward.trains_encoder == (arm in ("icm", "impact"))
     trained = [p for p in reward.parameters() if p.requires_grad]
     held = [] if reward.optimizer is None else reward.optimizer.param_groups[0]["params"]
     assert set(map(id, held)) == set(map(id, trained))
@@ -303,6 +303,21 @@ def test_icm_is_the_forward_error_in_features_of_the_inverse_model(encoder: str)
     # The joint update normalises the length of a source's gradient, not its direction.
     assert float(nn.functional.cosine_similarity(direction, gradient, dim=0)) > 0.999
     assert ("trunk" in moved(before, groups(model))) == (encoder == "shared")
+
+
+# ---------------------------------------------------------------- impact
+
+
+def test_impact_is_how_far_latents_move_before_the_step() -> None:
+    """The models that the encoder learns from are ICM's."""
+    pair = [filled_model(pixels=True, srl=None, task=False, intrinsic=name) for name in ("impact", "icm")]
+    model, batch, found = pair[0], sampled(pair[0]), captured(pair[0])
+    here, there = (model.policy.encoder(x.float() / 255) for x in (batch.observations, batch.next_observations))
+    for each in pair:
+        train_once(each, actors=False)
+    th.testing.assert_close(found[0], (here - there).detach().norm(dim=1), rtol=1e-4, atol=1e-6)
+    learned = [reward_of(each).state_dict() for each in pair]
+    assert differences(*learned) == []
 
 
 # ---------------------------------------------------------------- disagreement
