@@ -184,8 +184,8 @@ def cups() -> gym.Env:
     return TimeLimit(make_dmc_env("ball_in_cup", "catch", image_size=36, grayscale=True, renderer="fast"), 25)
 
 
-def model_of_cups(env: gym.Env, srl: str, **kwargs: Any) -> CuReSAC:
-    small = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=8))
+def model_of_cups(env: gym.Env, srl: str | None, hidden: int = 16, **kwargs: Any) -> CuReSAC:
+    small = dict(net_arch=[hidden], features_extractor_kwargs=dict(n_filters=8), share_encoder=True)
     return tiny_model("CnnPolicy", env, srl=srl, curiosity=None, policy_kwargs=small, buffer_size=1000, **kwargs)
 
 
@@ -196,6 +196,12 @@ def real_frames() -> Iterator[tuple[gym.Env, Any, list[Episode]]]:
     model = model_of_cups(env, "rae", learning_starts=1000).learn(1000)
     yield env, model.replay_buffer, list(run_episodes(model, env, 20, "random", states=True, seed=7))
     env.close()
+
+
+def r2_of_positions(model: CuReSAC, env: gym.Env, episodes: list[Episode]) -> float:
+    """Of a linear map from latents to where cup and ball are."""
+    found = state_probe(model, episodes, physics_state_names(env), physics_state_units(env))
+    return float(np.mean([found[name] for name in ("cup_x", "cup_z", "ball_x", "ball_z")]))
 
 
 @pytest.mark.parametrize("srl", LEARNS)
@@ -209,12 +215,19 @@ def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[
     model = model_of_cups(env, srl, learning_rate=learning_rate).learn(1)
     model.replay_buffer = buffer
     model._phase = lambda: (True, False)  # type: ignore[method-assign]
-
-    def r2_of_positions() -> float:
-        found = state_probe(model, episodes, physics_state_names(env), physics_state_units(env))
-        return float(np.mean([found[name] for name in ("cup_x", "cup_z", "ball_x", "ball_z")]))
-
-    untrained = r2_of_positions()
+    untrained = r2_of_positions(model, env, episodes)
     model.train(updates, batch_size)
-    trained = r2_of_positions()
+    trained = r2_of_positions(model, env, episodes)
+    assert untrained < 0.15 and trained > 0.4, (untrained, trained)
+
+
+def test_augmentation_alone_makes_latents_tell_the_state(real_frames: tuple[gym.Env, Any, list[Episode]]) -> None:
+    """Without a head, by what the task's critics teach the encoder of shifted images (DrQ's idea)."""
+    env, buffer, episodes = real_frames
+    shifted: Any = dict(augmentation="shift", augmentation_kwargs=dict(pad=2), gamma=0.9, learning_rate=1e-3)
+    model = model_of_cups(env, None, hidden=64, **shifted).learn(1)
+    model.replay_buffer = buffer
+    untrained = r2_of_positions(model, env, episodes)
+    model.train(800, 48)
+    trained = r2_of_positions(model, env, episodes)
     assert untrained < 0.15 and trained > 0.4, (untrained, trained)
