@@ -201,8 +201,10 @@ def table(rows: Sequence[Row]) -> list[str]:
         "| reward | television ÷ known | new ÷ known | visits: known | television | new |",
         "|---|---|---|---|---|---|",
     ]
-    for arm in [arm for arm in ARMS if any(row["arm"] == arm for row in rows)]:
+    for arm in ARMS:
         own = [row for row in rows if row["arm"] == arm]
+        if not own:
+            continue
         ratios = [
             f"{statistics.geometric_mean(row[room] / row['known'] for row in own if row['measure'] == 'paid'):.2f}"
             for room in ROOMS[1:]
@@ -228,10 +230,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     chosen, csv, run = options.only or list(ARMS), options.out / "rewards.csv", options.out / "run.json"
-    kept = [row for row in read_rows(csv) if row["arm"] not in chosen] if options.only else []
-    of_the_kept = json.loads(run.read_text()) if kept else None
+    rows: list[Row] = [row for row in read_rows(csv) if row["arm"] not in chosen] if options.only else []
+    of_the_kept = {"the other arms": json.loads(run.read_text())} if rows else {}
     measures = {"paid": partial(paid, updates=options.updates), "visits": partial(visits, steps=options.steps)}
-    rows: list[Row] = kept
     for measure, measured in measures.items():
         for seed, arm in itertools.product(range(options.seeds), chosen):
             start = time.monotonic()
@@ -240,8 +241,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_csv(csv, ("arm", "seed", "measure", *ROOMS), rows)
         (options.out / "table.md").write_text("\n".join([*table(rows), ""]))
     settings = {"seeds": options.seeds, "updates": options.updates, "steps": options.steps}
-    before = {} if of_the_kept is None else {"the other arms": of_the_kept}
-    write_json(run, {**describe_run(), "settings": settings, "arms": chosen, **before})
+    write_json(run, {**describe_run(), "settings": settings, "arms": chosen, **of_the_kept})
     return 0
 
 

@@ -175,7 +175,7 @@ def _best(
 ) -> float:
     """Least seconds of a call, of the number formats that the machine computes natively."""
     seconds = []
-    for dtype in (th.float32, th.bfloat16)[: len(PRECISIONS)]:
+    for dtype in (th.float32, th.bfloat16) if "bf16" in PRECISIONS else (th.float32,):
         made = [th.randn(shape).to(dtype) for shape in ((BATCH_SIZE, *inputs), weight, (BATCH_SIZE, *outputs))]
         made = [each.contiguous(memory_format=th.channels_last) if each.dim() == 4 else each for each in made]
         for _ in range(20):
