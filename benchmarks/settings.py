@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import FEATURES, PlainSacAe
+from sb3_cure.fast_ops import conv_transpose_cells, convolve
 from sb3_cure.layers import conv_sizes
 
 
@@ -138,7 +139,7 @@ def _block(model: Any) -> Callable[[], object]:
 
 def _floor(setting: Setting) -> Iterator[float]:
     """Seconds of each kind of product in an update of CuRe-RAE with curiosity, times how often it is needed."""
-    sizes, filters = conv_sizes(setting.size, setting.size, 4), setting.filters
+    sizes, filters, bias = conv_sizes(setting.size, setting.size, 4), setting.filters, th.zeros(setting.channels)
     for layer, ((before, _), (after, _)) in enumerate(pairwise(sizes)):
         channels, stride = (setting.channels, 2) if layer == 0 else (filters, 1)
         weight = (filters, channels, 3, 3)
@@ -147,6 +148,8 @@ def _floor(setting: Setting) -> Iterator[float]:
         large, small = (channels, before, before), (filters, after, after)
         forward = _best(lambda x, w, g, s=stride: F.conv2d(x, w, None, s), large, weight, small)
         to_inputs = _best(lambda x, w, g, s=stride: _backward(g, x, w, s, True), large, weight, small)
+        ours = (lambda x, w, g: conv_transpose_cells(g, w, bias)) if layer == 0 else _transposed
+        to_inputs = min(to_inputs, _best(ours, large, weight, small))
         to_weights = _best(lambda x, w, g, s=stride: _backward(g, x, w, s, False), large, weight, small)
         yield 3 * forward + to_weights + (to_inputs if layer > 0 else 0)
         yield to_inputs + forward + to_weights
@@ -164,6 +167,10 @@ def _backward(gradient: th.Tensor, inputs: th.Tensor, weight: th.Tensor, stride:
     return th.ops.aten.convolution_backward(
         gradient, inputs, weight, None, [stride] * 2, [0, 0], [1, 1], False, [0, 0], 1, mask
     )
+
+
+def _transposed(inputs: th.Tensor, weight: th.Tensor, gradient: th.Tensor) -> th.Tensor:
+    return convolve(gradient, weight, transposed=True)
 
 
 def _product(inputs: int, outputs: int) -> float:

@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_cure.layers import (
+    Conv2d,
     FlattenImage,
     FullPrecision,
     Projection,
@@ -89,10 +90,9 @@ class PixelEncoder(Encoder):
         super().__init__(observation_space, features_dim, trunk_dim=n_filters * height * width)
         self.n_filters = n_filters
         self.n_layers = n_layers
-        layers: list[nn.Module] = []
-        for layer in range(n_layers):
-            channels, stride = (shape[0], 2) if layer == 0 else (n_filters, 1)
-            layers += [nn.Conv2d(channels, n_filters, 3, stride), nn.ReLU(inplace=True)]
+        layers: list[nn.Module] = [nn.Conv2d(shape[0], n_filters, 3, stride=2), nn.ReLU(inplace=True)]
+        for _ in range(n_layers - 1):
+            layers += [Conv2d(n_filters, n_filters, 3), nn.ReLU(inplace=True)]
         self.trunk = nn.Sequential(*layers, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)

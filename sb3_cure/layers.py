@@ -9,9 +9,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
-from torch.nn import functional
 
-from sb3_cure.fast_ops import add_bias
+from sb3_cure.fast_ops import add_bias, convolve
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -165,6 +164,17 @@ def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
         return inputs.float()
 
 
+class Conv2d(nn.Conv2d):
+    """torch's convolution of stride 1, without padding."""
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """
+        :param images: In NHWC memory order, [B, in_channels, H, W]
+        :return: [B, out_channels, H', W']
+        """
+        return convolve(images, self.weight, self.bias)
+
+
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
     """torch's transposed convolution of stride 1, and a ReLU. The bias is added afterwards: inside, oneDNN's bias
     gradient costs as much as that of the weights."""
@@ -175,7 +185,7 @@ class ConvTranspose2dReLU(nn.ConvTranspose2d):
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        return add_bias(functional.conv_transpose2d(images, self.weight), self.bias, relu=True)  # type: ignore[arg-type]
+        return add_bias(convolve(images, self.weight, transposed=True), self.bias, relu=True)  # type: ignore[arg-type]
 
 
 class FlattenImage(nn.Module):

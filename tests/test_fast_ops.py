@@ -1,6 +1,7 @@
 """Kernels written for speed against their plain twins: values, and the gradients of all that they read."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -9,8 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn import functional as F
 
-from sb3_cure import layers
-from sb3_cure.fast_ops import SquaredError, add_bias, conv_transpose_cells, from_cells, random_bytes_like, to_cells
+from sb3_cure import fast_ops, layers
+from sb3_cure.fast_ops import (
+    SquaredError,
+    add_bias,
+    conv_transpose_cells,
+    convolve,
+    from_cells,
+    random_bytes_like,
+    to_cells,
+)
 from sb3_cure.layers import ConvTranspose2dReLU, EnsembleLinear, run_mlp
 
 sizes = st.integers(1, 9)
@@ -57,6 +66,37 @@ def test_cells_are_pixels_in_another_order(batch: int, channels: int, height: in
         for column in (0, 1):
             first = (2 * row + column) * channels
             assert th.equal(cells[:, first : first + channels], images[:, :, row::2, column::2])
+
+
+@given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes, k=st.integers(1, 3))
+@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("few", [1, 4])
+@settings(max_examples=20, deadline=None)
+def test_convolution(
+    transposed: bool, few: int, batch: int, channels: int, drawn: int, height: int, width: int, k: int
+) -> None:
+    plain = F.conv_transpose2d if transposed else F.conv2d
+    images = tensor(batch, channels, height + 2, width + 2)
+    weight = tensor(*((channels, drawn) if transposed else (drawn, channels)), k, k, seed=1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fast_ops, "FEW_CHANNELS", few)
+        agree(lambda *args: convolve(*args, transposed=transposed), plain, images, weight, tensor(drawn, seed=2))
+        agree(lambda *args: convolve(*args, transposed=transposed), plain, images, weight)
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_convolution_within_autocast(transposed: bool) -> None:
+    """As torch's own: computed in bf16, gradients in the number format of what they are of."""
+    results = []
+    for function in (partial(convolve, transposed=transposed), F.conv_transpose2d if transposed else F.conv2d):
+        inputs = [tensor(*shape, dtype=th.float32).requires_grad_() for shape in ((2, 4, 9, 9), (4, 4, 3, 3), (4,))]
+        with th.autocast("cpu", th.bfloat16):
+            value = function(*inputs)
+        value.float().square().sum().backward()
+        results.append([value, *(each.grad for each in inputs)])
+    for mine, theirs in zip(*results, strict=True):
+        assert mine.dtype == theirs.dtype
+        th.testing.assert_close(mine, theirs, rtol=0.02, atol=0.02 * float(theirs.detach().abs().max()))
 
 
 @given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes)

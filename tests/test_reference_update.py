@@ -17,6 +17,8 @@ from sb3_cure.layers import Projection, conv_sizes
 from sb3_cure.srl import autoencoder
 
 SIZE, FILTERS, HIDDEN, BATCH = 36, 4, 16, 8
+#: Adam's epsilon: with its default a gradient that is rounding alone makes a whole step, which way differs by processor
+EPSILON = 1e-4
 LAST, _ = conv_sizes(SIZE, SIZE, 4)[-1]
 Layer = nn.Linear | nn.Conv2d | nn.ConvTranspose2d | nn.LayerNorm
 
@@ -121,7 +123,11 @@ def test_sequential_updates_are_the_references(
         learning_starts=40,
         warmup_updates=0,
         buffer_size=100,
-        policy_kwargs=dict(net_arch=[HIDDEN, HIDDEN], features_extractor_kwargs=dict(n_filters=FILTERS)),
+        policy_kwargs=dict(
+            net_arch=[HIDDEN, HIDDEN],
+            features_extractor_kwargs=dict(n_filters=FILTERS),
+            optimizer_kwargs=dict(eps=EPSILON),
+        ),
         seed=0,
     )
     model.learn(40)  # random actions
@@ -129,6 +135,10 @@ def test_sequential_updates_are_the_references(
     channels, actions = model.observation_space.shape[0], model.action_space.shape[0]
     plain = reference(channels, actions, HIDDEN, size=SIZE, filters=FILTERS, decoder_first=True)
     copy_weights(model, plain)
+    for name, optimizer in vars(plain).items():
+        if name.endswith("_optimizer") and name != "alpha_optimizer":
+            # Its critics' loss is twice SB3's.
+            optimizer.param_groups[0]["eps"] = EPSILON * (2 if name == "critic_optimizer" else 1)
     # The only noise that the two would draw otherwise.
     monkeypatch.setattr(autoencoder, "random_bytes_like", lambda images: th.full_like(images, 99))
     monkeypatch.setattr(plain, "dither", lambda images: th.full_like(images, 99.5 / 256))
@@ -149,4 +159,4 @@ def test_sequential_updates_are_the_references(
         }
         expected = {name: float(loss) for name, loss in plain.losses.items()}
         expected["temperature"] = float(plain.log_alpha.detach().exp())
-        assert found == pytest.approx(expected, rel=1e-3), update
+        assert found == pytest.approx(expected, rel=1e-5), update
