@@ -181,9 +181,11 @@ def _images(space: spaces.Space, name: str) -> spaces.Space:
 
 
 def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:
-    """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, as one gather (the quickest way on uint8)."""
-    batch, channels, _, width = images.shape
-    rows, columns = rows.to(images.device), columns.to(images.device)
-    index = (rows[:, :, None] * width + columns[:, None, :]).view(batch, 1, -1)
-    windows = images.flatten(2).gather(2, index.expand(-1, channels, -1))
-    return windows.view(batch, channels, rows.shape[1], columns.shape[1])
+    """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, in NHWC memory order: whole rows first."""
+    batch, channels, height, width = images.shape
+    starts = th.arange(batch)[:, None] * height
+    bytes_of_columns = columns[:, :, None] * channels + th.arange(channels)
+    picked = images.permute(0, 2, 3, 1).reshape(batch * height, -1)
+    picked = picked.index_select(0, (starts + rows).flatten().to(images.device)).view(batch, -1, width * channels)
+    index = bytes_of_columns.view(batch, 1, -1).to(images.device).expand(-1, rows.shape[1], -1)
+    return picked.gather(2, index).view(batch, *rows.shape[1:], *columns.shape[1:], channels).permute(0, 3, 1, 2)

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_cure.layers import (
-    Conv2d,
+    Conv2dReLU,
     FlattenImage,
     FullPrecision,
     Projection,
@@ -90,10 +90,9 @@ class PixelEncoder(Encoder):
         super().__init__(observation_space, features_dim, trunk_dim=n_filters * height * width)
         self.n_filters = n_filters
         self.n_layers = n_layers
-        layers: list[nn.Module] = [nn.Conv2d(shape[0], n_filters, 3, stride=2), nn.ReLU(inplace=True)]
-        for _ in range(n_layers - 1):
-            layers += [Conv2d(n_filters, n_filters, 3), nn.ReLU(inplace=True)]
-        self.trunk = nn.Sequential(*layers, FlattenImage())
+        first = Conv2dReLU(shape[0], n_filters, 3, stride=2)
+        further = (Conv2dReLU(n_filters, n_filters, 3) for _ in range(n_layers - 1))
+        self.trunk = nn.Sequential(first, *further, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)
         # NHWC kernels are the fast ones for convolutions on CPU and GPU; the values are the same.

@@ -7,11 +7,13 @@ from torch.nn import functional as F
 
 #: Up to so many channels a transposed convolution is faster as a plain one of the padded images
 FEW_CHANNELS = 16
+#: Bits of minus infinity in bf16, read as an integer: of negative numbers those that are none (NaN) are above
+MINUS_INFINITY = -128
 
 
-def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, transposed: bool) -> th.Tensor:
+def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, stride: int, transposed: bool) -> th.Tensor:
     if not transposed:
-        return F.conv2d(images, weight, bias)
+        return F.conv2d(images, weight, bias, stride)
     if images.device.type != "cpu" or images.shape[1] > FEW_CHANNELS:
         return F.conv_transpose2d(images, weight, bias)
     border = weight.shape[-1] - 1
@@ -19,22 +21,54 @@ def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, tran
     return F.conv2d(F.pad(images, (border,) * 4), weight.flip(2, 3).transpose(0, 1), bias)
 
 
+def _as_integers(images: th.Tensor) -> th.Tensor:
+    """The bits of bf16, which a CPU compares as integers several times as fast; other formats as they are."""
+    is_slow = images.dtype == th.bfloat16 and images.device.type == "cpu" and not th.compiler.is_compiling()
+    return images.view(th.int16) if is_slow else images
+
+
+def relu_(images: th.Tensor) -> th.Tensor:
+    """ReLU in place; what is not a number stays so.
+
+    :param images: Any shape
+    :return: The same tensor
+    """
+    bits = _as_integers(images)
+    th.threshold_(bits, 0 if bits is images else MINUS_INFINITY, 0)
+    return images
+
+
+def relu_backward(gradient: th.Tensor, images: th.Tensor) -> th.Tensor:
+    """
+    :param gradient: Of the result, in its number format
+    :param images: Result of ``relu_``
+    :return: Gradient of what it was given
+    """
+    bits = th.ops.aten.threshold_backward(_as_integers(gradient), _as_integers(images), 0)
+    return bits.view(gradient.dtype)
+
+
 class Convolution(th.autograd.Function):
-    """Convolution of stride 1, or its transpose: the gradient of the images is the respective other one. oneDNN takes
-    half as long again for the transposed one in bf16, if channels are few."""
+    """Convolution or, of stride 1, its transpose, with a ReLU or without: the gradient at the images of either is the
+    other one. oneDNN takes half as long again for the transposed one in bf16, if channels are few."""
 
     @staticmethod
-    def forward(ctx: Any, images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, transposed: bool) -> th.Tensor:
-        """
-        :param images: In NHWC memory order, [B, C, H, W]
-        :param weight: Square kernels in the images' number format; [C', C, k, k], transposed [C, C', k, k]
-        :param bias: [C']
-        :param transposed: Whether it is the transpose
-        :return: [B, C', H', W']
-        """
-        ctx.save_for_backward(images, weight)
-        ctx.transposed, ctx.bias = transposed, bias is not None
-        return _convolve(images, weight, bias, transposed)
+    def forward(
+        ctx: Any,
+        images: th.Tensor,
+        weight: th.Tensor,
+        bias: th.Tensor | None,
+        stride: int,
+        transposed: bool,
+        relu: bool,
+    ) -> th.Tensor:
+        """Parameters as of ``convolve``, all in one number format."""
+        result = _convolve(images, weight, bias, stride, transposed)
+        if relu:
+            relu_(result)
+        ctx.save_for_backward(images, weight, result if relu else None)
+        ctx.stride, ctx.transposed = stride, transposed
+        return result
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
@@ -42,45 +76,41 @@ class Convolution(th.autograd.Function):
         :param gradient: [B, C', H', W']
         :return: Gradients of images, weight and bias
         """
-        images, weight = ctx.saved_tensors
-        of_images = _convolve(gradient, weight, None, not ctx.transposed) if ctx.needs_input_grad[0] else None
-        _, of_weight, of_bias = th.ops.aten.convolution_backward(
-            *(gradient, images, weight, weight.shape[:1], [1, 1], [0, 0], [1, 1], ctx.transposed, [0, 0], 1),
-            [False, True, ctx.bias],
+        images, weight, result = ctx.saved_tensors
+        if result is not None:
+            gradient = relu_backward(gradient, result)
+        by_images, by_weight, by_bias, *_ = ctx.needs_input_grad
+        sizes = [ctx.stride] * 2, [0, 0], [1, 1], ctx.transposed, [0, 0], 1
+        of_images, of_weight, _ = th.ops.aten.convolution_backward(
+            gradient, images, weight, None, *sizes, [by_images and ctx.stride > 1, by_weight, False]
         )
-        return of_images, of_weight, of_bias, None
+        if by_images and ctx.stride == 1:
+            of_images = _convolve(gradient, weight, None, 1, not ctx.transposed)
+        # Inside of the transposed one, the bias's gradient costs as much as that of the weights.
+        return of_images, of_weight, gradient.sum((0, 2, 3)) if by_bias else None, None, None, None
 
 
 def convolve(
-    images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None, transposed: bool = False
+    images: th.Tensor,
+    weight: th.Tensor,
+    bias: th.Tensor | None = None,
+    stride: int = 1,
+    transposed: bool = False,
+    relu: bool = False,
 ) -> th.Tensor:
     """
     :param images: In NHWC memory order, [B, C, H, W]
     :param weight: Square kernels, [C', C, k, k], transposed [C, C', k, k]
     :param bias: [C']
+    :param stride: 1 if transposed
     :param transposed: Whether it is the transpose
+    :param relu: Whether a ReLU follows
     :return: ``conv2d``, or ``conv_transpose2d``, within autocast in its number format, [B, C', H', W']
     """
     device = images.device.type
     dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else images.dtype
-    bias = None if bias is None else bias.to(dtype)
-    return Convolution.apply(images.to(dtype), weight.to(dtype), bias, transposed)  # type: ignore[no-any-return]
-
-
-def add_bias(images: th.Tensor, bias: th.Tensor, relu: bool = False) -> th.Tensor:
-    """``images + bias`` for each channel. Repeated over an image, the bias is added in long runs: torch's own broadcast
-    over the few channels of NHWC images costs ten times as much in bf16.
-
-    :param images: In NHWC memory order, [B, C, H, W]
-    :param bias: [C]
-    :param relu: Whether a ReLU follows
-    :return: [B, C, H, W]
-    """
-    batch, channels, height, width = images.shape
-    flat = images.permute(0, 2, 3, 1).reshape(batch, -1)
-    biased = flat + bias.to(images.dtype).repeat(height * width)
-    biased = biased.relu_() if relu else biased
-    return biased.view(batch, height, width, channels).permute(0, 3, 1, 2)
+    cast = [tensor if tensor is None else tensor.to(dtype) for tensor in (images, weight, bias)]
+    return Convolution.apply(*cast, stride, transposed, relu)  # type: ignore[no-any-return]
 
 
 def to_cells(images: th.Tensor) -> th.Tensor:
@@ -119,7 +149,7 @@ def conv_transpose_cells(images: th.Tensor, weight: th.Tensor, bias: th.Tensor) 
     taps = th.tensor([[0, 2], [1, 3]], device=weight.device)  # by pixel of the cell and input; row 3 is empty
     kernel = F.pad(weight, (0, 1, 0, 1))[:, :, taps[:, None, :, None], taps[None, :, None, :]]
     kernel = kernel.permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
-    return add_bias(convolve(images, kernel, transposed=True), bias.repeat(4))
+    return convolve(images, kernel, bias.repeat(4), transposed=True)
 
 
 class SquaredError(th.autograd.Function):

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
 
-from sb3_cure.fast_ops import add_bias, convolve
+from sb3_cure.fast_ops import convolve
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
@@ -164,20 +164,19 @@ def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
         return inputs.float()
 
 
-class Conv2d(nn.Conv2d):
-    """torch's convolution of stride 1, without padding."""
+class Conv2dReLU(nn.Conv2d):
+    """torch's convolution without padding, and a ReLU."""
 
     def forward(self, images: th.Tensor) -> th.Tensor:
         """
         :param images: In NHWC memory order, [B, in_channels, H, W]
         :return: [B, out_channels, H', W']
         """
-        return convolve(images, self.weight, self.bias)
+        return convolve(images, self.weight, self.bias, self.stride[0], relu=True)
 
 
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
-    """torch's transposed convolution of stride 1, and a ReLU. The bias is added afterwards: inside, oneDNN's bias
-    gradient costs as much as that of the weights."""
+    """torch's transposed convolution of stride 1, and a ReLU."""
 
     def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
         """
@@ -185,7 +184,7 @@ class ConvTranspose2dReLU(nn.ConvTranspose2d):
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
-        return add_bias(convolve(images, self.weight, transposed=True), self.bias, relu=True)  # type: ignore[arg-type]
+        return convolve(images, self.weight, self.bias, transposed=True, relu=True)
 
 
 class FlattenImage(nn.Module):

@@ -412,7 +412,7 @@ class CuRePolicy(BasePolicy):
         """
         fields = sampled._asdict()
         for name in ("observations", "next_observations"):
-            fields[name] = self.sense(fields[name])
+            fields[name] = _channels_last(self.sense(fields[name]))
         see = self.views if random else self.augmentation.center
         return Samples(**{**fields, "views": see(fields["observations"])})
 

@@ -15,14 +15,14 @@ from envs_for_tests import PixelBox, VectorBox, differences, gradients_of_an_upd
 from torch._dynamo.utils import counters
 
 from sb3_cure import CuReSAC
-from sb3_cure.layers import ConvTranspose2dReLU, Projection
+from sb3_cure.layers import Conv2dReLU, ConvTranspose2dReLU, Projection
 
 needs_compiler = pytest.mark.skipif(
     shutil.which(os.environ.get("CXX", "g++")) is None, reason="torch.compile needs a C++ compiler"
 )
 IMAGES = np.random.default_rng(0).integers(0, 256, (3, 6, 36, 36), dtype=np.uint8)
 #: What an eager update runs in Python
-FORWARDS = {cls.forward.__code__: cls.__name__ for cls in (th.nn.Conv2d, ConvTranspose2dReLU, Projection)}
+FORWARDS = {cls.forward.__code__: cls.__name__ for cls in (Conv2dReLU, ConvTranspose2dReLU, Projection)}
 
 
 def run_in_python(model: CuReSAC) -> set[str]:

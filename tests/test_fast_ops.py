@@ -1,5 +1,6 @@
 """Kernels written for speed against their plain twins: values, and the gradients of all that they read."""
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,14 +14,15 @@ from torch.nn import functional as F
 from sb3_cure import fast_ops, layers
 from sb3_cure.fast_ops import (
     SquaredError,
-    add_bias,
     conv_transpose_cells,
     convolve,
     from_cells,
     random_bytes_like,
+    relu_,
+    relu_backward,
     to_cells,
 )
-from sb3_cure.layers import ConvTranspose2dReLU, EnsembleLinear, run_mlp
+from sb3_cure.layers import Conv2dReLU, ConvTranspose2dReLU, EnsembleLinear, run_mlp
 
 sizes = st.integers(1, 9)
 
@@ -43,18 +45,6 @@ def agree(fast: Callable[..., th.Tensor], plain: Callable[..., th.Tensor], *inpu
         th.testing.assert_close(mine, theirs)
 
 
-@given(batch=sizes, channels=sizes, height=sizes, width=sizes, relu=st.booleans())
-@settings(max_examples=30, deadline=None)
-def test_bias_of_channels(batch: int, channels: int, height: int, width: int, relu: bool) -> None:
-    def plain(images: th.Tensor, bias: th.Tensor) -> th.Tensor:
-        biased = images + bias.view(-1, 1, 1)
-        return biased.relu() if relu else biased
-
-    images, bias = tensor(batch, channels, height, width), tensor(channels, seed=1)
-    agree(lambda x, b: add_bias(x, b, relu), plain, images, bias)
-    assert add_bias(images, bias, relu).is_contiguous(memory_format=th.channels_last)
-
-
 @given(batch=sizes, channels=sizes, height=sizes, width=sizes)
 @settings(max_examples=30, deadline=None)
 def test_cells_are_pixels_in_another_order(batch: int, channels: int, height: int, width: int) -> None:
@@ -68,20 +58,33 @@ def test_cells_are_pixels_in_another_order(batch: int, channels: int, height: in
             assert th.equal(cells[:, first : first + channels], images[:, :, row::2, column::2])
 
 
-@given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes, k=st.integers(1, 3))
-@pytest.mark.parametrize("transposed", [False, True])
+@given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes, k=st.integers(1, 3), relu=st.booleans())
 @pytest.mark.parametrize("few", [1, 4])
+@pytest.mark.parametrize(("stride", "transposed"), [(1, False), (2, False), (1, True)])
 @settings(max_examples=20, deadline=None)
 def test_convolution(
-    transposed: bool, few: int, batch: int, channels: int, drawn: int, height: int, width: int, k: int
+    stride: int,
+    transposed: bool,
+    few: int,
+    batch: int,
+    channels: int,
+    drawn: int,
+    height: int,
+    width: int,
+    k: int,
+    relu: bool,
 ) -> None:
-    plain = F.conv_transpose2d if transposed else F.conv2d
+    def plain(*args: th.Tensor) -> th.Tensor:
+        result = (F.conv_transpose2d if transposed else F.conv2d)(*args, stride=stride)
+        return result.relu() if relu else result
+
     images = tensor(batch, channels, height + 2, width + 2)
     weight = tensor(*((channels, drawn) if transposed else (drawn, channels)), k, k, seed=1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fast_ops, "FEW_CHANNELS", few)
-        agree(lambda *args: convolve(*args, transposed=transposed), plain, images, weight, tensor(drawn, seed=2))
-        agree(lambda *args: convolve(*args, transposed=transposed), plain, images, weight)
+        fast = partial(convolve, stride=stride, transposed=transposed, relu=relu)
+        agree(fast, plain, images, weight, tensor(drawn, seed=2))
+        agree(fast, plain, images, weight)
 
 
 @pytest.mark.parametrize("transposed", [False, True])
@@ -92,11 +95,25 @@ def test_convolution_within_autocast(transposed: bool) -> None:
         inputs = [tensor(*shape, dtype=th.float32).requires_grad_() for shape in ((2, 4, 9, 9), (4, 4, 3, 3), (4,))]
         with th.autocast("cpu", th.bfloat16):
             value = function(*inputs)
+        assert value.is_contiguous(memory_format=th.channels_last)
         value.float().square().sum().backward()
         results.append([value, *(each.grad for each in inputs)])
     for mine, theirs in zip(*results, strict=True):
         assert mine.dtype == theirs.dtype
         th.testing.assert_close(mine, theirs, rtol=0.02, atol=0.02 * float(theirs.detach().abs().max()))
+
+
+def test_relu_of_bf16_is_torchs() -> None:
+    """All numbers that there are; what is none stays none, and has no gradient of another."""
+    every = th.arange(-(2**15), 2**15).to(th.int16).view(th.bfloat16)
+    theirs = every.clone().requires_grad_()
+    expected = theirs.relu()
+    found = relu_(every.clone())
+    th.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
+    gradient = tensor(*every.shape, dtype=th.bfloat16)
+    expected.backward(gradient)
+    numbers = ~every.isnan()
+    assert th.equal(relu_backward(gradient, found)[numbers], theirs.grad[numbers])
 
 
 @given(batch=sizes, channels=sizes, drawn=sizes, height=sizes, width=sizes)
@@ -109,19 +126,13 @@ def test_transposed_convolution_by_cells(batch: int, channels: int, drawn: int, 
     agree(lambda *args: from_cells(conv_transpose_cells(*args)), plain, *inputs)
 
 
-def test_transposed_convolution_with_relu() -> None:
-    layer = ConvTranspose2dReLU(4, 5, 3).double()
-
-    def plain(images: th.Tensor) -> th.Tensor:
-        return F.conv_transpose2d(images, layer.weight, layer.bias).relu()
-
-    agree(layer, plain, tensor(2, 4, 6, 7))
-
-
-def test_what_is_not_a_number_shows_after_a_transposed_convolution() -> None:
-    layer = ConvTranspose2dReLU(4, 5, 3)
-    layer.weight.data[0] = th.nan
-    assert layer(tensor(1, 4, 9, 9).float()).isnan().any()
+@pytest.mark.parametrize("layer", [Conv2dReLU(4, 5, 3), ConvTranspose2dReLU(4, 5, 3)])
+@pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
+@pytest.mark.parametrize("bad", [th.nan, -th.nan])
+def test_what_is_not_a_number_shows_after_a_relu(layer: th.nn.Module, dtype: th.dtype, bad: float) -> None:
+    layer = copy.deepcopy(layer).to(dtype)
+    layer.bias.data[0] = bad
+    assert layer(tensor(1, 4, 9, 9, dtype=dtype)).isnan().any()
 
 
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
