@@ -1,13 +1,14 @@
 """Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
+import minari
 import numpy as np
 import pytest
 from envs_for_tests import Cliff, PixelBox, VectorBox, differences, state_of, tiny_model
+from minari.data_collector import EpisodeBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -79,16 +80,34 @@ def test_several_environments_share_the_episodes(tmp_path: Path) -> None:
         model.load_transitions(tmp_path)
 
 
-def test_objects_of_minari_are_read() -> None:
-    """By their attributes, in float64 as most of its datasets have them."""
-    rng = np.random.default_rng(0)
-    episode = SimpleNamespace(
-        id=0, observations=rng.uniform(-1, 1, (6, 2)), actions=rng.uniform(-1, 1, (5, 2)), rewards=rng.normal(size=5),
-        terminations=np.zeros(5, bool), truncations=np.arange(5) == 4, infos={},
+@pytest.mark.parametrize("make", [VectorBox, PixelBox, lambda: SimpleMultiObsEnv(discrete_actions=False)])
+def test_datasets_of_minari_are_read(make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Minari writes and loads them: the same transitions as from files of our own."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    env = record(make, tmp_path / "ours", 12)
+    episodes = [load_episode(path) for path in sorted((tmp_path / "ours").glob("*.npz"))]
+    buffers = [
+        EpisodeBuffer(
+            observations=episode.observations,
+            actions=list(episode.actions),
+            rewards=[float(reward) for reward in episode.rewards],
+            terminations=list(episode.terminations),
+            truncations=list(episode.truncations),
+        )
+        for episode in episodes
+    ]
+    minari.create_dataset_from_buffers(
+        "test/random-v0", buffers, observation_space=env.observation_space, action_space=env.action_space,
+        jpeg_encoding=False, data_format="hdf5",
     )  # fmt: skip
-    model = tiny_model("MlpPolicy", VectorBox(), n_steps=3)
-    assert model.load_transitions([episode, episode]) == 10
-    model.learn(15)
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    policy = "CnnPolicy" if make is PixelBox else policy
+    models = [tiny_model(policy, make(), srl=None, curiosity=None) for _ in range(2)]
+    assert models[0].load_transitions(tmp_path / "ours") == 12
+    assert models[1].load_transitions(minari.load_dataset("test/random-v0")) == 12
+    rows = np.arange(12), np.zeros(12, int)
+    ours, theirs = (transitions(model.replay_buffer, *rows) for model in models)
+    assert not differences(ours._asdict(), theirs._asdict())
 
 
 def test_dictionaries_keep_their_keys(tmp_path: Path) -> None:
