@@ -20,6 +20,7 @@ from stable_baselines3.common.utils import get_device
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.experiments.files import cpu_info, processor
 from sb3_cure.precision import has_fast_bf16
 
 Times = dict[str, list[float]]
@@ -91,25 +92,19 @@ def anonymous_memory_mb() -> float:
     return (memory.rss - memory.shared) / 2**20
 
 
-def _processor(field: str = "model name") -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            return next(line.split(":")[1].strip() for line in file if line.startswith(field))
-    except (OSError, StopIteration):
-        return platform.processor()
-
-
 def describe_machine() -> dict[str, Any]:
     """
     :return: What the numbers depend on
     """
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": len(os.sched_getaffinity(0)),
         "torch_threads": th.get_num_threads(),
         "memory_gib": round(psutil.virtual_memory().total / 2**30),
         "instructions": th.backends.cpu.get_cpu_capability(),
-        "bf16_instructions": " ".join(flag for flag in ("avx512_bf16", "amx_bf16") if flag in _processor("flags"))
+        "bf16_instructions": " ".join(
+            flag for flag in ("avx512_bf16", "amx_bf16") if flag in cpu_info().get("flags", "")
+        )
         or None,
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "system": f"{platform.system()} {platform.machine()}",

@@ -31,18 +31,30 @@ def describe_run() -> dict[str, Any]:
             "sb3_cure": sb3_cure.__version__,
             **{name: version(name) for name in _DEPENDENCIES},
         },
-        "machine": f"{_processor()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
+        "machine": f"{processor()}, {th.get_num_threads()} threads, {th.backends.cpu.get_cpu_capability()}",
         "gpu": th.cuda.get_device_name() if th.cuda.is_available() else None,
         "commit": _COMMIT,
     }
 
 
-def _processor() -> str:
-    """Its model where Linux tells, else its architecture."""
+def cpu_info() -> dict[str, str]:
+    """
+    :return: What Linux tells of the first processor, by field; empty elsewhere
+    """
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    lines = info.read_text().split("\n\n")[0].splitlines() if info.exists() else []
+    return {name.strip(): value.strip() for name, value in (line.split(":", 1) for line in lines)}
+
+
+def processor() -> str:
+    """
+    :return: Its name, and the numbers that tell its generation: some of several generations bear one name
+    """
+    info = cpu_info()
+    if "model name" not in info:
+        return platform.machine()
+    numbers = [f"{field.removeprefix('cpu ')} {info[field]}" for field in ("cpu family", "model") if field in info]
+    return ", ".join([info["model name"], *numbers])
 
 
 def code_commit() -> str | None:
