@@ -181,11 +181,13 @@ def _images(space: spaces.Space, name: str) -> spaces.Space:
 
 
 def _windows(images: th.Tensor, rows: th.Tensor, columns: th.Tensor) -> th.Tensor:
-    """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, in NHWC memory order: whole rows first."""
+    """images[b, c, rows[b, i], columns[b, j]] for all b, c, i, j, in NHWC memory order. First rows are picked, each as
+    one block of memory, then columns within them."""
     batch, channels, height, width = images.shape
-    starts = th.arange(batch)[:, None] * height
-    bytes_of_columns = columns[:, :, None] * channels + th.arange(channels)
-    picked = images.permute(0, 2, 3, 1).reshape(batch * height, -1)
-    picked = picked.index_select(0, (starts + rows).flatten().to(images.device)).view(batch, -1, width * channels)
-    index = bytes_of_columns.view(batch, 1, -1).to(images.device).expand(-1, rows.shape[1], -1)
-    return picked.gather(2, index).view(batch, *rows.shape[1:], *columns.shape[1:], channels).permute(0, 3, 1, 2)
+    rows, columns = rows.to(images.device), columns.to(images.device)
+    rows_of_all = rows + height * th.arange(batch, device=images.device)[:, None]
+    picked = images.permute(0, 2, 3, 1).reshape(batch * height, -1).index_select(0, rows_of_all.flatten())
+    pixels = channels * columns[:, :, None] + th.arange(channels, device=images.device)
+    index = pixels.view(batch, 1, -1).expand(-1, rows.shape[1], -1)
+    windows = picked.view(batch, -1, width * channels).gather(2, index)
+    return windows.view(batch, rows.shape[1], columns.shape[1], channels).permute(0, 3, 1, 2)

@@ -40,8 +40,8 @@ class Samples(NamedTuple):
     A batch of B transitions, as heads, intrinsic rewards and critics get it.
 
     The first fields are those of SB3's ``ReplayBufferSamples``. Observations are as stored: images uint8 in 0-255,
-    channels first, in NHWC memory order; vectors float32; dictionaries of both by key (those without images are one
-    vector here).
+    channels first; vectors float32; dictionaries of both by key (those without images are one vector here). Images lie
+    in NHWC memory order, of which ``flatten`` and ``reshape`` make vectors, but ``view`` cannot.
 
     :param observations: What the agent saw, [B, *shape]
     :param actions: What it did, scaled to [-1, 1], float32 [B, action_dim]

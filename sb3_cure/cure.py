@@ -655,9 +655,8 @@ class CuRe(OffPolicyAlgorithm):
         """Gradients of the optimiser's parameters, and of nothing else but ``also``; a look at them; its step."""
         inputs = list(also)
         if optimizer is not None:
+            optimizer.zero_grad()
             inputs += [p for group in optimizer.param_groups for p in group["params"] if p.requires_grad]
-        for tensor in inputs:
-            tensor.grad = None
         if inputs:
             loss.backward(inputs=inputs)
         self._guard.step(name, loss, optimizer, inputs)

@@ -42,6 +42,7 @@ class DeterministicActor(nn.Module):
             self.register_buffer(name, bound)
         self.train(False)
 
+    @th.no_grad()
     def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """
         :param observations: As the agent sees them, [B, *shape], or a dictionary: images uint8, channels first

@@ -7,7 +7,7 @@ from torch.nn import functional as F
 
 #: Up to so many channels a transposed convolution is faster as a plain one of the padded images
 FEW_CHANNELS = 16
-#: Bits of minus infinity in bf16, read as an integer: of negative numbers those that are none (NaN) are above
+#: The bits of minus infinity in bf16, as an integer. Those of all negative numbers are below, those of NaNs are not
 MINUS_INFINITY = -128
 
 
@@ -17,7 +17,7 @@ def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, stri
     if images.device.type != "cpu" or images.shape[1] > FEW_CHANNELS:
         return F.conv_transpose2d(images, weight, bias)
     border = weight.shape[-1] - 1
-    # Padded here and not by the convolution, which would take as long as a transposed one
+    # With the argument `padding` oneDNN would be as slow as for the transposed one.
     return F.conv2d(F.pad(images, (border,) * 4), weight.flip(2, 3).transpose(0, 1), bias)
 
 
@@ -71,7 +71,8 @@ class Convolution(th.autograd.Function):
         return result
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
+    @th.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """
         :param gradient: [B, C', H', W']
         :return: Gradients of images, weight and bias
@@ -108,9 +109,15 @@ def convolve(
     :return: ``conv2d``, or ``conv_transpose2d``, within autocast in its number format, [B, C', H', W']
     """
     device = images.device.type
-    dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else images.dtype
-    cast = [tensor if tensor is None else tensor.to(dtype) for tensor in (images, weight, bias)]
-    return Convolution.apply(*cast, stride, transposed, relu)  # type: ignore[no-any-return]
+    if th.is_autocast_enabled(device):
+        dtype = th.get_autocast_dtype(device)
+        cast = [each if each is None or each.dtype != th.float32 else each.to(dtype) for each in (images, weight, bias)]
+        images, weight, bias = cast  # type: ignore[assignment]
+    if th.is_grad_enabled():
+        return Convolution.apply(images, weight, bias, stride, transposed, relu)  # type: ignore[no-any-return]
+    # Exports can follow these, but no function with a gradient of its own.
+    result = _convolve(images, weight, bias, stride, transposed)
+    return relu_(result) if relu else result
 
 
 def to_cells(images: th.Tensor) -> th.Tensor:

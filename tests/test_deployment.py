@@ -1,5 +1,6 @@
 """A policy as a plain module: the actions of ``predict``, also when it was traced or exported."""
 
+import io
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,10 @@ def test_actions_are_those_of_predict(name: str) -> None:
     for actor, predict in policies.items():
         expected, _ = predict(observations, deterministic=True)
         module = DeterministicActor(model, actor)
-        traced = th.jit.trace(module, batch)
+        file = io.BytesIO()
+        th.jit.save(th.jit.trace(module, batch), file)
+        file.seek(0)
+        traced = th.jit.load(file)
         exported = th.export.export(module, (batch,)).module()
         for follow in (module, traced, exported):
             with th.no_grad():

@@ -344,6 +344,16 @@ def test_pretrained_extractor_may_be_frozen(update: str) -> None:
     assert changed == {"head", "critic", "actor"}
 
 
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_what_is_frozen_in_training_stays(update: str) -> None:
+    """Also where the last update before left a gradient."""
+    model = tiny_model("CnnPolicy", PixelBox(), update=update).learn(15)
+    frozen = [model.policy.encoder.trunk[0], model.policy.srl.decoder, model.policy.critic.ensemble[0]]
+    before = [parameter.clone() for part in frozen for parameter in part.requires_grad_(False).parameters()]
+    model.learn(5, reset_num_timesteps=False)
+    assert all(map(th.equal, before, (parameter for part in frozen for parameter in part.parameters())))
+
+
 def test_bf16_and_fp32_train_alike() -> None:
     """A few updates from equal weights on equal data: losses differ by bf16's rounding only, parameters stay finite."""
     losses = {}

@@ -104,7 +104,7 @@ def test_convolution_within_autocast(transposed: bool) -> None:
 
 
 def test_relu_of_bf16_is_torchs() -> None:
-    """All numbers that there are; what is none stays none, and has no gradient of another."""
+    """All numbers that there are, and their gradients; what is not a number stays so, whatever its sign."""
     every = th.arange(-(2**15), 2**15).to(th.int16).view(th.bfloat16)
     theirs = every.clone().requires_grad_()
     expected = theirs.relu()
@@ -128,10 +128,9 @@ def test_transposed_convolution_by_cells(batch: int, channels: int, drawn: int, 
 
 @pytest.mark.parametrize("layer", [Conv2dReLU(4, 5, 3), ConvTranspose2dReLU(4, 5, 3)])
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
-@pytest.mark.parametrize("bad", [th.nan, -th.nan])
-def test_what_is_not_a_number_shows_after_a_relu(layer: th.nn.Module, dtype: th.dtype, bad: float) -> None:
+def test_what_is_not_a_number_shows_after_a_relu(layer: th.nn.Module, dtype: th.dtype) -> None:
     layer = copy.deepcopy(layer).to(dtype)
-    layer.bias.data[0] = bad
+    layer.bias.data[0] = th.nan
     assert layer(tensor(1, 4, 9, 9, dtype=dtype)).isnan().any()
 
 
