@@ -16,6 +16,7 @@ from torch import nn
 
 from sb3_cure.buffers import transitions
 from sb3_cure.envs import render_check
+from sb3_cure.layers import Conv2dReLU
 from sb3_cure.policies import CuRePolicy, encoder_of
 from sb3_cure.srl import RAE
 
@@ -271,7 +272,7 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
         peaks[names[module]] = output.transpose(0, 1).flatten(1).amax(dim=1)
 
     names: dict[nn.Module, str] = {
-        module: name for name, module in encoder.named_modules() if isinstance(module, nn.ReLU)
+        module: name for name, module in encoder.named_modules() if isinstance(module, nn.ReLU | Conv2dReLU)
     }
     handles = [module.register_forward_hook(note) for module in names]
     try:

@@ -592,10 +592,11 @@ def _kinds(space: spaces.Space) -> Any:
 
 
 def _channels_last(views: Any) -> Any:
-    """Images in NHWC memory order; vectors as they are."""
+    """Images in NHWC memory order; vectors, and None, as they are."""
     if isinstance(views, dict):
         return {key: _channels_last(view) for key, view in views.items()}
-    return views.contiguous(memory_format=th.channels_last) if views.dim() == 4 else views
+    is_images = isinstance(views, th.Tensor) and views.dim() == 4
+    return views.contiguous(memory_format=th.channels_last) if is_images else views
 
 
 @contextlib.contextmanager

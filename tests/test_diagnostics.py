@@ -185,7 +185,7 @@ def with_dead_units(n_filters: int, n_dead: int) -> CuReSAC:
     kwargs = dict(features_extractor_kwargs=dict(n_filters=n_filters, n_layers=2))
     model = tiny_model("CnnPolicy", PixelBox(), policy_kwargs=kwargs)
     with th.no_grad():
-        model.policy.encoder.trunk[2].bias[:n_dead] = -10  # type: ignore[index, union-attr]
+        model.policy.encoder.trunk[1].bias[:n_dead] = -10  # type: ignore[index, union-attr]
     return model
 
 
@@ -201,7 +201,7 @@ box = functools.partial(tiny_model, "CnnPolicy")
 FAULTS: dict[str, tuple[Any, str, str]] = {
     "camera": (lambda: box(Still()), "constant_image", r"the last 49 observations of environment 0 are"),
     "one camera": (lambda: box(DummyVecEnv([PixelBox, Still])), "constant_image", r"observations of environment 1 are"),
-    "dead": (lambda: with_dead_units(16, 15), "dead_units", r"94% of the units of the encoder's layer 'trunk.3' are 0"),
+    "dead": (lambda: with_dead_units(16, 15), "dead_units", r"94% of the units of the encoder's layer 'trunk.1' are 0"),
     "all dead": (lambda: with_dead_units(4, 4), "dead_units", r"100% of the units"),
     "collapse": (
         lambda: box(PixelBox(), srl=Collapsing, task=False, curiosity_encoder_grad=False),
