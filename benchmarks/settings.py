@@ -148,7 +148,7 @@ def _floor(setting: Setting) -> Iterator[float]:
         large, small = (channels, before, before), (filters, after, after)
         forward = _best(lambda x, w, g, s=stride: F.conv2d(x, w, None, s), large, weight, small)
         to_inputs = _best(lambda x, w, g, s=stride: _backward(g, x, w, s, True), large, weight, small)
-        ours = (lambda x, w, g: conv_transpose_cells(g, w, bias)) if layer == 0 else _transposed
+        ours = (lambda x, w, g: conv_transpose_cells(g, w, bias.to(w.dtype))) if layer == 0 else _transposed
         to_inputs = min(to_inputs, _best(ours, large, weight, small))
         to_weights = _best(lambda x, w, g, s=stride: _backward(g, x, w, s, False), large, weight, small)
         yield 3 * forward + to_weights + (to_inputs if layer > 0 else 0)
