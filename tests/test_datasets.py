@@ -1,6 +1,7 @@
 """Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -108,6 +109,18 @@ def test_datasets_of_minari_are_read(make: Any, tmp_path: Path, monkeypatch: pyt
     rows = np.arange(12), np.zeros(12, int)
     ours, theirs = (transitions(model.replay_buffer, *rows) for model in models)
     assert not differences(ours._asdict(), theirs._asdict())
+
+
+def test_episodes_in_float64_are_read() -> None:
+    """By their attributes, as most datasets of Minari have them; for returns of several steps, too."""
+    rng = np.random.default_rng(0)
+    episode = SimpleNamespace(
+        id=0, observations=rng.uniform(-1, 1, (6, 2)), actions=rng.uniform(-1, 1, (5, 2)), rewards=rng.normal(size=5),
+        terminations=np.zeros(5, bool), truncations=np.arange(5) == 4, infos={},
+    )  # fmt: skip
+    model = tiny_model("MlpPolicy", VectorBox(), n_steps=3)
+    assert model.load_transitions([episode, episode]) == 10
+    model.learn(15)
 
 
 def test_dictionaries_keep_their_keys(tmp_path: Path) -> None:

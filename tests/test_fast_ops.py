@@ -126,6 +126,15 @@ def test_transposed_convolution_by_cells(batch: int, channels: int, drawn: int, 
     agree(lambda *args: from_cells(conv_transpose_cells(*args)), plain, *inputs)
 
 
+def test_transposed_convolution_with_relu() -> None:
+    layer = ConvTranspose2dReLU(4, 5, 3).double()
+
+    def plain(images: th.Tensor) -> th.Tensor:
+        return F.conv_transpose2d(images, layer.weight, layer.bias).relu()
+
+    agree(layer, plain, tensor(2, 4, 6, 7))
+
+
 @pytest.mark.parametrize("layer", [Conv2dReLU(4, 5, 3), ConvTranspose2dReLU(4, 5, 3)])
 @pytest.mark.parametrize("dtype", [th.float32, th.bfloat16])
 def test_what_is_not_a_number_shows_after_a_relu(layer: th.nn.Module, dtype: th.dtype) -> None:
