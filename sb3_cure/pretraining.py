@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
@@ -266,7 +268,7 @@ class Pretraining(CuRe):
         if self.curiosity == "bonus":
             policy.scale.forget()  # a bonus is divided by its size, the reward of pretraining by its spread
         if not keeps_transitions:
-            self.replay_buffer.reset()  # type: ignore[union-attr]
+            _empty(self.replay_buffer)  # type: ignore[arg-type]
             if policy.intrinsic is not None:
                 policy.intrinsic.forget()
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
@@ -282,3 +284,10 @@ class Pretraining(CuRe):
             # Draws the initial weights once more; nothing else of it is needed.
             arguments = {**self.policy_kwargs, **self._policy_choices()}
             self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **arguments)
+
+
+def _empty(buffer: ReplayBuffer) -> None:
+    buffer.reset()
+    if isinstance(buffer, HerReplayBuffer):  # which knows its episodes beside that
+        for array in (buffer.ep_start, buffer.ep_length, buffer._current_ep_start):
+            array[:] = 0

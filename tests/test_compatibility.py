@@ -3,6 +3,7 @@
 Most tests do the same with three agents: SB3's own SAC, CuReSAC with everything off, and CuReSAC as it comes.
 """
 
+import copy
 import warnings
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,18 @@ def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
     assert differences(state_of(ours), state_of(theirs)) == []
 
 
+@pytest.mark.parametrize("n_steps", [30, 35], ids=["between episodes", "within one"])
+def test_hindsight_after_pretraining(n_steps: int) -> None:
+    """Of what was collected in pretraining nothing is learned from; ``HerReplayBuffer.reset`` would keep its episodes."""
+    her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=10)
+    model: Any = tiny_model("MultiInputPolicy", Goal(), **her).pretrain(n_steps)
+    buffer = model.replay_buffer
+    buffer.observations["observation"][:] = 7  # wherever it lies
+    model.learn(40)
+    assert buffer.pos == np.sum(buffer.ep_length > 0) == 40
+    assert buffer.sample(200).observations["observation"].max() <= 1
+
+
 class Counting(ReplayBuffer):
     """It counts what it gives."""
 
@@ -283,6 +296,16 @@ def test_n_step_returns(agent: str) -> None:
 
 
 # --------------------------------------------------------------- parameters, environments
+
+
+@OURS
+def test_models_of_the_same_parameters_go_their_own_ways(agent: str) -> None:
+    """What one learns moves nothing of the other, the optimisers' counts among it."""
+    first, second = agent_of(agent, vectors()).learn(30), agent_of(agent, vectors(), seed=9)
+    second.set_parameters(first.get_parameters())
+    before = copy.deepcopy(first.get_parameters())
+    second.learn(30)
+    assert differences(first.get_parameters(), before) == []
 
 
 @AGENTS

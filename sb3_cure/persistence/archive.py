@@ -306,7 +306,10 @@ def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
     """Give moments the strides of their parameters: fused Adam steps both in the order of memory."""
     for parameter, state in optimizer.state.items():
         for key, value in state.items():
-            if not isinstance(value, th.Tensor) or (key in _COUNTS and value.dim() == 0):
+            if not isinstance(value, th.Tensor):
+                continue
+            if key in _COUNTS and value.dim() == 0:
+                state[key] = value.clone()  # fused steps count in place, and it may be another model's
                 continue
             if value.shape != parameter.shape:
                 optimizer.state.clear()  # a fused step would write beyond them
