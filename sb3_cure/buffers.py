@@ -409,11 +409,11 @@ class FrameStackReplayBuffer(SkipsMarked):
         first_kept = self._n_frames + self._max_frames_per_add - self.frame_capacity
         while self._n_valid and self.oldest_frame[(self.pos - self._n_valid) % self.buffer_size] < first_kept:
             self._n_valid -= 1
-        if self.full and self._n_valid < 0.9 * (self.buffer_size - 1):
+        if self._n_valid < 0.9 * ((self.buffer_size if self.full else self.pos) - 1):
             warnings.warn(
                 f"observations of shape {self.obs_shape} are seldom {self.frame_stack} frames of which the last "
                 f"{self.frame_stack - 1} come again, so that frames fill their room before the replay buffer has "
-                f"{self.buffer_size * self.n_envs} transitions: tell their number in "
+                f"{self.buffer_size * self.n_envs} transitions, and older ones are lost: tell their number in "
                 "replay_buffer_kwargs=dict(frame_stack=...), of dictionaries by key.",
                 stacklevel=2,
             )

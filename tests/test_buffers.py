@@ -1,5 +1,6 @@
 """The frame-stack buffer beside SB3's ReplayBuffer on the same stream, and what no buffer may sample."""
 
+import contextlib
 import errno
 import itertools
 import os
@@ -534,6 +535,20 @@ def test_bytes_per_transition(buffer_size: int, frame_stack: int) -> None:
     arrays = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
     assert buffer.nbytes == sum(array.nbytes for array in arrays)
     assert buffer_size * 21_168 < buffer.nbytes <= 1.05 * 21_168 * buffer_size
+
+
+@pytest.mark.parametrize("slides", [True, False], ids=["oldest frame first", "newest frame first"])
+def test_warns_before_frames_that_do_not_slide_cost_transitions(slides: bool) -> None:
+    """Long before the buffer is full: a short training would never hear of it."""
+    buffer = FrameStackReplayBuffer(1000, image_space(3, 1), ACTIONS, "cpu", frame_stack=3)
+    rng, order = np.random.default_rng(0), slice(None) if slides else slice(None, None, -1)
+    frames, zeros = rng.integers(0, 256, (503, 4, 5), dtype=np.uint8), np.zeros(1)
+    caught = contextlib.nullcontext() if slides else pytest.warns(UserWarning, match="seldom 3 frames")
+    with caught:
+        for t in range(500):
+            obs, next_obs = frames[None, t : t + 3][:, order], frames[None, t + 1 : t + 4][:, order]
+            buffer.add(obs, next_obs, np.zeros((1, 2)), zeros, zeros, [{}])
+    assert (buffer.size() == 500) is slides
 
 
 def test_warns_where_memory_will_not_suffice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
