@@ -8,7 +8,7 @@ from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
@@ -19,6 +19,7 @@ from sb3_cure.layers import (
     Projection,
     VectorNorm,
     conv_sizes,
+    full_precision,
     init_weights,
 )
 from sb3_cure.observations import image_spaces
@@ -199,6 +200,31 @@ class DictEncoder(Encoder):
         return DictProjection([encoder.make_projection() for encoder in self.images.values()], self.vector_dim)
 
 
+class ExtractorTrunk(nn.Module):
+    """An SB3 features extractor, which gets images in the memory order in which SB3 gives them (``view`` works on no
+    other), and computes in fp32 if it reads vectors.
+
+    :param extractor: The features extractor
+    """
+
+    def __init__(self, extractor: BaseFeaturesExtractor):
+        super().__init__()
+        self.extractor = extractor
+        self._reads_vectors = not is_image_space(extractor._observation_space)
+
+    def forward(self, observations: Any) -> th.Tensor:
+        """
+        :param observations: Preprocessed observations
+        :return: Features, [B, features_dim]
+        """
+        if not self._reads_vectors:
+            return self.extractor(observations.contiguous())  # type: ignore[no-any-return]
+        parts = observations if isinstance(observations, dict) else {"": observations}
+        with full_precision(next(iter(parts.values()))):
+            parts = {key: part.float().contiguous() for key, part in parts.items()}
+            return self.extractor(parts if isinstance(observations, dict) else parts[""])  # type: ignore[no-any-return]
+
+
 class ExtractorEncoder(Encoder):
     """Any SB3 features extractor as the shared encoder: it is the trunk, and its features are the latents.
 
@@ -207,8 +233,7 @@ class ExtractorEncoder(Encoder):
 
     def __init__(self, extractor: BaseFeaturesExtractor):
         super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
-        sees_images = bool(image_spaces(extractor._observation_space))
-        self.trunk = extractor if sees_images else FullPrecision(extractor)
+        self.trunk = ExtractorTrunk(extractor)
         self.projection = nn.Identity()
 
 

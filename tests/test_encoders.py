@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from hypothesis import given, settings
@@ -190,6 +191,46 @@ class SumOfVector(BaseFeaturesExtractor):
         return self.linear(observations)
 
 
+class Viewing(BaseFeaturesExtractor):
+    """A user's extractor that flattens with ``view``, which SB3's memory order allows."""
+
+    def __init__(self, observation_space: spaces.Space):
+        super().__init__(observation_space, 5)
+        self.convolution = nn.Conv2d(observation_space.shape[0], 2, 3, stride=3)
+        self.linear = nn.Linear(2 * 12 * 12, 5)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        features = self.convolution(observations)
+        return self.linear(features.view(len(features), -1))
+
+
+class ImageAndVector(BaseFeaturesExtractor):
+    """A user's extractor of a dictionary, as SB3's documentation writes it."""
+
+    def __init__(self, observation_space: spaces.Dict):
+        super().__init__(observation_space, 6)
+        self.image = Viewing(observation_space["front"])
+        self.vector = nn.Linear(2, 1)
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        return th.cat([self.image(observations["front"]), self.vector(observations["joints"])], dim=1)
+
+
+def test_vectors_beside_images_reach_an_extractor_in_full_precision() -> None:
+    """.5000 and .5005, which are one number in bf16."""
+    policy_kwargs = {"features_extractor_class": ImageAndVector}
+    env = SensorBox(("front", "joints"))
+    policy = tiny_model("MultiInputPolicy", env, srl="forward", precision="bf16", policy_kwargs=policy_kwargs).policy
+    seen = {
+        "front": th.zeros(2, 6, 36, 36, dtype=th.uint8),
+        "joints": th.tensor([[0.5, 0.5], [0.5005, 0.5]]),
+    }
+    with th.autocast("cpu", th.bfloat16):
+        latents = policy.encode(seen)
+    expected = 0.0005 * policy.encoder.trunk.extractor.vector.weight[0, 0]
+    th.testing.assert_close(latents[1, 5] - latents[0, 5], expected, rtol=1e-2, atol=0)
+
+
 @pytest.mark.parametrize(
     "policy, env, extractor, kwargs, srl_kwargs",
     [
@@ -203,8 +244,9 @@ class SumOfVector(BaseFeaturesExtractor):
             {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 24}},
         ),
         ("MlpPolicy", VectorBox(), SumOfVector, {}, {"srl": "rae"}),
+        ("CnnPolicy", PixelBox(), Viewing, {}, {"srl": "rae"}),
     ],
-    ids=["nature-rae", "nature-curl", "own-curl-crop", "own-vector"],
+    ids=["nature-rae", "nature-curl", "own-curl-crop", "own-vector", "own-view"],
 )
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("update", ["joint", "sequential"])

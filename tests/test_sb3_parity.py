@@ -458,7 +458,7 @@ def test_features_extractor_kwargs(extras: dict[str, Any]) -> None:
     """``features_extractor_class`` and ``features_extractor_kwargs`` reach the network that sees the observations."""
     policy_kwargs = dict(features_extractor_class=BatchNorm, features_extractor_kwargs=dict(dropout=0.25))
     policy = tiny_model("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs, **extras).learn(13).policy
-    extractors = [policy.encoder.trunk[0], policy.encoder_target.trunk[0]] if extras is ON else [
+    extractors = [policy.encoder.trunk.extractor, policy.encoder_target.trunk.extractor] if extras is ON else [
         policy.actor.features_extractor, policy.critic.features_extractor, policy.critic_target.features_extractor
     ]  # fmt: skip
     assert len({id(extractor) for extractor in extractors}) == len(extractors)
@@ -472,8 +472,8 @@ def test_training_and_evaluation_mode(extras: dict[str, Any]) -> None:
     policy_kwargs = dict(features_extractor_class=BatchNorm, features_extractor_kwargs=dict(dropout=0.5))
     model = tiny_model("MlpPolicy", VectorBox(), learning_starts=5, policy_kwargs=policy_kwargs, tau=0.0, **extras)
     extras_on = extras is ON
-    online = model.policy.encoder.trunk[0] if extras_on else model.critic.features_extractor
-    target = model.policy.encoder_target.trunk[0] if extras_on else model.critic_target.features_extractor
+    online = model.policy.encoder.trunk.extractor if extras_on else model.critic.features_extractor
+    target = model.policy.encoder_target.trunk.extractor if extras_on else model.critic_target.features_extractor
     statistics = [extractor.layers[1].running_mean for extractor in (online, target)]
     observation = np.array([0.3, -0.7], np.float32)
     model.learn(25, callback=StopBeforeTraining())

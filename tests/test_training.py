@@ -593,7 +593,7 @@ def test_any_features_extractor_is_the_shared_encoder(srl: str) -> None:
     """SB3's NatureCNN as encoder: shared by all, trained by all, decoded by the autoencoder."""
     policy_kwargs = dict(features_extractor_class=NatureCNN, features_extractor_kwargs=dict(features_dim=8))
     model = tiny_model("CnnPolicy", PixelBox(), srl=srl, policy_kwargs=policy_kwargs)
-    assert type(model.policy.encoder.trunk) is NatureCNN
+    assert type(model.policy.encoder.trunk.extractor) is NatureCNN
     names = moved(model, lambda: model.learn(14))
     assert names >= {"encoder", "encoder_target", "srl", *TASK, *CURIOUS}
     assert model.policy.encode(th.zeros(3, 6, 36, 36, dtype=th.uint8)).shape == (3, 8)
