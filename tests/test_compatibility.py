@@ -241,7 +241,7 @@ def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
 
 @pytest.mark.parametrize("n_steps", [30, 35], ids=["between episodes", "within one"])
 def test_hindsight_after_pretraining(n_steps: int) -> None:
-    """Of what was collected in pretraining nothing is learned from; ``HerReplayBuffer.reset`` would keep its episodes."""
+    """Nothing that was collected in pretraining is learned from: ``HerReplayBuffer.reset`` would keep its episodes."""
     her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=10)
     model: Any = tiny_model("MultiInputPolicy", Goal(), **her).pretrain(n_steps)
     buffer = model.replay_buffer

@@ -32,7 +32,7 @@ class Cells:
         return tuple(np.floor(state[self._indices] / self._widths).astype(int).tolist())
 
 
-class CountReward(gym.Wrapper, RecordConstructorArgs):
+class CountReward(gym.RewardWrapper, RecordConstructorArgs):
     """An oracle of exploration: the reward is 1 / sqrt(N), N the visits so far of the cell that a step leads to.
 
     Counts of Strehl and Littman (2008), MBIE-EB. They start with the environment, go on over its episodes and through
@@ -49,15 +49,14 @@ class CountReward(gym.Wrapper, RecordConstructorArgs):
         #: Visits of each cell
         self.visits: dict[tuple[int, ...], int] = {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def reward(self, reward: Any) -> float:
         """
-        :param action: The action
-        :return: What the environment returns, but for the reward
+        :param reward: The task's reward of a step, unused
+        :return: That of the cell to which it has led
         """
-        observation, _, terminated, truncated, info = self.env.step(action)
         cell = self._cells.of(physics_state(self.env))
         self.visits[cell] = self.visits.get(cell, 0) + 1
-        return observation, self.visits[cell] ** -0.5, terminated, truncated, info
+        return self.visits[cell] ** -0.5
 
     def state_dict(self) -> dict[str, Any]:
         """

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import filelock
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
@@ -194,7 +193,7 @@ class _Record(BaseCallback):
     def __init__(self, cell: Cell, folder: Path):
         super().__init__()
         self.cell, self.folder = cell, folder
-        self.eval_env = gym.make(cell.task, **cell.env_kwargs)
+        self.eval_env = cell.make_eval_env()
         self.action_repeat = action_repeat_of(self.eval_env)
         #: Whether the task's reward is being learned from
         self.evaluates = False
@@ -279,7 +278,9 @@ class _Record(BaseCallback):
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
-        row["seconds"], row["rewards_met"] = round(self.seconds, 1), round(self.rewards_met, 3)
+        row["seconds"] = round(self.seconds, 1)
+        if self.cell.collects_task_rewards:
+            row["rewards_met"] = round(self.rewards_met, 3)
         self.evaluations.append(row)
         self.write_tables()
 

@@ -6,7 +6,7 @@ import inspect
 import json
 import pkgutil
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -225,15 +225,35 @@ class Cell:
         return {**arguments, **self.custom_objects()}
 
     def make_env(self) -> gym.Env:
-        """An environment to train in: in the wrappers that ``env_wrapper`` names, as in rl-zoo's files, while the one
-        for evaluation is in none, so that it gives the task's reward.
-        """
+        """An environment to train in: in the wrappers that ``env_wrapper`` names, as in rl-zoo's files."""
         env = gym.make(self.task, **self.env_kwargs)
-        wrappers = self.arguments.get("env_wrapper") or []
-        for each in wrappers if isinstance(wrappers, list) else [wrappers]:
-            [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
-            env = pkgutil.resolve_name(name)(env, **kwargs)
+        for wrap, kwargs in self._wrappers():
+            env = wrap(env, **kwargs)
         return env if self.coverage is None else TellCell(env, self.coverage.widths)
+
+    def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
+        """An environment to measure policies in: in the same wrappers but ``gymnasium.RewardWrapper``, so that it gives
+        the task's reward.
+
+        :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
+        """
+        env = gym.make(self.task, **{**self.env_kwargs, **env_kwargs})
+        for wrap, kwargs in self._wrappers():
+            if not _changes_rewards(wrap):
+                env = wrap(env, **kwargs)
+        return env
+
+    @property
+    def collects_task_rewards(self) -> bool:
+        """Whether the rewards of training are the task's."""
+        return not any(_changes_rewards(wrap) for wrap, _ in self._wrappers())
+
+    def _wrappers(self) -> Iterator[tuple[Any, dict[str, Any]]]:
+        """What ``env_wrapper`` names, and its arguments, innermost first."""
+        named = self.arguments.get("env_wrapper") or []
+        for each in named if isinstance(named, list) else [named]:
+            [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
+            yield pkgutil.resolve_name(name), kwargs
 
     def custom_objects(self) -> dict[str, Any]:
         """What loading its model needs besides the archive: classes that are named by their modules."""
@@ -288,6 +308,10 @@ class Grid:
         found = (seed_of(folder) for arm in self.arms for folder in (results / arm.folder.parent).glob("seed*"))
         seeds = {cell.seed for cell in self.cells} | {seed for seed in found if seed is not None}
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in self.arms]
+
+
+def _changes_rewards(wrapper: Any) -> bool:
+    return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper)
 
 
 def constructor_defaults(algorithm: type) -> dict[str, Any]:
@@ -493,6 +517,8 @@ def check_arms(cells: Iterable[Cell]) -> None:
             if key not in envs:
                 envs[key] = cell.make_env()
                 _tell_time_limit(envs[key], cell.task)
+            if cell.kind == "visitation" and isinstance(envs[key].observation_space, gym.spaces.Dict):
+                raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
             with untouched_randomness(th.device("cpu")):
                 cell.make_model(envs[key], device="cpu", compile=False, buffer_size=1)
         except GLUnavailableError:  # with Ray other machines may have what this one has not

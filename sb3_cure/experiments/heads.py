@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 
@@ -142,7 +141,7 @@ def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator
     """The episodes of ``measure_visits`` again, by policy, but for those policies that are known."""
     path = results / cell.folder / "model.zip"
     model = ALGOS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
-    env = gym.make(cell.task, **cell.env_kwargs)
+    env = cell.make_eval_env()
     for actor in visiting_actors(model, cell):
         if actor not in known:
             yield actor, roll_out(model, cell, env, actor)
@@ -163,7 +162,7 @@ def _judge(cell: Cell) -> CuReSAC:
     """An autoencoder with the networks of a seed's first cell, which has learned nothing yet."""
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
-    env = gym.make(cell.task, **cell.env_kwargs)
+    env = cell.make_eval_env()
     model: CuReSAC = ALGOS[cell.algo](
         arguments["policy"],
         env,

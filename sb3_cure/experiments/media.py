@@ -3,7 +3,6 @@
 import contextlib
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
@@ -51,7 +50,7 @@ def name_of(cell: Cell) -> str:
 
 def _random_observations(cell: Cell) -> np.ndarray:
     """Of episodes with random actions, [n, *shape]."""
-    env = gym.make(cell.task, **cell.env_kwargs)
+    env = cell.make_eval_env()
     env.action_space.seed(FILM_SEED)
     observation, _ = env.reset(seed=FILM_SEED)
     chosen = []
@@ -77,7 +76,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param folder: Where to write
     """
     name = name_of(cell)
-    with contextlib.closing(gym.make(cell.task, **cell.env_kwargs)) as env:
+    with contextlib.closing(cell.make_eval_env()) as env:
         repeat = action_repeat_of(env)
         can_film = cell.budget > 0 and "rgb_array" in env.metadata.get("render_modes", [])
         actors = visiting_actors(model, cell)
@@ -92,7 +91,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
             names, units = physics_state_names(env), physics_state_units(env)
             plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
     if can_film:
-        with contextlib.closing(gym.make(cell.task, **{**cell.env_kwargs, "render_mode": "rgb_array"})) as env:
+        with contextlib.closing(cell.make_eval_env(render_mode="rgb_array")) as env:
             fps = max(round(env.metadata.get("render_fps") or 30), 1)
             for actor in trained_actors(model):
                 (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)

@@ -45,7 +45,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param cell: Its cell
     :param folder: Where to write
     """
-    env = gym.make(cell.task, **cell.env_kwargs)
+    env = cell.make_eval_env()
     even_negatives(model, env, seed=VISIT_SEED - 1)
     has_physics = env.has_wrapper_attr("physics")
     arrays: dict[str, Any] = {}

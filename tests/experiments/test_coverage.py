@@ -1,15 +1,16 @@
 """Cumulative coverage of all collected transitions, as cells of a grid record it."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from grids_for_tests import DMC_TASK, method, write_grid
 
 from sb3_cure.envs import physics_state, physics_state_names, rendering
 from sb3_cure.envs.counting import TellCell
+from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import GridError, check_arms, load_grid
@@ -61,11 +62,26 @@ def test_oracle_rewards_training_alone(tmp_path: Path) -> None:
     """Evaluations are of the task, whatever an arm trains on."""
     [cell] = grid(tmp_path).cells
     rewards = []
-    for env in (cell.make_env(), gym.make(cell.task, **cell.env_kwargs)):
+    for env in (cell.make_env(), cell.make_eval_env()):
         env.reset(seed=0)
         rewards.append(env.step(np.zeros(1, np.float32))[1])
         env.close()
     assert rewards[0] == 1 and rewards[1] < 0.1
+    folder = run_cell(cell, tmp_path / "out", pictures=False)
+    assert [row["rewards_met"] for row in read_rows(folder / "eval.csv")] == ["", ""]  # of no other arm's kind
+
+
+def test_policies_are_measured_in_the_wrappers_they_are_trained_in(tmp_path: Path) -> None:
+    """Steps are counted as training makes them, of observations that it sees."""
+    repeat = {"sb3_cure.envs.ActionRepeat": {"num_repeats": 2}}
+    arm = method(env_wrapper=[repeat, ORACLE], **QUICK)
+    [cell] = grid(tmp_path, methods={"slow": arm}, coverage=None).cells
+    with contextlib.closing(cell.make_env()) as env, contextlib.closing(cell.make_eval_env()) as measured:
+        assert action_repeat_of(measured) == action_repeat_of(env) == 2 * 40
+        assert "CountReward" not in str(measured)
+    folder = run_cell(cell, tmp_path / "out", pictures=False)
+    last = read_rows(folder / "eval.csv")[-1]
+    assert last["environment_steps"] == 2 * 40 * last["agent_steps"]
 
 
 def test_coverage_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

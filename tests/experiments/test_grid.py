@@ -220,6 +220,13 @@ def test_unlimited_episodes_are_warned_of(tmp_path: Path, capsys: pytest.Capture
     assert told.startswith(f"{TASK} tells no time limit: if its episodes do not end by themselves")
 
 
+def test_visitation_of_dictionaries_is_refused_before_training(tmp_path: Path) -> None:
+    sensors = method(policy="MultiInputPolicy", env_kwargs={"proprioception": True, "action_repeat": 40})
+    grid = load_grid(write_grid(tmp_path, kind="visitation", tasks=[DMC_TASK], methods={"sensors": sensors}))
+    with pytest.raises(GridError, match="visitation compares errors of one image or vector"):
+        check_arms(grid.cells)
+
+
 def test_checking_arms_leaves_randomness_and_memory_alone(tmp_path: Path) -> None:
     """Their networks are built, without the replay buffer."""
     grid = load_grid(write_grid(tmp_path, methods={"a": method(buffer_size=10**12)}))
