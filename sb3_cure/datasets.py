@@ -94,6 +94,9 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self._observations: list[Any] = []
         self._steps: list[Any] = []
+        # Names are in the order in which episodes are recorded, and of no two environments alike. A run that is resumed
+        # writes those that it plays again over what it had written.
+        self._number, self._token = len(list(Path(folder).glob("*.npz"))), uuid.uuid4().hex[:8]
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """
@@ -124,10 +127,10 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
     def _write(self) -> None:
         if self._steps:
-            # In the order in which they were recorded; several environments may share the folder.
-            name = f"{len(list(Path(self.folder).glob('*.npz'))):06d}-{uuid.uuid4().hex[:8]}.npz"
+            path = Path(self.folder, f"{self._number:06d}-{self._token}.npz")
             columns = map(np.array, zip(*self._steps, strict=True))
-            save_episode(Path(self.folder, name), RecordedEpisode(_stacked(self._observations), *columns))
+            save_episode(path, RecordedEpisode(_stacked(self._observations), *columns))
+            self._number += 1
         self._observations, self._steps = [], []
 
 

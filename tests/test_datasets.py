@@ -216,8 +216,12 @@ def test_nothing_to_fit_is_refused() -> None:
 class Interrupt(BaseCallback):
     """Stands in for a kill."""
 
+    def __init__(self, at: int = 25):
+        super().__init__()
+        self.at = at
+
     def _on_step(self) -> bool:
-        if self.num_timesteps == 25:
+        if self.num_timesteps == self.at:
             raise KeyboardInterrupt
         return True
 
@@ -237,6 +241,28 @@ def test_calls_that_were_over_are_skipped_after_a_kill(tmp_path: Path) -> None:
     whole = script(tiny_model("MlpPolicy", VectorBox()))
     assert type(whole.replay_buffer) is SkippingReplayBuffer and whole.replay_buffer.size() == 60
     assert differences(state_of(whole), state_of(resumed)) == []
+
+
+def test_resumed_run_records_each_episode_once(tmp_path: Path) -> None:
+    """Those that it plays again, too, which the killed run had written after its last checkpoint."""
+
+    def make(folder: str) -> gym.Env:
+        return RecordEpisodes(VectorBox(), tmp_path / folder)
+
+    def recorded(folder: str) -> list[list[float]]:
+        return [load_episode(path).rewards.tolist() for path in sorted((tmp_path / folder).glob("*.npz"))]
+
+    arguments: dict[str, Any] = dict(learning_starts=10**6)
+    whole = tiny_model("MlpPolicy", make("whole"), **arguments).learn(80)
+    whole.env.close()  # type: ignore[union-attr]
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint = ExactCheckpoint(15, tmp_path / "checkpoints")
+        tiny_model("MlpPolicy", make("parts"), **arguments).learn(80, callback=[checkpoint, Interrupt(44)])
+    n_written = len(recorded("parts"))
+    resumed = CuReSAC.resume(tmp_path / "checkpoints", make("parts"), device="cpu").learn(80)
+    assert resumed.num_timesteps == 80 and n_written > 1
+    resumed.env.close()  # type: ignore[union-attr]
+    assert recorded("parts") == recorded("whole")
 
 
 def test_unknown_statistics_are_refused(tmp_path: Path) -> None:
