@@ -4,7 +4,7 @@ from sb3_cure.cure_sac import CuReSAC
 from sb3_cure.cure_tqc import CuReTQC
 from sb3_cure.envs import make_dmc_env, register_dmc_envs
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"
 
 register_dmc_envs()
 

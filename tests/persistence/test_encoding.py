@@ -196,7 +196,7 @@ LIES = {
     "a larger dtype": lambda: with_entry("state.numbers", dtype="F64"),
     "no dtype": lambda: with_entry("state.numbers", dtype="spam"),
     "numbers as an array of bf16": lambda: with_entry("state.numbers", dtype="BF16", shape=[2, 6]),
-    "another format": lambda: honest().replace(b"sb3_cure 2", b"sb3_cure 9"),
+    "another format": lambda: honest().replace(b"sb3_cure 3", b"sb3_cure 2"),
     "deep JSON": lambda: with_json("[" * 100_000 + "]" * 100_000),
     "no JSON": lambda: with_json("spam"),
     "a number of 5000 digits": lambda: with_json("9" * 5000),
