@@ -234,11 +234,11 @@ class ExactCheckpoint(BaseCallback):
     all random streams, the state of the environments where they offer it, what was logged, and the public attributes
     of the callbacks that are plain Python, NumPy or torch. The frames of a ``FrameStackReplayBuffer`` are written once:
     a checkpoint adds the new ones. It is written aside, flushed to the disk, checksummed and renamed; until then the
-    former ones count. One is written when training starts and one when it ends.
+    former ones count. One is written when training starts and one when it ends, unless a callback ends it.
 
     On the CPU with ``precision="fp32", compile=False`` the resumed run equals one without interruption bit for bit
     (with ``overlap=True``, whose updates lag behind, it does not). Environments that cannot tell their state begin a
-    new episode instead, which is said when training starts. On SIGTERM and SIGINT a checkpoint is written before the
+    new episode instead, which is said when training starts; ``VecNormalize`` goes on with its statistics. On SIGTERM and SIGINT a checkpoint is written before the
     next rollout (with ``train_freq=1``: the next step), then the process leaves with the status that the signal asks
     for. Workers of SB3's ``SubprocVecEnv`` die of a Ctrl-C in a terminal: their episodes then begin anew.
 

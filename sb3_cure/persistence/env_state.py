@@ -14,7 +14,7 @@ Each layer (environment, wrapper, vectorised environment) saves what is its own:
 import functools
 import inspect
 from collections import OrderedDict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium.wrappers import PassiveEnvChecker
 from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_cure.envs.physics import integration_state, is_of_the_suite, load_integration_state
@@ -92,6 +92,30 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
         raise ValueError(
             f"The saved state does not fit these environments, build them as they were built when it was saved: {error}"
         ) from error
+
+
+def statistics_state(venv: VecEnv) -> list[dict[str, Any]]:
+    """
+    :param venv: Environments, which need not answer
+    :return: What each ``VecNormalize`` around them has learned, the outermost first
+    """
+    return [_layer_state(layer, [layer]) for layer in _normalizers(venv)]
+
+
+def load_statistics(venv: VecEnv, states: list[dict[str, Any]]) -> None:
+    """
+    :param venv: Environments, which are to be reset after this
+    :param states: Of ``statistics_state``
+    """
+    for layer, state in zip(_normalizers(venv), states, strict=True):
+        _load_layer(layer, state)
+
+
+def _normalizers(venv: Any) -> Iterator[VecNormalize]:
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, VecNormalize):
+            yield venv
+        venv = venv.venv
 
 
 def _state_or_reason(venv: VecEnv) -> tuple[dict[str, Any] | None, str | None]:

@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from sb3_cure.persistence.archive import SavesModels
 from sb3_cure.persistence.buffers import SavesReplayBuffers
 from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_usable
+from sb3_cure.persistence.env_state import load_statistics
 from sb3_cure.persistence.resume import Resumption, Run, watch
 
 Self = TypeVar("Self", bound="Persistence")
@@ -51,8 +52,9 @@ class Persistence(SavesModels, SavesReplayBuffers):
 
         The same calls of ``learn`` (and ``pretrain``) as before, with the same numbers of timesteps and the same
         callbacks, then do what was left: those that were over are skipped, so that a script can be started again as it
-        is. A single ``learn(n, reset_num_timesteps=False)`` means n more steps, as everywhere in SB3. Log files are
-        gone on with where ``set_logger`` is called as before.
+        is. A single ``learn(n, reset_num_timesteps=False)`` means n more steps, as everywhere in SB3, unless the
+        training's first call did not reset them either. Log files are gone on with where ``set_logger`` is called as
+        before.
 
         :param path: Folder of the checkpoints
         :param env: Environments as those before: as many, of the same settings
@@ -72,10 +74,12 @@ class Persistence(SavesModels, SavesReplayBuffers):
         run = model._run
         run.writers[Path(path).resolve()] = writer
         run.calls, run.done = state["calls"][:-1], state["calls"][:-1]
+        run.began_anew = state["began_anew"]
         if state["environments"] is None:
             # The interrupted episode cannot be gone on with; other first states than those that this run has seen.
             model._last_obs = None
             model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)
+            load_statistics(model.env, state["statistics"])
         run.resumed = Resumption(generation.folder, state, model, model._stateful_parts())
         if model.verbose >= 1:
             print(f"Resumed from {generation.folder}, after {model.num_timesteps} agent steps")
@@ -93,7 +97,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
         """As in SB3; after ``resume``, what was left of the interrupted call."""
         if self._was_over(self._call_name, reset_num_timesteps):
             return self
-        with self._run.calling(self._call_name):
+        with self._run.calling(self._call_name, reset_num_timesteps):
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
             self._restore_rest()  # where nothing was left to do
         return self
@@ -112,7 +116,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
     ) -> tuple[int, BaseCallback]:
         run, resumed = self._run, self._run.resumed
         # Whether this is the interrupted call, made again, whose total is meant
-        continues = resumed is not None and (reset_num_timesteps or run.replays)
+        continues = run.is_made_again(reset_num_timesteps)
         if resumed is not None:
             reset_num_timesteps = False
             total_timesteps += resumed.started_at - self.num_timesteps if continues else 0

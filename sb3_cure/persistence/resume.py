@@ -26,7 +26,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.persistence.archive import Stateful
 from sb3_cure.persistence.encoding import encode, write_tensors
-from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
+from sb3_cure.persistence.env_state import load_vec_env_state, statistics_state, vec_env_state
 
 
 class Run:
@@ -45,19 +45,28 @@ class Run:
         self.leaving = contextlib.ExitStack()
         #: Calls of ``learn`` and ``pretrain`` so far, the running one last
         self.calls: list[str] = []
+        #: Whether the first of them counted steps anew, as its ``reset_num_timesteps`` says
+        self.began_anew = True
         #: Of these, calls that were over when the checkpoint was taken, and that the script will make again
         self.done: list[str] = []
         #: Whether the script has made one of those again, so that its next call is the interrupted one
         self.replays = False
 
+    def is_made_again(self, counts_anew: bool) -> bool:
+        """
+        :param counts_anew: ``reset_num_timesteps`` of the first call after ``resume``, or of one after it
+        :return: Whether it is a call of the script that is run again: these begin as they did. Else it asks for more
+            steps
+        """
+        return self.resumed is not None and (self.replays or counts_anew or not self.began_anew)
+
     def skips(self, call: str, counts_anew: bool) -> bool:
         """
         :param call: ``"learn"`` or ``"pretrain"``, which is being called
-        :param counts_anew: Its ``reset_num_timesteps``: the first call of a script that is run again counts anew, while
-            one that does not asks for more steps
+        :param counts_anew: Its ``reset_num_timesteps``
         :return: Whether the checkpoint that was resumed from was taken after it
         """
-        if self.resumed is not None and (counts_anew or self.replays) and self.done[:1] == [call]:
+        if self.is_made_again(counts_anew) and self.done[:1] == [call]:
             self.done.pop(0)
             self.replays = True
             print(f"{call} number {len(self.calls) - len(self.done)} of this training was over: skipped")
@@ -66,11 +75,14 @@ class Run:
         return False
 
     @contextlib.contextmanager
-    def calling(self, call: str) -> Iterator[None]:
+    def calling(self, call: str, counts_anew: bool = True) -> Iterator[None]:
         """The running call.
 
         :param call: ``"learn"`` or ``"pretrain"``
+        :param counts_anew: Its ``reset_num_timesteps``
         """
+        if not self.calls and self.resumed is None:
+            self.began_anew = counts_anew
         self.calls.append(call)
         try:
             with self.leaving:
@@ -99,9 +111,12 @@ def training_state(model: OffPolicyAlgorithm, run: Run, environments_may_be_gone
     return {
         "num_timesteps": model.num_timesteps,
         "calls": list(run.calls),
+        "began_anew": run.began_anew,
         "n_envs": model.n_envs,
         "random": random_state(model),
         "environments": environments,
+        # Of the environments only what this process knows
+        "statistics": [] if environments is not None else statistics_state(model.env),
         "logger": _logger_state(model.logger),
         "callbacks": [[type(callback).__name__, _changed(callback)] for callback in run.watched],
     }

@@ -584,6 +584,40 @@ def test_secretive_environments_begin_a_new_episode(tmp_path: Path) -> None:
     assert steps == [7, 14, 21, 31, 38, 45, 52, 59]
 
 
+def test_statistics_outlive_secretive_environments(tmp_path: Path) -> None:
+    """Of observations and returns: networks and replay buffer go on, and are used to these."""
+
+    def make() -> VecNormalize:
+        return VecNormalize(DummyVecEnv([lambda: Monitor(NoState(VectorBox()))]))
+
+    env = make()
+    with pytest.warns(UserWarning, match="NoState"), pytest.raises(Killed):
+        tiny_model("MlpPolicy", env).learn(60, callback=[KillAt(31), ExactCheckpoint(30, tmp_path)])
+    resumed = CuReSAC.resume(tmp_path, make(), device="cpu")
+    ours, theirs = resumed.get_vec_normalize_env(), env
+    assert ours is not None and ours is not theirs
+    # Of the checkpoint, one step before: nothing but counts that go on comes near to these.
+    assert ours.obs_rms.count == pytest.approx(theirs.obs_rms.count - 1)  # type: ignore[union-attr]
+    np.testing.assert_allclose(ours.obs_rms.mean, theirs.obs_rms.mean, atol=0.05)  # type: ignore[union-attr]
+    with pytest.warns(UserWarning, match="NoState"):
+        resumed.learn(60, callback=ExactCheckpoint(30, tmp_path))
+    assert ours.obs_rms.count > 59 and ours.ret_rms.count > 59  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("kill_at", [15, 55, 100])
+def test_loops_of_learn_go_on_where_they_were(kill_at: int, tmp_path: Path) -> None:
+    """``reset_num_timesteps=False`` in all calls, the first one, too."""
+
+    def loop(model: CuReSAC, kill: KillAt) -> CuReSAC:
+        for _ in range(5):
+            model.learn(20, callback=[kill, ExactCheckpoint(10, tmp_path)], reset_num_timesteps=False)
+        return model
+
+    with pytest.raises(Killed):
+        loop(tiny_model("MlpPolicy", vectors()), KillAt(kill_at))
+    assert loop(CuReSAC.resume(tmp_path, vectors(), device="cpu"), KillAt(0)).num_timesteps == 100
+
+
 def test_abandoned_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(Killed):
         train(CASES["vectors"], tmp_path, False, KillAt(40))
