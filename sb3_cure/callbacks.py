@@ -94,7 +94,8 @@ class RolloutCallback(PeriodicCallback):
     Rolls out policies alone in an environment of its own every so many agent steps.
 
     :param eval_env: One (not vectorised) environment made as the training environment, not that one itself. Where
-        SB3's ``VecFrameStack`` stacks frames for training, wrap it in ``sb3_cure.envs.StackFrames(env, n)``
+        SB3's ``VecFrameStack`` stacks frames for training, wrap it in
+        ``sb3_cure.envs.StackFrames(env, n, padding="zeros")``
     :param every: Agent steps between two calls
     :param n_episodes: Episodes per policy
     :param deterministic: Whether policies act by their mean
@@ -114,15 +115,18 @@ class RolloutCallback(PeriodicCallback):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        self.eval_env, self.n_episodes, self.actors = eval_env, n_episodes, actors
+        self.eval_env, self.n_episodes = eval_env, n_episodes
         self.deterministic, self.seed = deterministic, seed
+        self._chosen = actors
+        #: Whom it rolls out in the call that runs
+        self.actors: list[str] = []
 
     def _init_callback(self) -> None:
         """Refuse now what would end the training when the callback is due."""
         if isinstance(self.eval_env, VecEnv):
             raise ValueError(
                 "eval_env is a VecEnv, but policies are rolled out in one environment: give a gymnasium.Env "
-                "(sb3_cure.envs.StackFrames stacks frames as VecFrameStack does)."
+                "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks frames as VecFrameStack does)."
             )
         model, space = self.model, self.eval_env.observation_space
         if self.eval_env.action_space != model.action_space or not _same_shapes(space, model.observation_space):
@@ -131,7 +135,7 @@ class RolloutCallback(PeriodicCallback):
                 f"{model.observation_space} and {model.action_space}: make it as the training environment."
             )
         trained = trained_actors(model)
-        self.actors = trained if self.actors is None else list(self.actors)
+        self.actors = trained if self._chosen is None else list(self._chosen)
         if not set(self.actors) <= {*trained, "random"}:
             raise ValueError(f"actors are {self.actors}, but this model has {', '.join([*trained, 'random'])}.")
 
@@ -334,7 +338,9 @@ class ReconstructionCallback(PeriodicCallback):
         if len_of(self.observations) == 0:  # nothing good has been seen so far
             self.observations = None
             return
-        observed, keys = obs_as_tensor(self.observations, model.device), list(image_spaces(model.observation_space))
+        normalizer = model.get_vec_normalize_env()  # of vectors beside the images
+        given = self.observations if normalizer is None else normalizer.normalize_obs(self.observations)
+        observed, keys = obs_as_tensor(given, model.device), list(image_spaces(model.observation_space))
         title = "What the agent sees, and what its latents hold of it"
         reconstruct = getattr(model.policy, "reconstruct", lambda observations: None)
         with th.no_grad():
@@ -381,7 +387,7 @@ class ReconstructionCallback(PeriodicCallback):
     def _sample(self, n: int) -> Any:
         """Observations that the model has seen, at random, on its device, [n, *shape] or such by key."""
         if self._buffer is not None:
-            return self._buffer.sample(n).observations
+            return self._buffer.sample(n, env=self.model.get_vec_normalize_env()).observations
         chosen = np.random.randint(len(self._latest), size=n)
         return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
 

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
@@ -17,8 +16,9 @@ from torch import nn
 from sb3_cure.buffers import transitions
 from sb3_cure.envs import render_check
 from sb3_cure.layers import Conv2dReLU
+from sb3_cure.observations import image_spaces, images_of
 from sb3_cure.policies import CuRePolicy, encoder_of
-from sb3_cure.srl import RAE
+from sb3_cure.srl import RAE, DictHead, heads_by_key
 
 #: Transitions, of all environments together, within which a constant image is looked for
 RECENT = 1000
@@ -102,9 +102,9 @@ def look(
 
 def constant_image(model: Any, n_samples: int) -> Finding | None:
     """
-    Environments whose latest observations are equal in every bit, while nothing moves or the camera sees nothing.
+    Environments whose latest images are equal in every bit, while nothing moves or the camera sees nothing.
 
-    Value: number of such environments. Expected: 0.
+    Value: number of such environments, of dictionaries of their images. Expected: 0.
 
     :param model: The model
     :param n_samples: Observations to look at, of all environments together
@@ -112,18 +112,19 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
     """
     buffer = model.replay_buffer
     rows = min(buffer.size(), max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
-    if not is_image_space(model.observation_space) or rows < MIN_ALIKE:
+    if not image_spaces(model.observation_space) or rows < MIN_ALIKE:
         return None
     chosen = np.linspace(0, rows - 1, min(rows, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
     positions = (buffer.pos - 1 - chosen) % buffer.buffer_size
-    constant = []
+    constant: list[str] = []
     for env in range(buffer.n_envs):
         seen = transitions(buffer, positions, np.full(len(chosen), env)).observations
-        if bool((seen == seen[:1]).all()):
-            constant.append(env)
+        for key, images in images_of(seen, model.observation_space).items():
+            if bool((images == images[:1]).all()):
+                constant.append(f"{env} ({key})" if key else f"{env}")
     problem = (
-        f"the last {rows} observations of environment {', '.join(map(str, constant))} are one and the same image: look "
-        "at what env.render() shows, and at camera_id."
+        f"the last {rows} observations of environment {', '.join(constant)} are one and the same image: look at what "
+        "env.render() shows, and at camera_id."
     )
     return Finding("constant_image", len(constant), problem if constant else None)
 
@@ -250,7 +251,7 @@ def software_rendering(env: VecEnv) -> Finding | None:
     """
     gpus = render_check.find_gpus()
     renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
-    if not gpus or not renders or not is_image_space(env.observation_space):
+    if not gpus or not renders or not image_spaces(env.observation_space):
         return None
     renderer = render_check.try_rendering().get("renderer")
     problem = None if renderer is None else render_check.judge_renderer(renderer, gpus)
@@ -284,14 +285,21 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
-    """Share of the targets' variance that the autoencoder's drawings explain; None for heads that are not ``RAE``."""
+    """Share of the targets' variance that the autoencoder's drawings explain, of several images that of the worst; None
+    for heads that are not ``RAE``, and of images without any variance."""
     head = getattr(model.policy, "srl", None)
-    if not isinstance(head, RAE):
+    heads = heads_by_key(head)
+    if not heads or not all(isinstance(each, RAE) for each in heads.values()):
         return None
     seen = model.policy.samples(batch, random=False)
-    variance = float(head.target(seen.views, dither=False).var(dim=0, correction=0).mean())
-    error = head.error(seen, latents)
-    return None if variance == 0 else 1 - float(error.mean()) / variance
+    parts = {key: seen.of(key) if key else seen for key in heads}
+    wheres = head.slices if isinstance(head, DictHead) else [slice(None)]
+    shares = []
+    for (key, each), where in zip(heads.items(), wheres, strict=True):
+        variance = float(each.target(parts[key].views, dither=False).var(dim=0, correction=0).mean())
+        if variance > 0:
+            shares.append(1 - float(each.error(parts[key], latents[:, where]).mean()) / variance)
+    return min(shares, default=None)
 
 
 def _temperatures(model: Any, batch: ReplayBufferSamples) -> Iterator[Temperature]:

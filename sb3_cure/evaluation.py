@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -186,7 +187,7 @@ def run_episodes(
             steps.append((action, float(reward), terminated))
             if render:
                 frames.append(env.render())
-        seen: Any = maybe_transpose(_stacked(observations), model.observation_space)
+        seen: Any = _channels_first(_stacked(observations), model.observation_space)
         actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
@@ -199,6 +200,12 @@ def _stacked(observations: list[Any]) -> Any:
     if isinstance(observations[0], dict):
         return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
     return np.stack(observations)
+
+
+def _channels_first(observations: Any, space: spaces.Space) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: maybe_transpose(observations[key], part) for key, part in space.spaces.items()}
+    return maybe_transpose(observations, space)
 
 
 def _as_batch(

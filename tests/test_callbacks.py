@@ -13,6 +13,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,7 +24,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_cure import CuReSAC, callbacks, make_dmc_env
 from sb3_cure.buffers import transitions
@@ -640,14 +641,55 @@ def test_vectorised_evaluation_environment_is_refused() -> None:
 
 
 def test_stacked_by_sb3_watched_in_one_environment() -> None:
-    """In ``StackFrames``; the unstacked one is refused."""
+    """In ``StackFrames``, which begins episodes as SB3 does; the unstacked one is refused."""
     single = partial(PixelBox, frame_stack=1, channels_last=True, tells_frame_stack=False)
     model = tiny_model("CnnPolicy", VecFrameStack(DummyVecEnv([single]), 3))
     with pytest.raises(ValueError, match="make it as the training environment"):
         model.learn(5, callback=EvalBothCallback(single()))
-    evaluation = EvalBothCallback(StackFrames(single(), 3), eval_freq=10, n_episodes=1, seed=0)
+    env, theirs = StackFrames(single(), 3, padding="zeros"), VecFrameStack(DummyVecEnv([single]), 3)
+    theirs.seed(0)
+    for ours, [stacked] in (
+        (env.reset(seed=0)[0], theirs.reset()),
+        (env.step(np.ones(2))[0], theirs.step(np.ones((1, 2)))[0]),
+    ):
+        np.testing.assert_array_equal(ours, stacked)
+    evaluation = EvalBothCallback(env, eval_freq=10, n_episodes=1, seed=0)
     model.learn(10, callback=evaluation)
     assert len(evaluation.history) == 1
+
+
+def test_one_callback_serves_pretraining_and_learning() -> None:
+    """By default whom each of them trains."""
+    evaluation = EvalBothCallback(PixelBox(), eval_freq=10, n_episodes=1)
+    tiny_model("CnnPolicy", PixelBox()).pretrain(10, callback=evaluation).learn(10, callback=evaluation)
+    assert [{name for name in row if name.endswith("_reward")} for row in evaluation.history] == [
+        {"eval/curious_reward"},
+        {"eval/task_reward", "eval/curious_reward"},
+    ]
+
+
+def test_dictionaries_with_channels_last_are_watched() -> None:
+    """As they are trained: SB3 moves the channels there."""
+    env = SensorBox(("front", "joints"), channels_last=True)
+    evaluation = EvalBothCallback(SensorBox(("front", "joints"), channels_last=True), eval_freq=10, n_episodes=1)
+    tiny_model("MultiInputPolicy", env).learn(10, callback=evaluation)
+    assert len(evaluation.history) == 1
+
+
+def test_vectors_beside_drawn_images_are_normalised(tmp_path: Path) -> None:
+    """As in training, for the decoder that is fitted, and for what is drawn."""
+    env = VecNormalize(DummyVecEnv([lambda: SensorBox(("front", "joints"))]), norm_obs_keys=["joints"], clip_obs=0.01)
+    model = tiny_model("MultiInputPolicy", env, srl="curl")
+    seen: list[float] = []
+    center = model.policy.center
+
+    def noted(observations: Any) -> Any:
+        seen.append(float(observations["joints"].abs().max()))
+        return center(observations)
+
+    model.policy.center = noted  # type: ignore[method-assign]
+    model.learn(20, callback=ReconstructionCallback(tmp_path, every=10, decoder_updates=2))
+    assert len(seen) > 2 and max(seen) <= 0.01
 
 
 def test_observations_must_fit(tmp_path: Path) -> None:

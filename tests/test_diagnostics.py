@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -369,6 +370,27 @@ def test_rl_zoo_makes_it_from_yaml() -> None:
     model = box(PixelBox())
     callbacks: list[BaseCallback] = [plain, other]
     assert model.learn(20, callbacks).num_timesteps == 20
+
+
+def test_images_of_dictionaries_are_looked_at() -> None:
+    """A camera that stands still beside one that does not, and drawings that hold nothing of one image."""
+
+    class HalfStill(SensorBox):
+        def observe(self, first: bool = False) -> Any:
+            return {**super().observe(first), "wrist": np.zeros((6, 28, 28), np.uint8)}
+
+    with pytest.warns(UserWarning) as caught:
+        model = tiny_model("MultiInputPolicy", HalfStill())
+        model.learn(50, DiagnosticsCallback(every=49, autoencoder_updates=1))
+    sentences = [str(warning.message) for warning in caught]
+    assert any("observations of environment 0 (wrist) are one and the same image" in each for each in sentences)
+    batch = model.replay_buffer.sample(16)  # type: ignore[union-attr]
+    latents = model.policy.encode(batch.observations)
+    front = diagnostics.explained_share(model, batch, latents)
+    model.policy.srl.heads[0].decoder.linear.weight.data.zero_()  # type: ignore[union-attr]
+    assert front is not None
+    explained = diagnostics.explained_share(model, batch, latents)
+    assert explained is not None and explained < 0.01
 
 
 def test_what_other_callbacks_write_hides_nothing() -> None:

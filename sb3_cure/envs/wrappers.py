@@ -160,19 +160,25 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """
-    Joins the last observations along their first axis, oldest first; the first one of an episode is repeated.
+    Joins the last observations along their first axis, oldest first.
 
     Images with the channels last (their smallest dimension, as SB3 tells them) are joined along the last axis. Of
     dictionaries the images are stacked, the rest stays as it is.
 
     :param env: An environment whose observations are arrays, such as images, or dictionaries with images
     :param frame_stack: Number of observations in a stack
-    :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows
+    :param padding: What stands before the first one of an episode: ``"first"``, itself, or ``"zeros"``, as in SB3's
+        ``VecFrameStack`` (which stacks the vectors of dictionaries, too)
+    :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows, or
+        for another ``padding``
     """
 
-    def __init__(self, env: gym.Env, frame_stack: int = 3) -> None:
-        RecordConstructorArgs.__init__(self, frame_stack=frame_stack)
+    def __init__(self, env: gym.Env, frame_stack: int = 3, padding: str = "first") -> None:
+        RecordConstructorArgs.__init__(self, frame_stack=frame_stack, padding=padding)
         super().__init__(env)
+        if padding not in ("first", "zeros"):
+            raise ValueError(f"padding is {padding!r}: choose 'first' or 'zeros'.")
+        self.padding = padding
         self.frame_stack = check_at_least_one("frame_stack", frame_stack, usual=3)
         space = env.observation_space
         # Of observations that are no dictionary, under the key ""
@@ -202,20 +208,23 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         return spaces.Box(low, high, dtype=box.dtype.type)
 
-    def _push(self, observation: Any, times: int) -> Any:
+    def _push(self, observation: Any, first: bool) -> Any:
         parts = observation if isinstance(observation, dict) else {"": observation}
         for key, frames in self._frames.items():
-            frames.extend([np.array(parts[key])] * times)  # an environment may write the next one into it
+            frame = np.array(parts[key])  # an environment may write the next one into it
+            if first:
+                frames.extend([frame if self.padding == "first" else np.zeros_like(frame)] * self.frame_stack)
+            frames.append(frame)
         stacked = {key: np.concatenate(frames, self._axes[key]) for key, frames in self._frames.items()}
         return {**parts, **stacked} if isinstance(observation, dict) else stacked[""]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
-        return self._push(observation, self.frame_stack), info
+        return self._push(observation, first=True), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return self._push(observation, 1), reward, terminated, truncated, info
+        return self._push(observation, first=False), reward, terminated, truncated, info
 
 
 def make_pixel_env(
