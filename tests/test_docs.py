@@ -5,6 +5,8 @@ import inspect
 import json
 import pkgutil
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -75,6 +77,14 @@ def test_own_camera_of_the_guide_trains(example: str) -> None:
     assert model.num_timesteps == 8
     assert model.replay_buffer.frame_stack == 3
     assert model.observation_space.shape == (9, 48, 48)
+
+
+def test_several_environments_of_the_guide_step_in_workers(tmp_path: Path) -> None:
+    """As a script, which the workers import again."""
+    block = next(block for block in blocks("docs/guide/environments.md") if "SubprocVecEnv" in block)
+    assert "n_envs=4" in block and "learn(1000)" in block
+    (tmp_path / "script.py").write_text(block.replace("n_envs=4", "n_envs=2").replace("learn(1000)", "learn(8)"))
+    subprocess.run([sys.executable, tmp_path / "script.py"], check=True, cwd=tmp_path, timeout=300)
 
 
 def test_own_camera_of_the_guide_is_watched_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import torch as th
 from gymnasium import spaces
 from torch.utils import collect_env
 
+from sb3_cure import __version__
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
 from sb3_cure.precision import resolve_compile, resolve_precision
 
@@ -76,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     needed = needed_packages()
     line, missing = check_packages(needed[""])
-    print(f"\n{PACKAGE} {installed_version(PACKAGE)} with {line}")
+    print(f"\n{PACKAGE} {__version__} with {line}")
     if missing:
         errors.append(f"missing: {', '.join(missing)}; pip install {' '.join(missing)}")
     for extra, purpose in EXTRAS.items():

@@ -30,6 +30,8 @@ from sb3_cure.envs.rendering import is_headless
 from sb3_cure.zoo_files import zoo_file
 
 DEFAULT_ALGORITHM = "cure_sac"
+#: The file of settings where ``--conf-file`` is not given
+DEFAULT_SETTINGS = "cure_sac_ae"
 #: Algorithms by the names that ``--algo`` knows them by
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"cure_sac": sb3_cure.CuReSAC, "cure_tqc": sb3_cure.CuReTQC}
 #: Arguments of the algorithms that take a class of the user's own, which settings name as ``my_module.MyClass``
@@ -162,8 +164,8 @@ def register() -> None:
 
 def train(arguments: Sequence[str]) -> None:
     """
-    :param arguments: Command line of rl-zoo3's ``train``; ``--algo`` is ``cure_sac`` unless given, and ``--env`` may be
-        ``my_module:My-v0``, with the module that registers it
+    :param arguments: Command line of rl-zoo3's ``train``; unless given, ``--algo`` is ``cure_sac`` and ``--conf-file``
+        ``cure_sac_ae``. ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
     _find_modules_here()
@@ -178,7 +180,8 @@ def train(arguments: Sequence[str]) -> None:
     if given.gym_packages:
         rest += ["--gym-packages", *given.gym_packages]
     own_arguments = sys.argv
-    sys.argv = ["sb3-cure train", "--algo", DEFAULT_ALGORITHM, *rest]  # of repeated flags argparse takes the last
+    # Of repeated flags argparse takes the last.
+    sys.argv = ["sb3-cure train", "--algo", DEFAULT_ALGORITHM, "--conf-file", DEFAULT_SETTINGS, *rest]
     try:
         rl_zoo3.train.train()
     finally:

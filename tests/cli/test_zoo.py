@@ -103,6 +103,15 @@ def train(*arguments: str, task: str = TASK, **changes: Any) -> None:
     assert main(["train", "--env", task, "--conf-file", config, "--device", "cpu", *arguments]) == 0
 
 
+def test_settings_are_cure_by_default(folder: Path) -> None:
+    """As rl-zoo3's commands name no file either."""
+    few = "n_timesteps:20 learning_starts:10 warmup_updates:1 batch_size:4 buffer_size:100".split()
+    small = "policy_kwargs:dict(net_arch=[8],features_extractor_kwargs=dict(n_filters=2))"
+    assert main(["train", "--env", TASK, "--device", "cpu", "-params", *few, small]) == 0
+    [run] = (folder / "logs" / "cure_sac").glob("*_1")
+    assert "srl" in next(run.rglob("config.yml")).read_text()
+
+
 @pytest.fixture
 def set_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[CuReSAC, zoo.ExperimentManager]]:
     """Function that trains as ``train`` does, but returns the model and the manager before the first step."""
