@@ -482,9 +482,18 @@ def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
             )
 
 
+class _Loader(yaml.SafeLoader):
+    """Takes 1e-6 for a number, as YAML 1.2 does: torch would meet the text in the first update."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(path.read_text())
+        content = yaml.load(path.read_text(), _Loader)  # a SafeLoader
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise GridError(
             f"{path} cannot be read ({' '.join(str(error).split())}): "

@@ -76,7 +76,15 @@ SETTINGS = {
     "train_freq": 1,
     "gradient_steps": -1,
     "srl_schedule": "simultaneous",
+    "learning_starts": 1000,
     "policy_kwargs": {"net_arch": [1024, 1024]},
+}
+#: Updates after the warm-up by published method
+WARMUP_UPDATES = {"SAC-AE": 1000, "CURL": 0}
+#: What an arm may choose without becoming another method; its head, augmentation and curiosity are looked at
+FREE = {
+    *("policy", "srl", "srl_kwargs", "augmentation", "augmentation_kwargs", "curiosity"),
+    *("buffer_size", "replay_buffer_kwargs", "precision", "compile", "update", "overlap", "device", "verbose"),
 }
 
 
@@ -88,18 +96,22 @@ def task_key(task: str) -> str:
     return task.replace("-", "_")
 
 
-def published_method(arguments: dict) -> tuple[str | None, bool]:
+def published_method(config: dict) -> tuple[str | None, bool]:
     """Which published method an arm is.
 
-    :param arguments: CuReSAC's arguments, as ``config.json`` keeps them
+    :param config: Its ``config.json``
     :return: The method that it is or builds upon, None for a head without published numbers; and whether it is that
         method, in its settings and without curiosity
     """
+    arguments = config.get("arguments", {})
     base = {"rae": "SAC-AE", "curl": "CURL"}.get(str(arguments.get("srl", "rae")))
-    augmentation = arguments.get("augmentation") or arguments.get("srl_kwargs", {}).get("augmentation", "none")
+    head = dict(arguments.get("srl_kwargs", {}))
+    augmentation = arguments.get("augmentation") or head.pop("augmentation", "none")
     usual = ("crop",) if base == "CURL" else ("none", "auto")  # auto: what the head asks for, nothing with "rae"
-    is_usual = augmentation in usual and all(arguments.get(key, value) == value for key, value in SETTINGS.items())
-    return base, is_usual and arguments.get("curiosity", "separate") is None
+    settings = {**SETTINGS, "warmup_updates": WARMUP_UPDATES.get(str(base))}
+    others = {key: value for key, value in arguments.items() if key not in FREE and settings.get(key) != value}
+    is_plain = config.get("algo", "cure_sac") == "cure_sac" and arguments.get("curiosity", "separate") is None
+    return base, augmentation in usual and is_plain and not others and not head
 
 
 @dataclass(frozen=True)
@@ -152,7 +164,7 @@ def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison
         cells = [cell for cell in experiment.done(task, method).values() if len(cell.curve()[0]) > 1]
         if not cells or cells[0].config.get("pretrain") or not all(cell.sees_published_pixels for cell in cells):
             continue
-        base, same_method = published_method(cells[0].config.get("arguments", {}))
+        base, same_method = published_method(cells[0].config)
         if base is None:
             continue
         steps, stacked = stack_curves(cells)

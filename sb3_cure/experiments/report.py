@@ -116,10 +116,11 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
     if len(updates) and not updates.any():
         headlines.insert(0, words("untrained"))
-    explored = _stacked(experiment, "cells")
+    explored = _stacked(experiment, "cells", at_least=1)
     if explored:
-        label, caption = "cells of the true state\nreached in training", words("cells_reached", list(explored))
-        parts.append(_figure("cells_reached", caption, plots.learning_curves, explored, colors, label))
+        if grown := _stacked(experiment, "cells"):
+            label, caption = "cells of the true state\nreached in training", words("cells_reached", list(grown))
+            parts.append(_figure("cells_reached", caption, plots.learning_curves, grown, colors, label))
         parts.append(tables.cells_reached_table(experiment, explored))
         headlines += _exploration_headlines(experiment, list(explored))
     parts += curve_figures(experiment, colors)
@@ -157,13 +158,13 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         yield _figure("srl_error", caption, plots.policy_curves, errors, colors, label, True, actors)
 
 
-def _stacked(experiment: Experiment, column: str) -> dict[str, dict[str, Curves]]:
-    """By task and arm, where there are two evaluations or more with a value in the column."""
+def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str, dict[str, Curves]]:
+    """By task and arm, where there are so many evaluations with a value in the column."""
     curves: dict[str, dict[str, Curves]] = {}
     for task in experiment.tasks:
         for method in experiment.methods:
             steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
-            if len(steps) > 1:
+            if len(steps) >= at_least:
                 curves.setdefault(task, {})[method] = steps, values
     return curves
 

@@ -213,7 +213,10 @@ def _check_alike(cells: Iterable[CellResult]) -> None:
     first: dict[tuple[str, ...], CellResult] = {}
     for cell in (cell for cell in cells if cell.done):
         keys = (cell.config.keys() | {"arguments"}) - {"seed", "method"}
-        for arm, compared in (((cell.task, cell.method), keys), ((cell.task,), {"eval_every", "eval_episodes"})):
+        for arm, compared in (
+            ((cell.task, cell.method), keys),
+            ((cell.task,), {"eval_every", "eval_episodes", "coverage"}),
+        ):
             other = first.setdefault(arm, cell)
             for key in sorted(compared & other.config.keys()):
                 here, there = comparable(key, cell.config.get(key), other.config[key])

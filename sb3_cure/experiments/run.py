@@ -88,7 +88,7 @@ def check_grid(grid: Grid, results: Path) -> None:
     :raises GridError: with one sentence, if an arm cannot work, or the folder holds cells of other settings: also of
         other seeds and arms, as they are to be compared with those that are run now
     """
-    shared = {key: grid.description[key] for key in ("kind", "budget", "evaluation")}
+    shared = {key: grid.description.get(key) for key in ("kind", "budget", "evaluation", "coverage")}
     check_settings(results / grid.experiment, shared, "grid.json")
     for cell in grid.with_seeds_in(results):
         check_settings(results / cell.folder, cell.config())

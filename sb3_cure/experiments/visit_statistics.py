@@ -112,7 +112,7 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
             means = judged.groupby(["method", "actor", "seed"]).error_mean.mean()
             ends = judged.groupby(["method", "actor"]).agg({"error_min": "min", "error_max": "max"})
             for row in _compare(experiment, task, means.to_dict()):
-                if head == "own":
+                if head in ("own", "mean_image"):  # which differ from arm to arm
                     row["task_ratio"] = Estimate(float("nan"))
                 low, high = ends.loc[row["method"], row["actor"]]
                 found.append(ErrorSummary(**row, head=str(head), error_min=float(low), error_max=float(high)))

@@ -103,6 +103,17 @@ def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:
     assert [cell.arguments["gamma"] for cell in load_grid(path).cells] == [0.1, 0.2, 0.3]
 
 
+def test_numbers_with_exponents_alone_are_numbers(tmp_path: Path) -> None:
+    """YAML 1.1 takes 1e-6 for a text, which would end the cell in its first update."""
+    path = write_grid(tmp_path)
+    (tmp_path / "zoo.yml").write_text(
+        "default: {tau: 1e-2, beta: -1E+3, gamma: .5e0, name: 1e, folder: e5, share: 0.5}"
+    )
+    [cell] = load_grid(path).cells
+    expected = {"tau": 0.01, "beta": -1000.0, "gamma": 0.5, "name": "1e", "folder": "e5", "share": 0.5}
+    assert {name: cell.arguments[name] for name in expected} == expected
+
+
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "an unknown kind": (dict(kind="curve"), "kind: Input should be 'curves', 'visitation' or 'pretraining'"),
     "a budget in words": (dict(budget="many"), r"budget: .*integer.* \(got 'many'\)"),

@@ -85,6 +85,12 @@ def test_other_pixels_are_not_compared(tmp_path: Path) -> None:
         ({"policy_kwargs": {"net_arch": [8]}}, False),
         ({"srl_kwargs": {"augmentation": "shift"}}, False),
         ({"train_freq": 4}, False),
+        ({"learning_starts": 1000, "warmup_updates": 1000, "update": "joint"}, True),
+        ({"learning_starts": 1_000_000}, False),
+        ({"warmup_updates": 0}, False),
+        ({"n_steps": 5}, False),
+        ({"srl_kwargs": {"latent_penalty": 1.0}}, False),
+        ({"env_wrapper": ["sb3_cure.envs.counting.CountReward"]}, False),
     ],
 )
 def test_other_settings_are_not_judged(tmp_path: Path, arguments: dict[str, Any], same: bool) -> None:

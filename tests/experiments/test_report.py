@@ -17,7 +17,7 @@ from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, write_cell, write_csv, write_grid
 
 from sb3_cure.experiments import plots, report, statistics
-from sb3_cure.experiments.results import read_results
+from sb3_cure.experiments.results import ResultsError, read_results
 from sb3_cure.experiments.tables import NONE, conditions_table
 
 TASK = "cartpole-swingup"
@@ -188,6 +188,28 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in (tmp_path / "table.md").read_text().replace(
         "\\", ""
     )
+
+
+def test_cells_that_were_counted_once_are_compared(tmp_path: Path) -> None:
+    """In table and headline; there is no line to draw."""
+    write_grid(tmp_path)
+    for method, cells in {"sac_ae": 100, "cure_sac_ae": 300}.items():
+        cell = write_cell(tmp_path, TASK, method, 0, curve(0, 0))
+        columns = ("environment_steps", "agent_steps", "cells", "entropy_bits")
+        write_csv(cell / "coverage.csv", columns, [(100_000, 0, cells, 1.0)])
+    assert report.main([str(tmp_path)]) == 0
+    _, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Cells of the true state")
+    assert (baseline[3], cure[3]) == ("100", "300")
+    assert "it reached 3.00 (one seed) times the cells" in (tmp_path / "table.md").read_text()
+    assert not (tmp_path / "cells_reached.png").exists()
+
+
+def test_cells_of_other_widths_are_not_compared(tmp_path: Path) -> None:
+    write_grid(tmp_path)
+    for method, width in {"sac_ae": 0.1, "cure_sac_ae": 0.2}.items():
+        write_cell(tmp_path, TASK, method, 0, curve(0, 0), coverage={"widths": {"slider": width}, "at": [100_000]})
+    with pytest.raises(ResultsError, match=r"was run with coverage .* cannot be compared"):
+        read_results(tmp_path)
 
 
 def test_coverage_comes_first_where_no_arm_has_a_return(tmp_path: Path) -> None:

@@ -57,12 +57,13 @@ def test_task_ratio_pairs_seeds_with_baseline(tmp_path: Path) -> None:
             ("cure_sac_ae", "curious", curious, roaming),
         ):
             rows = [("random", "own", 0, 1, 1, 1, 1), (actor, "own", 0, error, error, error, 1)]
-            rows += [(actor, "common", 0, error, error, error, 1)]
+            rows += [(actor, head, 0, error, error, error, 1) for head in ("common", "mean_image")]
             states = {"random": still, actor: visited}
             write_cell(folder, TASK, method, seed, {}, visitation=rows, states=states)
     (experiment,) = read_results(folder)
     errors = {(row.head, row.method, row.actor): row.task_ratio for row in summarise_errors(experiment)}
-    compared = ("common", "cure_sac_ae", "curious")  # the own heads of two agents are two yardsticks
+    # Own heads and mean images of two agents are two yardsticks.
+    compared = ("common", "cure_sac_ae", "curious")
     assert errors[compared].value == pytest.approx(np.sqrt(18))
     assert np.isnan([errors[key].value for key in errors if key != compared]).all()
     coverage = {(row.method, row.actor): row.task_ratio for row in state_coverage(experiment)}
