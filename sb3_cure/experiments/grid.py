@@ -232,8 +232,8 @@ class Cell:
         return env if self.coverage is None else TellCell(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
-        """An environment to measure policies in: in the same wrappers but ``gymnasium.RewardWrapper``, so that it gives
-        the task's reward.
+        """An environment to measure policies in: in the same wrappers but those of rewards
+        (``gymnasium.RewardWrapper``, ``NormalizeReward``), so that it gives the task's reward.
 
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
         """
@@ -311,7 +311,7 @@ class Grid:
 
 
 def _changes_rewards(wrapper: Any) -> bool:
-    return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper)
+    return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper | gym.wrappers.NormalizeReward)
 
 
 def constructor_defaults(algorithm: type) -> dict[str, Any]:
