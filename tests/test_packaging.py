@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.version import Version
 
 from sb3_cure import __version__
 from sb3_cure.zoo_files import GRIDS, ZOO, zoo_file
@@ -87,7 +88,10 @@ def test_files_are_found_by_name_or_path(tmp_path: Path) -> None:
 
 
 def test_changelog_and_citation_name_the_version() -> None:
+    """The last one that was released; what has changed since is of the next one."""
     released = re.search(r"^## \[(.*)\] - (.*)$", (ROOT / "CHANGELOG.md").read_text(), re.M)
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert released and released.groups() == (citation["version"], citation["date-released"])
-    assert citation["version"] == __version__
+    has_changed = "## [Unreleased]" in (ROOT / "CHANGELOG.md").read_text()
+    now, then = Version(__version__), Version(citation["version"])
+    assert now.is_prerelease and now > then if has_changed else now == then

@@ -172,6 +172,7 @@ def train(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--algo", default=DEFAULT_ALGORITHM)
     given, rest = parser.parse_known_args(arguments)
     if given.env is not None:
         module, _, task = given.env.rpartition(":")
@@ -180,8 +181,9 @@ def train(arguments: Sequence[str]) -> None:
     if given.gym_packages:
         rest += ["--gym-packages", *given.gym_packages]
     own_arguments = sys.argv
+    settings = ["--conf-file", DEFAULT_SETTINGS] if given.algo in ALGORITHMS else []  # else rl-zoo3's own
     # Of repeated flags argparse takes the last.
-    sys.argv = ["sb3-cure train", "--algo", DEFAULT_ALGORITHM, "--conf-file", DEFAULT_SETTINGS, *rest]
+    sys.argv = ["sb3-cure train", "--algo", given.algo, *settings, *rest]
     try:
         rl_zoo3.train.train()
     finally:
