@@ -28,7 +28,7 @@ from sb3_cure.buffers import transitions, unmarked
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation import Episode, evenly_measured, run_episodes, state_probe, trained_actors
+from sb3_cure.evaluation import Episode, as_trained, evenly_measured, run_episodes, state_probe, trained_actors
 from sb3_cure.metrics import frame_stack_of, newest_frames
 from sb3_cure.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.persistence import ExactCheckpoint as ExactCheckpoint
@@ -338,9 +338,8 @@ class ReconstructionCallback(PeriodicCallback):
         if len_of(self.observations) == 0:  # nothing good has been seen so far
             self.observations = None
             return
-        normalizer = model.get_vec_normalize_env()  # of vectors beside the images
-        given = self.observations if normalizer is None else normalizer.normalize_obs(self.observations)
-        observed, keys = obs_as_tensor(given, model.device), list(image_spaces(model.observation_space))
+        observed = obs_as_tensor(as_trained(model, self.observations), model.device)
+        keys = list(image_spaces(model.observation_space))
         title = "What the agent sees, and what its latents hold of it"
         reconstruct = getattr(model.policy, "reconstruct", lambda observations: None)
         with th.no_grad():

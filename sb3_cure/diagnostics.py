@@ -18,7 +18,7 @@ from sb3_cure.envs import render_check
 from sb3_cure.layers import Conv2dReLU
 from sb3_cure.observations import image_spaces, images_of
 from sb3_cure.policies import CuRePolicy, encoder_of
-from sb3_cure.srl import RAE, DictHead, heads_by_key
+from sb3_cure.srl import RAE, DictHead
 
 #: Transitions, of all environments together, within which a constant image is looked for
 RECENT = 1000
@@ -288,17 +288,16 @@ def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) 
     """Share of the targets' variance that the autoencoder's drawings explain, of several images that of the worst; None
     for heads that are not ``RAE``, and of images without any variance."""
     head = getattr(model.policy, "srl", None)
-    heads = heads_by_key(head)
-    if not heads or not all(isinstance(each, RAE) for each in heads.values()):
+    parts: list[Any] = head.parts(latents) if isinstance(head, DictHead) else [("", head, latents)]
+    if not all(isinstance(each, RAE) for _, each, _ in parts):
         return None
     seen = model.policy.samples(batch, random=False)
-    parts = {key: seen.of(key) if key else seen for key in heads}
-    wheres = head.slices if isinstance(head, DictHead) else [slice(None)]
     shares = []
-    for (key, each), where in zip(heads.items(), wheres, strict=True):
-        variance = float(each.target(parts[key].views, dither=False).var(dim=0, correction=0).mean())
+    for key, each, own in parts:
+        shown = seen.of(key) if key else seen
+        variance = float(each.target(shown.views, dither=False).var(dim=0, correction=0).mean())
         if variance > 0:
-            shares.append(1 - float(each.error(parts[key], latents[:, where]).mean()) / variance)
+            shares.append(1 - float(each.error(shown, own).mean()) / variance)
     return min(shares, default=None)
 
 

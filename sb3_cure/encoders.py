@@ -22,7 +22,7 @@ from sb3_cure.layers import (
     full_precision,
     init_weights,
 )
-from sb3_cure.observations import image_spaces
+from sb3_cure.observations import by_key, image_spaces
 
 
 class Encoder(BaseFeaturesExtractor):
@@ -219,10 +219,9 @@ class ExtractorTrunk(nn.Module):
         """
         if not self._reads_vectors:
             return self.extractor(observations.contiguous())  # type: ignore[no-any-return]
-        parts = observations if isinstance(observations, dict) else {"": observations}
+        parts = {key: part.float().contiguous() for key, part in by_key(observations).items()}
         with full_precision(next(iter(parts.values()))):
-            parts = {key: part.float().contiguous() for key, part in parts.items()}
-            return self.extractor(parts if isinstance(observations, dict) else parts[""])  # type: ignore[no-any-return]
+            return self.extractor(parts.get("", parts))  # type: ignore[no-any-return]
 
 
 class ExtractorEncoder(Encoder):

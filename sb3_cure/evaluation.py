@@ -94,7 +94,7 @@ def even_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) 
     if not heads:
         return
     actors = [*trained_actors(model), "random"]
-    seen = [_as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
+    seen = [as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
     for key, head in heads.items():
         share = max(len(head.bank) // len(actors), 1)
         images = [images_of(each, model.observation_space)[key] for each in seen]
@@ -130,8 +130,12 @@ def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None)
             head.set_bank(usual[key])
 
 
-def _as_trained(model: BaseAlgorithm, observations: Any) -> Any:
-    """Observations normalised as in training, if a ``VecNormalize`` did so."""
+def as_trained(model: BaseAlgorithm, observations: Any) -> Any:
+    """
+    :param model: A model
+    :param observations: As its environments give them
+    :return: Normalised as in training, if a ``VecNormalize`` did so
+    """
     normalizer = model.get_vec_normalize_env()
     return observations if normalizer is None else normalizer.normalize_obs(observations)
 
@@ -178,7 +182,7 @@ def run_episodes(
             if actor == "random":
                 action = env.action_space.sample()
             else:
-                action, memory = predict(_as_trained(model, observation), memory, np.array([not steps]), deterministic)
+                action, memory = predict(as_trained(model, observation), memory, np.array([not steps]), deterministic)
             if state_of:
                 true_states.append(np.array(state_of(env)))  # a copy
             observation, reward, terminated, truncated, _ = env.step(action)
@@ -191,7 +195,7 @@ def run_episodes(
         actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
-            errors = srl_errors(model, _as_batch(model, _as_trained(model, seen), actions, rewards, dones))
+            errors = srl_errors(model, _as_batch(model, as_trained(model, seen), actions, rewards, dones))
         kept = {"states": np.stack(true_states)} if states else {}
         yield Episode(rewards, errors, rows_of(seen, slice(-1)), frames, **kept)  # type: ignore[arg-type]
 
@@ -324,7 +328,7 @@ def state_probe(
         n = len(episode.states)
         if n != len(episode.rewards):
             raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
-        seen = obs_as_tensor(_as_trained(model, episode.observations), model.device)
+        seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
         parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, n, 128)]
         with th.no_grad():
             latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in parts]))

@@ -109,9 +109,9 @@ def published_method(config: dict) -> tuple[str | None, bool]:
     augmentation = arguments.get("augmentation") or head.pop("augmentation", "none")
     usual = ("crop",) if base == "CURL" else ("none", "auto")  # auto: what the head asks for, nothing with "rae"
     settings = {**SETTINGS, "warmup_updates": WARMUP_UPDATES.get(str(base))}
-    others = {key: value for key, value in arguments.items() if key not in FREE and settings.get(key) != value}
+    is_usual = augmentation in usual and all(key in FREE or settings.get(key) == arguments[key] for key in arguments)
     is_plain = config.get("algo", "cure_sac") == "cure_sac" and arguments.get("curiosity", "separate") is None
-    return base, augmentation in usual and is_plain and not others and not head
+    return base, is_usual and is_plain and not head
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class DictHead(SRLHead):
         :param next_latents: Unused
         :return: Sum of the losses, and the mean error of each sample, [B]
         """
-        outputs = [head.loss(batch.of(key), part) for key, head, part in self._parts(latents)]
+        outputs = [head.loss(batch.of(key), part) for key, head, part in self.parts(latents)]
         error = self.mean_error([output.error for output in outputs], learns=th.is_grad_enabled())
         return SRLOutput(th.stack([output.loss.float() for output in outputs]).sum(), error)
 
@@ -72,7 +72,7 @@ class DictHead(SRLHead):
         :param latents: Joined latents, [B, features_dim]
         :return: Mean of the noise-free errors, [B]
         """
-        errors = [head.error(batch.of(key), part) for key, head, part in self._parts(latents)]
+        errors = [head.error(batch.of(key), part) for key, head, part in self.parts(latents)]
         return self.mean_error(errors, learns=False)
 
     def reconstruct(self, latents: th.Tensor) -> dict[str, th.Tensor] | None:  # type: ignore[override]
@@ -80,7 +80,7 @@ class DictHead(SRLHead):
         :param latents: Joined latents, [B, features_dim]
         :return: Views by key, or None if the heads do not decode
         """
-        drawn = {key: head.reconstruct(part) for key, head, part in self._parts(latents)}
+        drawn = {key: head.reconstruct(part) for key, head, part in self.parts(latents)}
         return None if None in drawn.values() else drawn
 
     def after_step(self) -> None:
@@ -88,8 +88,11 @@ class DictHead(SRLHead):
         for head in heads_by_key(self).values():
             head.after_step()
 
-    def _parts(self, latents: th.Tensor) -> list[tuple[str, Any, th.Tensor]]:
-        """Key, head and latents of each image."""
+    def parts(self, latents: th.Tensor) -> list[tuple[str, Any, th.Tensor]]:
+        """
+        :param latents: Joined latents, [B, features_dim]
+        :return: Key, head and latents of each image
+        """
         parts = zip(self.keys, self.heads, self.slices, strict=True)
         return [(key, head, latents[:, where]) for key, head, where in parts]
 
