@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import pickle
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -719,7 +720,8 @@ def test_tensorboard_goes_on_in_its_folder(tmp_path: Path) -> None:
     learn(model, "first")
     model.logger.close()
     steps = []
-    for path in sorted((board / "CuReSAC_1").iterdir()):
+    # Named by second, process and number of the file: by these as numbers, as both may begin in one second.
+    for path in sorted((board / "CuReSAC_1").iterdir(), key=lambda path: list(map(int, re.findall(r"\d+", path.name)))):
         events = EventAccumulator(str(path)).Reload()
         steps.append([event.step for event in events.Scalars("rollout/ep_rew_mean")])
     assert steps == [[7, 14, 21, 28], [28, 35, 42, 49, 56]]  # of which TensorBoard drops the first 28
