@@ -1,11 +1,14 @@
 """A policy as a plain module: the actions of ``predict``, also when it was traced or exported."""
 
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch as th
+from dictionaries_for_tests import sensor_model
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 
 from sb3_cure.deployment import DeterministicActor
@@ -39,6 +42,17 @@ def test_actions_are_those_of_predict(name: str) -> None:
         for follow in (module, traced, exported):
             with th.no_grad():
                 np.testing.assert_allclose(follow(batch).numpy(), expected, atol=1e-5)
+
+
+def test_onnx_of_a_dictionary(tmp_path: Path) -> None:
+    """Another runtime acts as ``predict`` does, on inputs of the names that the guide tells."""
+    model, file = sensor_model(srl="curl").learn(14), tmp_path / "policy.onnx"
+    observation: Any = model.observation_space.sample()
+    batch = {key: part[None] for key, part in observation.items()}
+    th.onnx.export(DeterministicActor(model), ({key: th.as_tensor(part) for key, part in batch.items()}, {}), file)
+    inputs = {f"observations_{key}": part for key, part in batch.items()}
+    (actions,) = onnxruntime.InferenceSession(file).run(None, inputs)
+    np.testing.assert_allclose(actions, model.predict(batch, deterministic=True)[0], atol=1e-5)
 
 
 def test_what_acts_is_all_that_leaves() -> None:

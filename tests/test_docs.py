@@ -147,8 +147,8 @@ def test_own_reward_of_the_guide_falls_as_it_is_learned() -> None:
 
 
 def test_a_policy_leaves_for_the_robot_as_the_guide_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file that its lines write gives the actions of ``predict``."""
-    here, on_the_robot = blocks("docs/guide/robot.md")
+    """The files that its lines write, torch's and ONNX's, give the actions of ``predict``."""
+    here, on_the_robot, onnx = blocks("docs/guide/robot.md")
     monkeypatch.chdir(tmp_path)
     model = tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0))
     names: dict = {"model": model}
@@ -156,6 +156,8 @@ def test_a_policy_leaves_for_the_robot_as_the_guide_says(tmp_path: Path, monkeyp
         exec(compile(block, "robot.md", "exec"), names)
     actions, _ = model.predict(names["images"].numpy(), deterministic=True)
     np.testing.assert_allclose(names["actions"].detach(), actions, atol=1e-5)
+    np.testing.assert_allclose(names["action"], actions[0], atol=1e-5)
+    exec(compile(onnx, "robot.md", "exec"), names)
     np.testing.assert_allclose(names["action"], actions[0], atol=1e-5)
 
 
