@@ -238,10 +238,10 @@ class ExactCheckpoint(BaseCallback):
 
     On the CPU with ``precision="fp32", compile=False`` the resumed run equals one without interruption bit for bit
     (with ``overlap=True``, whose updates lag behind, it does not). Environments that cannot tell their state begin a
-    new episode instead, which is said when training starts; ``VecNormalize`` goes on with its statistics. On SIGTERM
-    and SIGINT a checkpoint is written before the next rollout (with ``train_freq=1``: the next step), then the process
-    leaves with the status that the signal asks for. Workers of SB3's ``SubprocVecEnv`` die of a Ctrl-C in a terminal:
-    their episodes then begin anew.
+    new episode instead, which is said when training starts; ``VecNormalize`` and Gymnasium's ``NormalizeReward`` go on
+    with their statistics. On SIGTERM and SIGINT a checkpoint is written before the next rollout (with ``train_freq=1``:
+    the next step), then the process leaves with the status that the signal asks for. Workers of SB3's
+    ``SubprocVecEnv`` die of a Ctrl-C in a terminal: their episodes then begin anew.
 
     :param save_freq: Agent steps between two checkpoints (of all environments together)
     :param path: Folder for the checkpoints of this training, made if missing

@@ -94,21 +94,43 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> None:
         ) from error
 
 
-def statistics_state(venv: VecEnv) -> list[dict[str, Any]]:
+def statistics_state(venv: VecEnv, answers: bool) -> dict[str, list[Any]]:
     """
-    :param venv: Environments, which need not answer
-    :return: What each ``VecNormalize`` around them has learned, the outermost first
+    :param venv: Environments that cannot tell all that they remember
+    :param answers: Whether they can be asked at all
+    :return: What each ``VecNormalize`` around them has learned, the outermost first; and the running means of wrappers
+        such as Gymnasium's ``NormalizeReward`` in each of them
     """
-    return [_layer_state(layer, [layer]) for layer in _normalizers(venv)]
+    outer = [_layer_state(layer, [layer]) for layer in _normalizers(venv)]
+    try:
+        envs = _in_envs(_layers(venv)[-1], _env_statistics, [None] * venv.num_envs) if answers else []
+    except _NotPlain:
+        envs = []
+    return {"layers": outer, "envs": envs}
 
 
-def load_statistics(venv: VecEnv, states: list[dict[str, Any]]) -> None:
+def load_statistics(venv: VecEnv, state: dict[str, list[Any]]) -> None:
     """
     :param venv: Environments, which are to be reset after this
-    :param states: Of ``statistics_state``
+    :param state: Of ``statistics_state``
     """
-    for layer, state in zip(_normalizers(venv), states, strict=True):
-        _load_layer(layer, state)
+    for layer, layer_state in zip(_normalizers(venv), state["layers"], strict=True):
+        _load_layer(layer, layer_state)
+    if state["envs"]:
+        _in_envs(_layers(venv)[-1], _load_env_statistics, state["envs"])
+
+
+def _env_statistics(env: gym.Env, _: Any) -> list[dict[str, Any]]:
+    return [
+        {key: _encoded(value, {}) for key, value in vars(layer).items() if type(value) in _HELPERS}
+        for layer in _layers(env)
+    ]
+
+
+def _load_env_statistics(env: gym.Env, states: list[dict[str, Any]]) -> None:
+    for layer, saved in zip(_layers(env), states, strict=True):
+        for key, value in saved.items():
+            _decoded(value, vars(layer)[key], {})
 
 
 def _normalizers(venv: Any) -> Iterator[VecNormalize]:

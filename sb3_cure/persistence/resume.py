@@ -102,12 +102,13 @@ def training_state(model: OffPolicyAlgorithm, run: Run, environments_may_be_gone
     :return: What training depends on, beside what ``save`` and the replay buffer hold
     """
     assert model.env is not None
+    answers = True
     try:
         environments = vec_env_state(model.env)
     except (OSError, EOFError, RuntimeError) as error:
         if not environments_may_be_gone:
             raise RuntimeError(f"the environments do not tell their state ({error or type(error).__name__})") from error
-        environments = None
+        environments, answers = None, False
     return {
         "num_timesteps": model.num_timesteps,
         "calls": list(run.calls),
@@ -115,8 +116,8 @@ def training_state(model: OffPolicyAlgorithm, run: Run, environments_may_be_gone
         "n_envs": model.n_envs,
         "random": random_state(model),
         "environments": environments,
-        # Of the environments only what this process knows
-        "statistics": [] if environments is not None else statistics_state(model.env),
+        # If that is not there, what networks and replay buffer are used to
+        "statistics": None if environments is not None else statistics_state(model.env, answers),
         "logger": _logger_state(model.logger),
         "callbacks": [[type(callback).__name__, _changed(callback)] for callback in run.watched],
     }

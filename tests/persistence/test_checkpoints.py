@@ -27,6 +27,7 @@ import pytest
 import torch as th
 from dictionaries_for_tests import Goal, SensorBox
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import TD3
@@ -603,6 +604,23 @@ def test_statistics_outlive_secretive_environments(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="NoState"):
         resumed.learn(60, callback=ExactCheckpoint(30, tmp_path))
     assert ours.obs_rms.count > 59 and ours.ret_rms.count > 59  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])
+def test_statistics_of_wrappers_outlive_secretive_environments(vec_env_class: Any, tmp_path: Path) -> None:
+    """Of each environment, in this process or in a worker."""
+
+    def make() -> VecEnv:
+        return vec_env_class([lambda: Monitor(NormalizeReward(NormalizeObservation(NoState(VectorBox(99)))))] * 2)
+
+    def counts(env: Any) -> list[float]:
+        return [float(each.count) for name in ("obs_rms", "return_rms") for each in env.get_attr(name)]
+
+    env = make()
+    with pytest.warns(UserWarning, match="NoState"), pytest.raises(Killed):
+        tiny_model("MlpPolicy", env).learn(60, callback=[KillAt(21), ExactCheckpoint(40, tmp_path)])
+    resumed = CuReSAC.resume(tmp_path, make(), device="cpu")
+    assert counts(resumed.env) == pytest.approx([each - 1 for each in counts(env)])  # of the checkpoint, a step before
 
 
 @pytest.mark.parametrize("kill_at", [15, 55, 100])
