@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
+
 from benchmarks.harness import interleaved, make_env, summary
+from sb3_cure.envs import make_dmc_env, make_pixel_env
 
 
-def _step_call(image_size: int, renderer: str, task: tuple[str, str]) -> Callable[[], object]:
-    from sb3_cure import make_dmc_env
-
-    env = make_dmc_env(*task, image_size=image_size, renderer=renderer, action_repeat=1, seed=0)
-    env.reset()
+def _step_call(env: gym.Env) -> Callable[[], object]:
+    env.reset(seed=0)
     action = env.action_space.sample()
 
     def step() -> None:
@@ -28,9 +28,17 @@ def measure(repeats: int = 7) -> dict[str, Any]:
     """
     make_env().close()
     variants = {
-        f"{domain}-{task}, {size} px, {renderer}": _step_call(size, renderer, (domain, task))
+        f"{domain}-{task}, {size} px, {renderer}": _step_call(
+            make_dmc_env(domain, task, image_size=size, renderer=renderer, action_repeat=1)
+        )
         for domain, task in (("cartpole", "swingup"), ("cheetah", "run"))
         for size in (36, 84, 100)
         for renderer in ("dmc", "fast")
+    }
+    variants |= {
+        f"{id} of Gymnasium, {size} px, {renderer}": _step_call(make_pixel_env(id, image_size=size, renderer=renderer))
+        for id in ("HalfCheetah-v5", "Ant-v5")
+        for size in (48, 84)
+        for renderer in ("env", "fast")
     }
     return {name: summary(values) for name, values in interleaved(variants, repeats, calls=20).items()}

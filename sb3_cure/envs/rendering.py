@@ -41,7 +41,12 @@ def _glfw_has_a_display() -> bool:
 
 
 def choose_backend() -> None:
-    """Let MuJoCo, which asks when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display."""
+    """Let MuJoCo, which asks when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
+
+    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set.
+    """
+    # It starts a thread per core for each environment, which small images only slow down.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
         os.environ["MUJOCO_GL"] = "egl"
 
@@ -50,15 +55,13 @@ def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
-    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set, and SDL's windows to do
-    without OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is. No rendering context is made, so a process that has only
+    Mesa's software renderer is told to use no extra threads, as by ``choose_backend``, and SDL's windows to do without
+    OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is set. No rendering context is made, so a process that has only
     called this can still be forked.
 
     :raises GLUnavailableError: If the libraries or their drivers are missing
     """
     choose_backend()
-    # Mesa's software renderer starts a thread per core for each environment, which small images only slow down.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
     # pygame, which opens windows for render_mode="human", would draw with OpenGL, too: that ends the process (EGL), or
     # the window shows the first frame for ever (GLFW).
     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")

@@ -14,6 +14,9 @@ from sb3_cure.envs.rendering import choose_backend
 
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
+#: How many rows and columns of a fast frame make one of the image: drawing more pixels and averaging them smooths edges
+#: as multisampling does, which takes software renderers several times as long
+OVERSAMPLING = 2
 
 
 def check_at_least_one(name: str, value: Any, usual: int) -> int:
@@ -47,6 +50,26 @@ def check_frame(frame: Any, env: gym.Env) -> None:
         f"Rendering {env} with render_mode={env.render_mode!r} gave {given}, but frames are uint8 of shape (height, "
         f"width, 3): {fix}."
     )
+
+
+def draw_fast(env: gym.Env, image_size: int) -> None:
+    """Let an environment draw frames of little more than what is observed, without shadows and reflections.
+
+    :param env: A MuJoCo environment of Gymnasium or Gymnasium-Robotics that has not rendered yet
+    :param image_size: Height and width of the observation in pixels
+    :raises ValueError: If it is another environment
+    """
+    base: Any = env.unwrapped
+    if not hasattr(base, "mujoco_renderer"):
+        raise ValueError(f"renderer='fast' is for Gymnasium's MuJoCo environments, which {env} is not: use 'env'.")
+    choose_backend()
+    # All of this takes effect because the rendering context is made with the first frame.
+    visual, size = base.model.vis, OVERSAMPLING * image_size
+    visual.quality.shadowsize = visual.quality.offsamples = 0
+    base.model.mat_reflectance[:] = 0
+    base.mujoco_renderer.width = base.mujoco_renderer.height = size
+    visual.global_.offwidth = max(visual.global_.offwidth, size)
+    visual.global_.offheight = max(visual.global_.offheight, size)
 
 
 class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -128,14 +151,19 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
     :param env: An environment made with ``render_mode="rgb_array"``
     :param image_size: Height and width of the observation in pixels; frames of another size are area-averaged to it
     :param grayscale: One channel of luminance instead of three of RGB
-    :raises ValueError: If ``image_size`` is not an integer of at least 1, or, when first reset, if ``env`` does not
-        render uint8 RGB frames
+    :param renderer: ``"env"`` or ``"fast"``, see :func:`make_pixel_env`
+    :raises ValueError: If ``image_size`` is not an integer of at least 1, if ``env`` cannot be drawn fast, or, when
+        first reset, if it does not render uint8 RGB frames
     """
 
-    def __init__(self, env: gym.Env, image_size: int = 84, grayscale: bool = False) -> None:
-        RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale)
+    def __init__(self, env: gym.Env, image_size: int = 84, grayscale: bool = False, renderer: str = "env") -> None:
+        RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale, renderer=renderer)
         super().__init__(env)
         self.image_size = check_at_least_one("image_size", image_size, usual=84)
+        if renderer not in ("env", "fast"):
+            raise ValueError(f"renderer is {renderer!r}: choose 'env' or 'fast'.")
+        if renderer == "fast":
+            draw_fast(env, self.image_size)
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
@@ -234,6 +262,7 @@ def make_pixel_env(
     frame_stack: int = 3,
     action_repeat: int = 1,
     grayscale: bool = False,
+    renderer: str = "env",
 ) -> gym.Env:
     """
     Make any Gymnasium environment that can render itself one that is seen through pixels.
@@ -247,8 +276,12 @@ def make_pixel_env(
     :param frame_stack: Number of frames in an observation
     :param action_repeat: Environment steps per agent step; their rewards are summed
     :param grayscale: One channel of luminance per frame instead of three of RGB
+    :param renderer: ``"env"`` gives the pixels of ``env``; ``"fast"``, for MuJoCo environments of Gymnasium, leaves out
+        shadows and reflections and draws at twice the ``image_size``, which is many times faster without a GPU and
+        shows other pixels: another environment (videos of it have these frames, too)
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack`` and ``action_repeat``
-    :raises ValueError: If an argument is out of range or, when first reset, ``env`` does not render RGB frames
+    :raises ValueError: If an argument is out of range, ``env`` cannot be drawn fast or, when first reset, does not
+        render RGB frames
     """
     if isinstance(env, str):
         choose_backend()
@@ -256,4 +289,4 @@ def make_pixel_env(
     env = ActionRepeat(env, action_repeat)
     if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):
         env = NormalizeActions(env)
-    return StackFrames(PixelObservation(env, image_size, grayscale), frame_stack)
+    return StackFrames(PixelObservation(env, image_size, grayscale, renderer), frame_stack)

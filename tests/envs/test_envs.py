@@ -442,6 +442,21 @@ def test_pixel_environment_from_an_id():
         del gym.registry["test/Painting-v0"]
 
 
+def test_gymnasium_is_drawn_fast():
+    """The same steps, seen in the same way but for shadows, which lie beside the robot here; few pixels are drawn."""
+    frames = {}
+    for renderer in ("env", "fast"):
+        env = make_pixel_env("InvertedPendulum-v5", image_size=36, frame_stack=1, renderer=renderer)
+        first, _ = env.reset(seed=0)
+        steps = [env.step(np.array([action], dtype=np.float32)) for action in (1, 1, 1, -1, -1)]
+        frames[renderer] = np.array([first, *(step[0] for step in steps[1:])], dtype=float)
+        assert env.render().shape == {"env": (480, 480, 3), "fast": (72, 72, 3)}[renderer]
+        env.close()
+    between = np.abs(frames["fast"] - frames["env"]).mean(axis=(1, 2, 3))
+    since_the_first = np.abs(frames["env"][1:] - frames["env"][0]).mean(axis=(1, 2, 3))
+    assert between.max() < since_the_first.min() / 2
+
+
 # -------------------------------------------------------------------------------------------------- bad input
 
 
@@ -476,6 +491,8 @@ def test_bad_input_is_answered_in_one_sentence(kwargs, named):
         (lambda: make_pixel_env(Painting(render_mode=None)).reset(), "render_mode=None.*make it with 'rgb_array'"),
         (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*make it with 'rgb_array'"),
         (lambda: make_pixel_env(Painting(), action_repeat=-1), "action_repeat=-1"),
+        (lambda: make_pixel_env(Painting(), renderer="fast"), "Gymnasium's MuJoCo environments.*use 'env'"),
+        (lambda: make_pixel_env(Painting(), renderer="quick"), "'quick'.*'env' or 'fast'"),
         (lambda: ActionRepeat(Painting(), 0), "action_repeat=0"),
         (lambda: NormalizeActions(Painting()), "Discrete"),
         (lambda: StackFrames(gym.wrappers.FlattenObservation(Painting()), 0), "frame_stack=0"),
