@@ -413,7 +413,6 @@ class CuRe(OffPolicyAlgorithm):
         """
         rollout = super().collect_rollouts(*args, **kwargs)
         if not self._warmed_up and self.num_timesteps > self.learning_starts and rollout.continue_training:
-            self._warmed_up = True
             updates = self.warmup_updates
             if updates is None:
                 updates = 0 if self.srl is None or self.learning_starts == 0 else get_srl_class(self.srl).warmup_updates
@@ -423,6 +422,7 @@ class CuRe(OffPolicyAlgorithm):
                     CuRe.train(self, gradient_steps=updates, batch_size=self.batch_size)  # now, also with overlap=True
                 finally:
                     self._in_burst = False
+            self._warmed_up = True
         return rollout
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:

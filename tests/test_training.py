@@ -1,5 +1,6 @@
 """A training run as a user sees it: who acts, what is stored, what is updated when, and what is logged."""
 
+import contextlib
 import copy
 import csv
 from collections.abc import Callable
@@ -150,6 +151,29 @@ def test_burst_after_warmup(
     arguments = dict(srl=srl, curiosity=curiosity, warmup_updates=warmup_updates, learning_starts=0)
     tiny_model("CnnPolicy", PixelBox(), **arguments).learn(2)
     assert calls == [(1, warmup_updates)] * bool(warmup_updates) + [(1, 1), (2, 1)]
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+@pytest.mark.parametrize("ended_by", ["a callback", "an exception"])
+def test_no_step_is_made_up_where_training_was_ended(ended_by: str, overlap: bool) -> None:
+    """The step in which it ended, the last one of an episode, is not stored; training goes on with a reset."""
+
+    class End(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.n_calls == 12 and ended_by == "an exception":
+                raise KeyboardInterrupt
+            return self.n_calls < 12
+
+    env = (SubprocVecEnv if overlap else DummyVecEnv)([lambda: Monitor(VectorBox(4))])
+    model = tiny_model("MlpPolicy", env, overlap=overlap)
+    with contextlib.suppress(KeyboardInterrupt):
+        model.learn(30, callback=End())
+    model.learn(10, reset_num_timesteps=False)
+    buffer: Any = model.replay_buffer
+    before, after = buffer.observations[:21, 0], buffer.next_observations[:21, 0]
+    assert buffer.size() == 21
+    np.testing.assert_allclose(after, np.clip(before + 0.3 * buffer.actions[:21, 0], -1, 1), atol=1e-6)
+    env.close()
 
 
 @pytest.mark.parametrize("extras", [{}, dict(srl=None, curiosity=None)], ids=["on", "off"])

@@ -1,5 +1,6 @@
 """The burst of updates after the warm-up, as SAC-AE's public code makes it: its step counter stands still meanwhile."""
 
+import itertools
 from typing import Any
 
 import pytest
@@ -35,6 +36,24 @@ def test_burst_updates_actors_in_every_update(update: str) -> None:
     assert numbers_of_steps(model) == {
         "task critic": 20, "curious critic": 20, "task actor": 14, "curious actor": 14, "task temperature": 14,
     }  # fmt: skip
+
+
+def test_interrupted_burst_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By Ctrl-C, as training seems to stand still meanwhile."""
+    model, calls = tiny_model("MlpPolicy", VectorBox(), warmup_updates=9), itertools.count(1)
+    step = model._gradient_step
+
+    def interrupted(*args: Any) -> None:
+        if next(calls) == 5:
+            raise KeyboardInterrupt
+        step(*args)
+
+    monkeypatch.setattr(model, "_gradient_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(20)
+    assert (model.num_timesteps, model._n_updates) == (11, 4)
+    model.learn(1, reset_num_timesteps=False)
+    assert model._n_updates == 4 + 9 + 1
 
 
 @pytest.mark.parametrize("burst", [4, 5])

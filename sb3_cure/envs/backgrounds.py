@@ -5,18 +5,23 @@ al. (2021), "The Distracting Control Suite". Where the robot is MuJoCo's own seg
 cameras are alike; it is rendered beside each frame.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
 
+#: What NumPy's generators take
+Seed = int | Sequence[int] | None
+
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
-_PLANE = 0
+#: Kinds of geoms that floors and walls are of: planes and height fields (MuJoCo's mjtGeom)
+_GROUND = (0, 1)
 
 
 class Background:
-    """Replaces the sky and the planes of the world, such as floor and walls, with the shadows on them.
+    """Replaces the sky and the ground of the world, such as floor, walls and hills, with the shadows on it.
 
     :param source: ``"noise"``: random pixels, new ones in each frame; or a folder of images, one of which is drawn for
         each episode, cut to a square
@@ -27,7 +32,7 @@ class Background:
     :raises ValueError: if it is neither ``"noise"`` nor a folder with images
     """
 
-    def __init__(self, source: str, physics: Any, size: int, seed: int | None = None):
+    def __init__(self, source: str, physics: Any, size: int, seed: Seed = None):
         self.rng = np.random.default_rng(seed)
         self.size = size
         self._images: list[Path] | None = None
@@ -39,12 +44,12 @@ class Background:
                     f"background={str(source)!r} is neither 'noise' nor a folder with images ({', '.join(_SUFFIXES)})."
                 )
         model = physics.model
-        self._planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == _PLANE))
+        self._ground = np.flatnonzero((model.geom_bodyid == 0) & np.isin(model.geom_type, _GROUND))
         #: Which image the episode has; None: noise
         self.drawn: int | None = None
         self._image = np.zeros((size, size, 3), dtype=np.uint8)
 
-    def begin(self, seed: int | None) -> None:
+    def begin(self, seed: Seed) -> None:
         """Draw what an episode is seen before.
 
         :param seed: As of ``reset``
@@ -64,11 +69,11 @@ class Background:
     def mask(self, camera: Any) -> np.ndarray:
         """
         :param camera: A camera of dm_control
-        :return: Where it sees sky or planes of the world, bool [size, size]
+        :return: Where it sees sky or ground, bool [size, size]
         """
         seen = camera.render(segmentation=True)
         numbers, kinds = seen[..., 0], seen[..., 1]
-        return (kinds == -1) | (kinds == _geom()) & np.isin(numbers, self._planes)
+        return (kinds == -1) | (kinds == _geom()) & np.isin(numbers, self._ground)
 
     def behind(self, frame: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """

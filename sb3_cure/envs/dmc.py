@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from sb3_cure.envs.backgrounds import Background
+from sb3_cure.envs.backgrounds import Background, Seed
 from sb3_cure.envs.physics import Proprioception
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
@@ -47,7 +47,7 @@ class DMCPixels(PixelObservation):
         camera_id: int = 0,
         renderer: str = "dmc",
         background: str | None = None,
-        seed: int | None = None,
+        seed: Seed = None,
     ) -> None:
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -132,7 +132,11 @@ class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.ut
             **{name: value for name, value in kwargs.items() if name != "seed"},  # as of `DMCPixels`
         )
         super().__init__(env)
-        self._cameras = {key: DMCPixels(env, image_size, camera_id=index, **kwargs) for key, index in cameras.items()}
+        seeds = _apart(kwargs.pop("seed", None), len(cameras))
+        self._cameras = {
+            key: DMCPixels(env, image_size, camera_id=index, seed=seed, **kwargs)
+            for (key, index), seed in zip(cameras.items(), seeds, strict=True)
+        }
         self._joints = Proprioception(env) if proprioception else None
         first = next(iter(self._cameras.values()))
         self.image_size, self.renderer = first.image_size, first.renderer
@@ -146,9 +150,9 @@ class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.ut
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        for camera in self._cameras.values():
+        for camera, own in zip(self._cameras.values(), _apart(seed, len(self._cameras)), strict=True):
             if camera.background is not None:
-                camera.background.begin(seed)
+                camera.background.begin(own)
         return super().reset(seed=seed, options=options)
 
     def observation(self, observation: Any) -> dict[str, np.ndarray]:
@@ -172,6 +176,11 @@ class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.ut
         """
         for key, camera in self._cameras.items():
             camera.load_state_dict(state[key])
+
+
+def _apart(seed: int | None, n_cameras: int) -> list[Seed]:
+    """Seeds of the cameras' backgrounds; that of the first is the seed itself, as if it were the only one."""
+    return [seed if position == 0 or seed is None else [seed, position] for position in range(n_cameras)]
 
 
 def make_dmc_env(

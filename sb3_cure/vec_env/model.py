@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.buffers import SkipsMarked, restarts_workers
 from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
-from sb3_cure.vec_env.finite_check import BadTransitionError, FiniteCheck
+from sb3_cure.vec_env.finite_check import FiniteCheck
 
 
 class ModelEnvironments(OffPolicyAlgorithm):
@@ -71,13 +71,15 @@ class ModelEnvironments(OffPolicyAlgorithm):
         :param env: Environments
         :return: What was collected
         """
+        goes_on = False
         try:
-            return super().collect_rollouts(self._overlapped or env, *args, **kwargs)
-        except BaseException as error:
-            if self._overlapped is not None or isinstance(error, BadTransitionError):
-                # The environments have gone on without us: another `learn` starts with a reset.
+            rollout = super().collect_rollouts(self._overlapped or env, *args, **kwargs)
+            goes_on = rollout.continue_training
+        finally:
+            if not goes_on:
+                # The environments have made a step that is not stored: another `learn` starts with a reset.
                 self._last_obs = None
-            raise
+        return rollout
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update now or, with ``overlap=True`` while ``learn`` runs, during the next step.

@@ -284,7 +284,9 @@ class _Worker:
         return answer
 
     def _lost(self, what: str, details: str = "") -> EnvFaultError:
-        if self.owner.on_env_fault == "restart":
+        if self._request[0] == "get_spaces" and self.restarts == 0:
+            fix = "mend what makes it; a script that starts workers needs `if __name__ == '__main__':`."
+        elif self.owner.on_env_fault == "restart":
             fix = "its worker is replaced, and training goes on without this transition."
         else:
             fix = "pass on_env_fault='restart' to replace its worker and go on, or mend the cause."

@@ -71,6 +71,26 @@ def test_noise_is_new_in_each_frame_and_drawn_by_the_seed() -> None:
     assert np.abs(corners[1:].astype(int) - corners[:-1]).mean() > 60, "of independent pixels: 85"
 
 
+def test_cameras_see_noise_of_their_own() -> None:
+    """That of the first is the one that it would see alone."""
+    alone, _ = episode(steps=0, background="noise")
+    env = make_dmc_env(
+        "reacher", "easy", cameras=[0, 1], image_size=36, frame_stack=1, renderer="fast", background="noise"
+    )
+    for _ in range(2):  # also where a seed is given again
+        seen: Any = env.reset(seed=1)[0]
+        np.testing.assert_array_equal(seen["camera0"], alone[0])
+        assert (seen["camera1"] == seen["camera0"]).mean() < 0.1
+    env.close()
+
+
+def test_hills_are_ground() -> None:
+    """Of the quadruped's terrain, a height field, nothing is left."""
+    arguments: dict[str, Any] = dict(steps=0, domain="quadruped", task="escape")
+    plain, seen = episode(**arguments)[0], episode(**arguments, background="noise")[0]
+    assert (plain != seen).any(axis=1).mean() > 0.8
+
+
 def test_each_episode_draws_an_image(folder: str) -> None:
     """The first by the seed, those after it go on with its stream."""
 

@@ -566,6 +566,9 @@ def test_failed_construction_leaves_no_process_behind() -> None:
     children = set(psutil.Process().children())
     with pytest.raises(EnvFaultError, match=r"Environment 1 raised FileNotFoundError.* when it was made") as caught:
         made([VectorBox, cannot_be_made])
+    assert str(caught.value).endswith(
+        "mend what makes it; a script that starts workers needs `if __name__ == '__main__':`."
+    )
     assert "in cannot_be_made" in caught.value.__notes__[0]
     assert set(psutil.Process().children()) <= children
 
