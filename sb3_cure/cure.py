@@ -520,6 +520,12 @@ class CuRe(OffPolicyAlgorithm):
             )
         if trains:
             self._learn_from("srl", loss.float(), srl.optimizer, "srl", read)
+            if all(copy.grad is None and copy.requires_grad for _, copy in read):
+                warnings.warn(
+                    f"the loss of {type(srl).__name__} does not depend on the latents that it is given, so it does not "
+                    "train the encoder: what a head encodes itself counts as constant.",
+                    stacklevel=2,
+                )
             srl.after_step()
         variance = latents.var(dim=0, correction=0).mean()
         self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})

@@ -112,11 +112,15 @@ class Evaluation(_Part):
     episodes: PositiveInt = 10
 
 
+#: Settings of which an override of some keys leaves the others: they belong to whatever head and reward there is
+_MERGED = ("env_kwargs", "policy_kwargs")
+
+
 class Method(_Part):
     """An arm of the comparison.
 
     :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
-    :param overrides: What differs from the file's entry
+    :param overrides: What differs from the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
     :param algo: A key of ``ALGOS``
     :param pretrain: The phase before training, if any
     :param train: Whether the task is learned at all
@@ -462,9 +466,18 @@ def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any
     found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
     if not found:
         raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
-    entry = {"policy": "CnnPolicy", **entries[found[0]], **method.overrides}
+    entry = {"policy": "CnnPolicy", **entries[found[0]]}
+    entry |= {
+        key: _merged(entry.get(key), value) if key in _MERGED else value for key, value in method.overrides.items()
+    }
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
     return entry.pop("n_envs", 1), entry.pop("env_kwargs", {}), entry
+
+
+def _merged(mapping: Any, overrides: Any) -> Any:
+    if not (isinstance(mapping, dict) and isinstance(overrides, dict)):
+        return overrides
+    return {**mapping, **{key: _merged(mapping.get(key), value) for key, value in overrides.items()}}
 
 
 def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:

@@ -116,13 +116,19 @@ class SRLHead(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} must implement loss(batch, latents) -> SRLOutput")
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """The noise-free error, for measuring and plotting; by default that of ``loss``.
+        """The noise-free error, for measuring and plotting; by default that of ``loss``, of centred views.
+
+        Policies are measured in batches of any size: a loss that reads other samples of its batch needs an error of
+        its own, which does not, or measures them by how the batch was cut.
 
         :param batch: Samples of the replay buffer; ``batch.views`` are the centred ones
         :param latents: The encoder's output for ``batch.views``, [B, encoder.features_dim]
         :return: Error per sample, [B]
         """
-        return self.loss(batch, latents).error
+        if not self.needs_next_latents:
+            return self.loss(batch, latents).error
+        next_views = self.augment.center(batch.next_observations)
+        return self.loss(batch, latents, self.encoder(self.preprocess(next_views)).float()).error
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
         """

@@ -144,17 +144,6 @@ class Inverse(SRLHead):
         error = (self.model(th.cat([latents, next_latents], dim=1)) - batch.actions).square().mean(dim=1)
         return SRLOutput(error.mean(), error.detach())
 
-    @th.no_grad()
-    def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """The same of centred views.
-
-        :param batch: Samples of the replay buffer
-        :param latents: [B, features_dim]
-        :return: [B]
-        """
-        next_views = self.augment.center(batch.next_observations)
-        return self.loss(batch, latents, self.encoder(self.preprocess(next_views)).float()).error
-
 
 def _mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Module:
     """One hidden layer."""

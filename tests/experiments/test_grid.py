@@ -43,6 +43,24 @@ def test_number_of_seeds_counts_those_listed(tmp_path: Path) -> None:
     assert [cell.seed for cell in load_grid(write_grid(tmp_path, seeds=2), seeds=3).cells] == [0, 1, 2]
 
 
+def test_overrides_leave_other_keys_of_networks_and_environment(tmp_path: Path) -> None:
+    """Else an ablation of one setting would change all others, too; arguments of a head go with the head."""
+    changed = dict(
+        policy_kwargs={"features_extractor_kwargs": {"n_filters": 8}}, env_kwargs={"image_size": 40}, srl_kwargs={}
+    )
+    zoo = dict(
+        policy_kwargs={"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4, "n_layers": 2}},
+        env_kwargs={"image_size": 36, "grayscale": True},
+        srl_kwargs={"decoder_latent_lambda": 0.1},
+    )
+    path = write_grid(tmp_path, methods={"cure": {"config": "own.yml", "overrides": changed}})
+    (tmp_path / "own.yml").write_text(yaml.safe_dump({"default": zoo}))
+    (cell,) = load_grid(path).cells
+    assert cell.env_kwargs == {"image_size": 40, "grayscale": True}
+    networks = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 8, "n_layers": 2}}
+    assert (cell.arguments["policy_kwargs"], cell.arguments["srl_kwargs"]) == (networks, {})
+
+
 def test_grids_and_settings_of_the_package_by_name(tmp_path: Path) -> None:
     """The same cells as by path; names that there are not are told from those that there are."""
     assert load_grid("fast/curves") == load_grid(GRIDS / "fast" / "curves.yml")

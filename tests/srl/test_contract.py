@@ -13,6 +13,7 @@ from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_o
 from sb3_cure import CuReSAC
 from sb3_cure.buffers import Samples
 from sb3_cure.encoders import Encoder
+from sb3_cure.evaluation import srl_errors
 from sb3_cure.srl import RAE, SRL_HEADS, SRLHead, SRLOutput, get_srl_class
 
 UPDATES = pytest.mark.parametrize("update", ["joint", "sequential"])
@@ -113,6 +114,29 @@ def test_head_that_needs_next_latents_gets_them(precision: str, update: str) -> 
         size = 1.0 if update == "sequential" else float(th.cat(at_latents).norm())
         for parameter, old, gradient in zip(encoder.parameters(), before, along, strict=True):
             th.testing.assert_close(parameter.detach(), old - 0.01 * gradient / size)
+
+
+def test_head_that_needs_next_latents_is_measured() -> None:
+    """By default with those of the centred views of what followed."""
+    model = filled_model(pixels=True, srl=Forward, augmentation="shift")
+    batch = model.policy.samples(model.replay_buffer.sample(BATCH), random=False)
+    expected = model.policy.encode(batch.observations), model.policy.encode(batch.next_observations)
+    srl_errors(model, batch)
+    for given, latents in zip(model.policy.srl.given[-1], expected, strict=True):
+        th.testing.assert_close(given, latents)
+
+
+@UPDATES
+def test_loss_that_moves_no_encoder_is_told(update: str) -> None:
+    class Apart(Positions):
+        """Encodes for itself what it was given the latents of."""
+
+        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            return super().loss(batch, self.encoder(batch.views))
+
+    model = filled_model(srl=Apart, update=update)
+    with pytest.warns(UserWarning, match="loss of Apart does not depend on the latents that it is given"):
+        train_once(model, rl=False)
 
 
 @pytest.mark.parametrize("target", ["observation", "next_observation"])
