@@ -21,6 +21,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 
 from sb3_cure.buffers import SkipsMarked
+from sb3_cure.observations import copied
 
 #: One array, or one for each key of a dictionary
 Arrays = Any
@@ -105,7 +106,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         """
         self._write()
         observation, info = self.env.reset(**kwargs)
-        self._observations = [_copied(observation)]
+        self._observations = [copied(observation)]
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -113,9 +114,10 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         :param action: The action
         :return: What the environment returns
         """
+        given = np.array(action)  # the environment may change it
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._observations.append(_copied(observation))
-        self._steps.append([np.array(action), float(reward), bool(terminated), bool(truncated)])
+        self._observations.append(copied(observation))
+        self._steps.append([given, float(reward), bool(terminated), bool(truncated)])
         if terminated or truncated:
             self._write()
         return observation, reward, terminated, truncated, info
@@ -150,27 +152,39 @@ def fill(
             f"episodes differ in length, which a {type(buffer).__name__} of {buffer.n_envs} environments cannot hold: "
             "use one environment, or a SkippingReplayBuffer."
         )
-    source, n_added = iter(episodes), 0
+    source, n_added, n_rows = iter(episodes), 0, 0
     # Each environment goes on with the next episode that is left, and in the end with transitions never sampled.
     lanes = [_transitions(source, buffer, scale_action) for _ in range(buffer.n_envs)]
     for row in itertools.zip_longest(*lanes):
-        n_added += sum(each is not None for each in row)
+        n_rows, n_added = n_rows + 1, n_added + sum(each is not None for each in row)
         blank = (*next(each for each in row if each is not None)[:-1], {"bad_transition": "no episode is left"})
         obs, next_obs, actions, rewards, dones, infos = zip(*(each or blank for each in row), strict=True)
         columns = (_stacked(obs), _stacked(next_obs), *map(np.array, (actions, rewards, dones)))
         buffer.add(*columns, list(infos))  # type: ignore[arg-type, call-arg]
-    if n_added > buffer.buffer_size * buffer.n_envs:
+    if n_rows > buffer.buffer_size:
+        side_by_side = f" (those of {buffer.n_envs} environments side by side)" if buffer.n_envs > 1 else ""
         warnings.warn(
-            f"the episodes have {n_added} transitions, but the replay buffer keeps the last "
-            f"{buffer.buffer_size * buffer.n_envs}: make buffer_size larger.",
+            f"the episodes have {n_added} transitions in {n_rows} rows{side_by_side}, but the replay buffer keeps the "
+            f"last {buffer.buffer_size} rows: make buffer_size larger.",
             stacklevel=3,
         )
     return n_added
 
 
 def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Callable[[np.ndarray], np.ndarray]) -> Any:
-    """Transitions of the episodes that are left in a source, as ``ReplayBuffer.add`` takes them."""
+    """Transitions of the episodes that are left in a source, as ``ReplayBuffer.add`` takes them. An episode without an
+    end was stopped: nothing goes on from it to the next one."""
     for episode in source:
+        lengths = {name: len(getattr(episode, name)) for name in RecordedEpisode._fields[1:]}
+        seen = (
+            episode.observations if isinstance(episode.observations, dict) else {"observations": episode.observations}
+        )
+        lengths |= {name: len(each) - 1 for name, each in seen.items() if name in _keys(buffer.observation_space)}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(
+                f"an episode of T steps has T actions, rewards, terminations and truncations, T + 1 observations, but "
+                f"one has for T {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
+            )
         observations = _as_stored(episode.observations, buffer.observation_space)
         actions = scale_action(np.asarray(episode.actions))
         if actions.shape[1:] != buffer.action_space.shape or np.abs(actions).max(initial=0) > 1 + 1e-6:
@@ -180,9 +194,13 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
             )
         for t, reward in enumerate(episode.rewards):
             terminated = bool(episode.terminations[t])
-            info = {"TimeLimit.truncated": bool(episode.truncations[t]) and not terminated}
-            done = terminated or bool(episode.truncations[t])
+            done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)
+            info = {"TimeLimit.truncated": done and not terminated}
             yield _at(observations, t), _at(observations, t + 1), actions[t], float(reward), done, info
+
+
+def _keys(space: spaces.Space) -> list[str]:
+    return list(space.spaces) if isinstance(space, spaces.Dict) else ["observations"]
 
 
 def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
@@ -201,12 +219,6 @@ def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
 
 def _at(observations: Arrays, t: int) -> Arrays:
     return {key: array[t] for key, array in observations.items()} if isinstance(observations, dict) else observations[t]
-
-
-def _copied(observation: Any) -> Any:
-    if isinstance(observation, dict):
-        return {key: np.array(value) for key, value in observation.items()}
-    return np.array(observation)
 
 
 def _stacked(observations: Any) -> Arrays:

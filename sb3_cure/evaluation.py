@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
-from sb3_cure.observations import images_of, len_of, rows_of
+from sb3_cure.observations import copied, images_of, len_of, rows_of
 from sb3_cure.policies import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
@@ -176,7 +176,7 @@ def run_episodes(
         env.action_space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
-        observations, frames, true_states, steps = [observation], [], [], list[tuple[Any, ...]]()
+        observations, frames, true_states, steps = [copied(observation)], [], [], list[tuple[Any, ...]]()
         done, memory = False, None  # memory: of recurrent policies
         while not done:
             if actor == "random":
@@ -185,10 +185,11 @@ def run_episodes(
                 action, memory = predict(as_trained(model, observation), memory, np.array([not steps]), deterministic)
             if state_of:
                 true_states.append(np.array(state_of(env)))  # a copy
+            given = np.array(action)  # the environment may change it, and write each observation into one place
             observation, reward, terminated, truncated, _ = env.step(action)
             done = terminated or truncated
-            observations.append(observation)
-            steps.append((action, float(reward), terminated))
+            observations.append(copied(observation))
+            steps.append((given, float(reward), terminated))
             if render:
                 frames.append(env.render())
         seen: Any = _channels_first(_stacked(observations), model.observation_space)

@@ -38,6 +38,16 @@ def by_key(images: Any) -> dict[str, Any]:
     return images if isinstance(images, dict) else {"": images}
 
 
+def copied(observation: Any) -> Any:
+    """
+    :param observation: An observation, which the environment may write the next one into
+    :return: A copy
+    """
+    if isinstance(observation, dict):
+        return {key: np.array(value) for key, value in observation.items()}
+    return np.array(observation)
+
+
 def rows_of(observations: Any, rows: Any) -> Any:
     """
     :param observations: [n, *shape], or a dictionary of such

@@ -8,8 +8,10 @@ import gymnasium as gym
 import minari
 import numpy as np
 import pytest
+from dictionaries_for_tests import Goal
 from envs_for_tests import Cliff, PixelBox, VectorBox, differences, state_of, tiny_model
 from minari.data_collector import EpisodeBuffer
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -21,6 +23,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.buffers import SkippingReplayBuffer, transitions, unmarked
 from sb3_cure.callbacks import ExactCheckpoint
 from sb3_cure.datasets import RecordedEpisode, RecordEpisodes, load_episode, save_episode
+from sb3_cure.evaluation import run_episodes
 
 both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
 
@@ -36,6 +39,88 @@ def record(make: Any, folder: Path, steps: int) -> gym.Env:
             env.reset()
     env.close()
     return env
+
+
+class InPlace(VectorBox):
+    """Writes each observation into one place, and scales the actions that it is given."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.seen = np.zeros(2, np.float32)
+        super().reset(**kwargs)
+        return self.observe(), {}
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        self.seen[:] = self.position
+        return self.seen
+
+    def step(self, action: np.ndarray) -> Any:
+        step = super().step(action)
+        action *= 0.5
+        return step
+
+
+def test_environments_may_write_into_what_they_are_given_and_give(tmp_path: Path) -> None:
+    """Files, and episodes that measure policies, hold what there was."""
+    plain, in_place = record(VectorBox, tmp_path / "plain", 9), record(InPlace, tmp_path / "in place", 9)
+    first, second = (load_episode(next((tmp_path / name).iterdir())) for name in ("plain", "in place"))
+    for ours, theirs in zip(first, second, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    model = tiny_model("MlpPolicy", VectorBox(), srl="inverse")
+    measured = [next(run_episodes(model, env.env, 1, "random", seed=0)) for env in (plain, in_place)]
+    np.testing.assert_array_equal(measured[0].observations, measured[1].observations)
+    np.testing.assert_allclose(measured[0].srl_errors, measured[1].srl_errors, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["HerReplayBuffer", "NStepReplayBuffer"])
+def test_stopped_episodes_do_not_go_on_in_the_next(kind: str) -> None:
+    """SB3's own buffers take goals and returns of several steps from one episode."""
+    if kind == "HerReplayBuffer":
+        model = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer)
+    else:
+        model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None, n_steps=3)
+    episodes = []
+    for number in range(4):
+        states = np.full((9, 2), number / 4)
+        seen: Any = states.astype(np.float32)
+        if kind == "HerReplayBuffer":
+            seen = {key: states for key in ("observation", "achieved_goal", "desired_goal")}
+        nothing = np.zeros(8, bool)
+        episodes.append(
+            RecordedEpisode(seen, np.zeros((8, 2), np.float32), np.full(8, float(number)), nothing, nothing)
+        )
+    assert model.load_transitions(episodes) == 32
+    assert type(model.replay_buffer).__name__ == kind
+    batch: Any = model.replay_buffer.sample(200)
+    if kind == "HerReplayBuffer":
+        np.testing.assert_array_equal(batch.observations["desired_goal"], batch.observations["achieved_goal"])
+        assert (batch.dones == 0).all()
+    else:
+        steps = np.log(batch.discounts.numpy()) / np.log(model.gamma)
+        expected = batch.observations[:, :1].numpy() * 4 * (1 - model.gamma**steps) / (1 - model.gamma)
+        np.testing.assert_allclose(batch.rewards, expected, rtol=1e-4)
+
+
+def test_lengths_of_an_episode_must_agree() -> None:
+    """A camera that saw twice as often as actions were taken would pair them wrongly."""
+    model, n = tiny_model("MlpPolicy", VectorBox()), 5
+    ends = np.zeros(n, bool)
+    twice = RecordedEpisode(np.zeros((2 * n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ends, ends)
+    with pytest.raises(
+        ValueError, match=r"T \+ 1 observations, but one has for T 5 \(actions\), .* 10 \(observations\)"
+    ):
+        model.load_transitions([twice])
+    assert model.replay_buffer.size() == 0
+
+
+def test_rows_of_several_environments_are_counted() -> None:
+    """One long episode beside a short one fills the buffer's rows, and the rest of them is empty."""
+    envs = make_vec_env(VectorBox, 2)
+    model, episodes = tiny_model("MlpPolicy", envs, buffer_size=40), []
+    for n in (30, 5):
+        ends = np.zeros(n, bool)
+        episodes.append(RecordedEpisode(np.zeros((n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ends, ends))
+    with pytest.warns(UserWarning, match="35 transitions in 30 rows .*2 environments side by side.* the last 20 rows"):
+        model.load_transitions(episodes)
 
 
 @both_algorithms
