@@ -112,7 +112,8 @@ def test_arms_without_srl_or_curiosity_are_measured(tmp_path: Path) -> None:
     """SB3's own SAC, and a shared encoder without head, as baselines: returns and visits without SRL errors."""
     none = {"srl": None, "curiosity": None, "warmup_updates": None}
     shared = {**TINY["policy_kwargs"], "share_encoder": True}
-    methods = {"sac": method(**none, policy_kwargs={"net_arch": [8]}), "encoder": method(**none, policy_kwargs=shared)}
+    nature = {"net_arch": [8], "features_extractor_kwargs": None}  # those of the settings are not for SB3's
+    methods = {"sac": method(**none, policy_kwargs=nature), "encoder": method(**none, policy_kwargs=shared)}
     for cell in load_grid(write_grid(tmp_path, kind="visitation", budget=100, methods=methods)).cells:
         folder = run_cell(cell, tmp_path)
         last = read_rows(folder / "eval.csv")[-1]
