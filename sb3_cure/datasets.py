@@ -21,7 +21,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 
 from sb3_cure.buffers import SkipsMarked
-from sb3_cure.observations import copied
+from sb3_cure.observations import by_key, copied, rows_of, stacked
 
 #: One array, or one for each key of a dictionary
 Arrays = Any
@@ -131,7 +131,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         if self._steps:
             path = Path(self.folder, f"{self._number:06d}-{self._token}.npz")
             columns = map(np.array, zip(*self._steps, strict=True))
-            save_episode(path, RecordedEpisode(_stacked(self._observations), *columns))
+            save_episode(path, RecordedEpisode(stacked(self._observations), *columns))
             self._number += 1
         self._observations, self._steps = [], []
 
@@ -159,7 +159,7 @@ def fill(
         n_rows, n_added = n_rows + 1, n_added + sum(each is not None for each in row)
         blank = (*next(each for each in row if each is not None)[:-1], {"bad_transition": "no episode is left"})
         obs, next_obs, actions, rewards, dones, infos = zip(*(each or blank for each in row), strict=True)
-        columns = (_stacked(obs), _stacked(next_obs), *map(np.array, (actions, rewards, dones)))
+        columns = (stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)))
         buffer.add(*columns, list(infos))  # type: ignore[arg-type, call-arg]
     if n_rows > buffer.buffer_size:
         side_by_side = f" (those of {buffer.n_envs} environments side by side)" if buffer.n_envs > 1 else ""
@@ -175,17 +175,14 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
     """Transitions of the episodes that are left in a source, as ``ReplayBuffer.add`` takes them. An episode without an
     end was stopped: nothing goes on from it to the next one."""
     for episode in source:
+        observations = _as_stored(episode.observations, buffer.observation_space)
         lengths = {name: len(getattr(episode, name)) for name in RecordedEpisode._fields[1:]}
-        seen = (
-            episode.observations if isinstance(episode.observations, dict) else {"observations": episode.observations}
-        )
-        lengths |= {name: len(each) - 1 for name, each in seen.items() if name in _keys(buffer.observation_space)}
+        lengths |= {name or "observations": len(each) - 1 for name, each in by_key(observations).items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
-                f"an episode of T steps has T actions, rewards, terminations and truncations, T + 1 observations, but "
+                "an episode of T steps has T actions, rewards, terminations and truncations, T + 1 observations, but "
                 f"one has for T {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
             )
-        observations = _as_stored(episode.observations, buffer.observation_space)
         actions = scale_action(np.asarray(episode.actions))
         if actions.shape[1:] != buffer.action_space.shape or np.abs(actions).max(initial=0) > 1 + 1e-6:
             raise ValueError(
@@ -196,11 +193,7 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
             terminated = bool(episode.terminations[t])
             done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)
             info = {"TimeLimit.truncated": done and not terminated}
-            yield _at(observations, t), _at(observations, t + 1), actions[t], float(reward), done, info
-
-
-def _keys(space: spaces.Space) -> list[str]:
-    return list(space.spaces) if isinstance(space, spaces.Dict) else ["observations"]
+            yield rows_of(observations, t), rows_of(observations, t + 1), actions[t], float(reward), done, info
 
 
 def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
@@ -215,14 +208,3 @@ def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
             "record them from an environment in the same wrappers."
         )
     return array
-
-
-def _at(observations: Arrays, t: int) -> Arrays:
-    return {key: array[t] for key, array in observations.items()} if isinstance(observations, dict) else observations[t]
-
-
-def _stacked(observations: Any) -> Arrays:
-    first = observations[0]
-    if isinstance(first, dict):
-        return {key: np.stack([each[key] for each in observations]) for key in first}
-    return np.stack(observations)

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.buffers import Samples, transitions, unmarked
 from sb3_cure.envs import physics_state
-from sb3_cure.observations import copied, images_of, len_of, rows_of
+from sb3_cure.observations import copied, images_of, len_of, rows_of, stacked
 from sb3_cure.policies import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
@@ -192,19 +192,13 @@ def run_episodes(
             steps.append((given, float(reward), terminated))
             if render:
                 frames.append(env.render())
-        seen: Any = _channels_first(_stacked(observations), model.observation_space)
+        seen: Any = _channels_first(stacked(observations), model.observation_space)
         actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
             errors = srl_errors(model, _as_batch(model, as_trained(model, seen), actions, rewards, dones))
         kept = {"states": np.stack(true_states)} if states else {}
         yield Episode(rewards, errors, rows_of(seen, slice(-1)), frames, **kept)  # type: ignore[arg-type]
-
-
-def _stacked(observations: list[Any]) -> Any:
-    if isinstance(observations[0], dict):
-        return {key: np.stack([each[key] for each in observations]) for key in observations[0]}
-    return np.stack(observations)
 
 
 def _channels_first(observations: Any, space: spaces.Space) -> Any:

@@ -1,6 +1,6 @@
 """Observations of one sensor, or dictionaries of several: which parts are images, and how vectors become one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,17 @@ def copied(observation: Any) -> Any:
     if isinstance(observation, dict):
         return {key: np.array(value) for key, value in observation.items()}
     return np.array(observation)
+
+
+def stacked(observations: Sequence[Any]) -> Any:
+    """
+    :param observations: n observations
+    :return: [n, *shape], or a dictionary of such
+    """
+    first = observations[0]
+    if isinstance(first, dict):
+        return {key: np.stack([each[key] for each in observations]) for key in first}
+    return np.stack(observations)
 
 
 def rows_of(observations: Any, rows: Any) -> Any:

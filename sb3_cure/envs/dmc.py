@@ -118,24 +118,30 @@ class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.ut
     :param proprioception: Whether there is a key ``"proprioception"``: what
         :class:`~sb3_cure.envs.physics.Proprioception` gives
     :param image_size: Height and width of the images in pixels
+    :param seed: Of the backgrounds
     :param kwargs: Further arguments of :class:`DMCPixels`
     """
 
     def __init__(
-        self, env: gym.Env, cameras: dict[str, int], proprioception: bool, image_size: int = 84, **kwargs: Any
+        self,
+        env: gym.Env,
+        cameras: dict[str, int],
+        proprioception: bool,
+        image_size: int = 84,
+        seed: int | None = None,
+        **kwargs: Any,
     ) -> None:
         gym.utils.RecordConstructorArgs.__init__(
             self,
             cameras=list(cameras.items()),
             proprioception=proprioception,
             image_size=image_size,
-            **{name: value for name, value in kwargs.items() if name != "seed"},  # as of `DMCPixels`
+            **kwargs,  # but no seed, as of `DMCPixels`
         )
         super().__init__(env)
-        seeds = _apart(kwargs.pop("seed", None), len(cameras))
         self._cameras = {
-            key: DMCPixels(env, image_size, camera_id=index, seed=seed, **kwargs)
-            for (key, index), seed in zip(cameras.items(), seeds, strict=True)
+            key: DMCPixels(env, image_size, camera_id=index, seed=own, **kwargs)
+            for (key, index), own in zip(cameras.items(), _apart(seed, len(cameras)), strict=True)
         }
         self._joints = Proprioception(env) if proprioception else None
         first = next(iter(self._cameras.values()))

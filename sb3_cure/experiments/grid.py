@@ -467,9 +467,8 @@ def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any
     if not found:
         raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
     entry = {"policy": "CnnPolicy", **entries[found[0]]}
-    entry |= {
-        key: _merged(entry.get(key), value) if key in _MERGED else value for key, value in method.overrides.items()
-    }
+    for key, value in method.overrides.items():
+        entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
     return entry.pop("n_envs", 1), entry.pop("env_kwargs", {}), entry
 
