@@ -63,7 +63,8 @@ def main() -> None:
             print(f"{part} ...", flush=True)
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
                 results, peak = process.submit(run_part, part, options.repeats, options.disk).result()
-            measured[part] = {"peak_memory_mb": round(peak), **results}
+            version = machine["versions"]["sb3_cure"]  # with --only, other parts may be of another one
+            measured[part] = {"sb3_cure": version, "peak_memory_mb": round(peak), **results}
             report = {"machine": machine, **{key: measured[key] for key in names if key in measured}}
             path.write_text(json.dumps(report, indent=2) + "\n")
             path.with_suffix(".md").write_text("\n".join([f"# Benchmarks: {title}", "", *to_markdown(report, 2)]))
