@@ -12,7 +12,7 @@ import psutil
 
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence.checkpoints import CHUNK, CheckpointWriter
 
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3

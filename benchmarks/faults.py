@@ -31,8 +31,8 @@ from gymnasium import spaces
 from stable_baselines3.common.logger import Logger
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import transitions
-from sb3_cure.experiments.files import describe_run, write_json
+from sb3_cure.data.buffers import transitions
+from sb3_cure.evaluation.result_files import describe_run, write_json
 from sb3_cure.persistence.checkpoints import CheckpointWriter
 from sb3_cure.persistence.resume import load_random_state, random_state
 

@@ -30,7 +30,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_cure import CuReSAC
-from sb3_cure.experiments.files import describe_run
+from sb3_cure.evaluation.result_files import describe_run
 from sb3_cure.persistence import read_state, write_state
 
 #: What a load may take besides what the process had before, bytes, and how long, seconds

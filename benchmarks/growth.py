@@ -14,7 +14,7 @@ from benchmarks.harness import (
     stream,
     summary,
 )
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 
 
 def by_batch(sizes: tuple[int, ...] = (32, 64, 128, 256), repeats: int = 3) -> dict[str, Any]:

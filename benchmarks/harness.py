@@ -20,8 +20,8 @@ from stable_baselines3.common.utils import get_device
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.experiments.files import cpu_info, processor
-from sb3_cure.precision import has_fast_bf16
+from sb3_cure.evaluation.result_files import cpu_info, processor
+from sb3_cure.networks.precision import has_fast_bf16
 
 Times = dict[str, list[float]]
 

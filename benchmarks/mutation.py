@@ -34,7 +34,7 @@ from cosmic_ray.ast.ast_query import ASTQuery
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 
-from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json
+from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What should kill the mutants of each file, the likeliest and fastest first (below tests/, or options of pytest)

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks import checkpoints, collection, growth, heads, numerics, rendering, replay, rewards, settings, update
 from benchmarks.harness import PRECISIONS
-from sb3_cure.allocator import tune_allocator
+from sb3_cure.networks.allocator import tune_allocator
 
 
 def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, Any]]]:

@@ -21,8 +21,8 @@ import numpy as np
 import torch as th
 
 from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
-from sb3_cure.allocator import tune_allocator
 from sb3_cure.envs.wrappers import action_repeat_of
+from sb3_cure.evaluation.result_files import Row, checkout_commit, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.cells import (
     EVAL_SEED,
     alone_in,
@@ -30,8 +30,8 @@ from sb3_cure.experiments.cells import (
     is_evaluation_due,
     run_cell,
 )
-from sb3_cure.experiments.files import Row, checkout_commit, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import DONE, Cell, GridError, load_grid
+from sb3_cure.networks.allocator import tune_allocator
 
 GRID = Path(__file__).parent.parent / "zoo_configs" / "experiments" / "fast" / "public_sac_ae.yml"
 ARM, SOURCE = "public", "https://github.com/denisyarats/pytorch_sac_ae"

@@ -5,7 +5,7 @@
 
 First their losses, from the same weights, batches and noise; then their times, in small networks on small images and in
 the paper's setting. Both get the same batches and take turns; with and without the allocator settings of
-``sb3_cure.allocator``, each in a process of its own, as they cannot be undone.
+``sb3_cure.networks.allocator``, each in a process of its own, as they cannot be undone.
 """
 
 import argparse
@@ -26,9 +26,9 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from benchmarks.harness import BATCH_SIZE, Times, describe_machine, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
 from benchmarks.settings import SETTINGS, Setting
-from sb3_cure.allocator import tune_allocator
-from sb3_cure.experiments.files import write_json
-from sb3_cure.layers import conv_sizes
+from sb3_cure.evaluation.result_files import write_json
+from sb3_cure.networks.allocator import tune_allocator
+from sb3_cure.networks.layers import conv_sizes
 
 #: Of a log of the public implementation and of ``PlainSacAe.losses``
 LOSSES = {"train_critic/loss": "critic", "train_actor/loss": "actor", "train_ae/ae_loss": "decoder"}
@@ -211,7 +211,7 @@ def main() -> None:
         for tuned in (False, True):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
                 times = process.submit(measure, options.checkout, setting, options.repeats, tuned).result()
-            name = "with sb3_cure.allocator" if tuned else "with the C library's allocation"
+            name = "with sb3_cure.networks.allocator" if tuned else "with the C library's allocation"
             row[name] = {**{each: summary(seconds) for each, seconds in times.items()}}
             row[name]["plain / public"] = round(median_ratio(times, PLAIN, PUBLIC), 3)
         found[str(setting)] = row

@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from benchmarks.harness import BATCH_SIZE, fill, interleaved, make_env, median_ratio, stream, summary
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 
 OURS, SB3 = "FrameStackReplayBuffer", "SB3 ReplayBuffer"
 

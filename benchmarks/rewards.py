@@ -28,8 +28,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from benchmarks.harness import make_model
 from benchmarks.settings import SETTINGS, added_costs
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import transitions
-from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json
+from sb3_cure.data.buffers import transitions
+from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 
 ROOMS = ("known", "television", "new")
 #: Where each begins and ends along the first axis

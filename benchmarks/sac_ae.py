@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.layers import conv_sizes, init_weights
+from sb3_cure.networks.layers import conv_sizes, init_weights
 
 FEATURES = 50
 

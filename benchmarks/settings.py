@@ -16,8 +16,8 @@ from torch.nn import functional as F
 
 from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import FEATURES, PlainSacAe
-from sb3_cure.fast_ops import conv_transpose_cells, convolve
-from sb3_cure.layers import conv_sizes
+from sb3_cure.networks.fast_ops import conv_transpose_cells, convolve
+from sb3_cure.networks.layers import conv_sizes
 
 
 class Setting(NamedTuple):

@@ -227,7 +227,7 @@ def plot(rows: list[dict[str, float]], filled: float, path: Path) -> None:
     from matplotlib import style
     from matplotlib.figure import Figure
 
-    from sb3_cure.experiments.plots import STYLE, save  # after the watch, which counts this process's memory
+    from sb3_cure.evaluation.plots import STYLE, save  # after the watch, which counts this process's memory
 
     with style.context(STYLE):
         figure = Figure(figsize=(9, 3))

@@ -44,14 +44,22 @@ from benchmarks import public_returns
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
 from sb3_cure import CuReSAC
-from sb3_cure.allocator import tune_allocator
-from sb3_cure.callbacks import untouched_randomness
 from sb3_cure.envs.wrappers import action_repeat_of
+from sb3_cure.evaluation.callbacks import untouched_randomness
+from sb3_cure.evaluation.plots import arm_colors, in_style, save
+from sb3_cure.evaluation.result_files import (
+    Row,
+    checkout_commit,
+    describe_run,
+    read_rows,
+    write_csv,
+    write_json,
+    write_text,
+)
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
-from sb3_cure.experiments.files import Row, checkout_commit, describe_run, read_rows, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import Cell, GridError, constructor_defaults, load_grid, read_kept
-from sb3_cure.experiments.plots import arm_colors, in_style, save
 from sb3_cure.experiments.tables import NONE, Table
+from sb3_cure.networks.allocator import tune_allocator
 
 PUBLIC = public_returns.ARM
 #: Grids that hold our arms

@@ -23,11 +23,11 @@ from matplotlib.ticker import EngFormatter
 
 import sb3_cure
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.callbacks import EvalBothCallback
-from sb3_cure.evaluation import run_episodes
+from sb3_cure.evaluation.callbacks import EvalBothCallback
+from sb3_cure.evaluation.plots import in_style, save
+from sb3_cure.evaluation.result_files import describe_run, write_csv
+from sb3_cure.evaluation.rollouts import run_episodes
 from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, PROFILE, TASK
-from sb3_cure.experiments.files import describe_run, write_csv
-from sb3_cure.experiments.plots import in_style, save
 
 MODES = ("sequential", "joint")
 SETTINGS = {**PROFILE, "intrinsic": "srl_error", "intrinsic_kwargs": {}, "curiosity_encoder_grad": False}

@@ -19,8 +19,8 @@ import pandas as pd
 
 from benchmarks import zero_decoder
 from sb3_cure import CuReSAC
-from sb3_cure.evaluation import run_episodes, srl_errors
-from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json, write_text
+from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json, write_text
+from sb3_cure.evaluation.rollouts import run_episodes, srl_errors
 from sb3_cure.experiments.grid import short_name
 from sb3_cure.experiments.heads import fit_head, observation_batch
 from sb3_cure.experiments.published import SRL_ERROR, task_key

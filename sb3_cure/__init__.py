@@ -1,11 +1,10 @@
 """Stable-Baselines3 from pixels: SAC and TQC with state representation learning and curiosity about it (CuRe)."""
 
-from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.cure_tqc import CuReTQC
-from sb3_cure.envs import make_dmc_env, register_dmc_envs
+from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
+from sb3_cure.envs import make_dmc_env, make_pixel_env, register_dmc_envs
 
 __version__ = "0.3.0.dev0"
 
 register_dmc_envs()
 
-__all__ = ["CuReSAC", "CuReTQC", "__version__", "make_dmc_env"]
+__all__ = ["CuReSAC", "CuReTQC", "__version__", "make_dmc_env", "make_pixel_env"]

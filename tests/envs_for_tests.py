@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 
 
 class VectorBox(gym.Env):

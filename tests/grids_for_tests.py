@@ -7,7 +7,7 @@ import gymnasium as gym
 import yaml
 from envs_for_tests import PixelBox
 
-from sb3_cure.experiments.files import read_rows
+from sb3_cure.evaluation.result_files import read_rows
 
 #: 20 steps per episode, an action repeat of 4
 TASK = "grids/PixelBox-v0"

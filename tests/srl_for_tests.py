@@ -7,9 +7,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_cure.augmentations import make_augmentation
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder, PixelEncoder
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.augmentations import make_augmentation
+from sb3_cure.networks.encoders import Encoder, PixelEncoder
 from sb3_cure.srl import SRLHead
 
 

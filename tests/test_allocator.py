@@ -8,7 +8,7 @@ import pytest
 COUNT_FAULTS = """
 import resource
 import torch as th
-from sb3_cure.allocator import tune_allocator
+from sb3_cure.networks.allocator import tune_allocator
 assert tune_allocator()
 def round():
     [th.ones(4_000_000) for _ in range(12)]

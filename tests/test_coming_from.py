@@ -11,8 +11,8 @@ from envs_for_tests import PixelBox
 from stable_baselines3 import SAC
 
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.augmentations import Augmentation, RandomCrop, RandomShift
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
+from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
 
 PAGE = (Path(__file__).parents[1] / "docs" / "coming_from.md").read_text(encoding="utf-8")
 SNIPPETS = dict(re.findall(r"^## From (\S+?)\n.*?```python\n(.*?)```", PAGE, re.S | re.M))

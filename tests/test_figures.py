@@ -31,7 +31,7 @@ def test_drawing_is_well_formed_and_keeps_to_its_paper(script: Path) -> None:
 
 
 def test_agents_have_the_colours_of_the_plots() -> None:
-    colors = pytest.importorskip("sb3_cure.experiments.plots", exc_type=ImportError).COLORS
+    colors = pytest.importorskip("sb3_cure.evaluation.plots", exc_type=ImportError).COLORS
     drawn = (DOCS / "_static" / "architecture.svg").read_text(encoding="utf-8")
     assert f"--task: {colors['task']}" in drawn and f"--curious: {colors['curious']}" in drawn
 

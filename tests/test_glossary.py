@@ -10,10 +10,10 @@ from envs_for_tests import PixelBox, tiny_model
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from sb3_cure import CuReSAC
-from sb3_cure.callbacks import DiagnosticsCallback, EvalBothCallback
-from sb3_cure.critics import LatentCritic
-from sb3_cure.encoders import PixelEncoder
-from sb3_cure.policies import CuRePolicy
+from sb3_cure.cure.critics import LatentCritic
+from sb3_cure.cure.policies import CuRePolicy
+from sb3_cure.evaluation.callbacks import DiagnosticsCallback, EvalBothCallback
+from sb3_cure.networks.encoders import PixelEncoder
 from sb3_cure.srl import RAE
 
 GLOSSARY = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text(encoding="utf-8")

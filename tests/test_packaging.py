@@ -16,7 +16,7 @@ import yaml
 from packaging.version import Version
 
 from sb3_cure import __version__
-from sb3_cure.zoo_files import GRIDS, ZOO, zoo_file
+from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
 
 ROOT = Path(__file__).parent.parent
 

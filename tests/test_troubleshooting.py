@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_cure.callbacks import DiagnosticsCallback
+from sb3_cure.evaluation.callbacks import DiagnosticsCallback
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
 
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.buffers import Samples
-from sb3_cure.fast_ops import from_cells, to_cells
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.fast_ops import from_cells, to_cells
 
 ALGORITHMS: dict[str, Any] = {"sac": CuReSAC, "tqc": CuReTQC}
 BATCH = 8

@@ -16,7 +16,7 @@ from torch.utils import collect_env
 
 from sb3_cure import __version__
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
-from sb3_cure.precision import resolve_compile, resolve_precision
+from sb3_cure.networks.precision import resolve_compile, resolve_precision
 
 PACKAGE = "sb3-cure"
 #: What networks compute in bf16 where they can

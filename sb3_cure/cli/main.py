@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from sb3_cure.allocator import tune_allocator
+from sb3_cure.networks.allocator import tune_allocator
 
 
 class Command(NamedTuple):

@@ -26,8 +26,8 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 import sb3_cure
+from sb3_cure.cli.zoo_files import zoo_file
 from sb3_cure.envs.rendering import is_headless
-from sb3_cure.zoo_files import zoo_file
 
 DEFAULT_ALGORITHM = "cure_sac"
 #: The file of settings where ``--conf-file`` is not given

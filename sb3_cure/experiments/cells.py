@@ -16,15 +16,16 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_cure.callbacks import ExactCheckpoint, untouched_randomness
-from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation import run_episodes, trained_actors
+from sb3_cure.evaluation.callbacks import untouched_randomness
+from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
+from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.grid import ALGOS, DONE, Cell, GridError, comparable, constructor_defaults, read_kept
 from sb3_cure.experiments.media import draw_cell, watch_reconstructions
 from sb3_cure.experiments.visitation import measure_visits
+from sb3_cure.persistence import ExactCheckpoint
 
 #: Evaluations start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000

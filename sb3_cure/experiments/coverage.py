@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_cure.experiments.files import Row, write_csv
+from sb3_cure.evaluation.result_files import Row, write_csv
 from sb3_cure.experiments.visit_statistics import entropy_bits
 
 COLUMNS = ("environment_steps", "agent_steps", "cells", "entropy_bits")

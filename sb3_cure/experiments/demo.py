@@ -18,13 +18,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.allocator import tune_allocator
-from sb3_cure.callbacks import ReconstructionCallback
 from sb3_cure.envs import physics_state_names, physics_state_units
-from sb3_cure.evaluation import Episode, run_episodes
-from sb3_cure.experiments import plots
-from sb3_cure.experiments.files import describe_run, write_csv, write_json
-from sb3_cure.experiments.video import write_video_side_by_side
+from sb3_cure.evaluation import plots
+from sb3_cure.evaluation.callbacks import ReconstructionCallback
+from sb3_cure.evaluation.result_files import describe_run, write_csv, write_json
+from sb3_cure.evaluation.rollouts import Episode, run_episodes
+from sb3_cure.evaluation.video import write_video_side_by_side
+from sb3_cure.networks.allocator import tune_allocator
 
 DOMAIN, TASK = "cartpole", "swingup"
 # The camera that follows the cart: the usual one is far away, and the cart drives out of its view.

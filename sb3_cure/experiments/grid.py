@@ -17,12 +17,11 @@ import torch as th
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.callbacks import untouched_randomness
-from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.cure_tqc import CuReTQC
+from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
+from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 from sb3_cure.envs.counting import TellCell
 from sb3_cure.envs.rendering import GLUnavailableError
-from sb3_cure.zoo_files import GRIDS, ZOO, zoo_file
+from sb3_cure.evaluation.callbacks import untouched_randomness
 
 #: The file that tells that a cell is finished
 DONE = "DONE"

@@ -13,11 +13,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 
-from sb3_cure.buffers import Samples
-from sb3_cure.cure_sac import CuReSAC
-from sb3_cure.evaluation import Episode, srl_errors
+from sb3_cure.cure.algorithms import CuReSAC
+from sb3_cure.data.samples import Samples
+from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
+from sb3_cure.evaluation.rollouts import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_progress
-from sb3_cure.experiments.files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.experiments.grid import ALGOS, Cell, Grid, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 

@@ -7,16 +7,16 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_cure.callbacks import ReconstructionCallback
-from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.cure.algorithms import CuReSAC
+from sb3_cure.cure.metrics import frame_stack_of
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation import evenly_measured, most_uncomfortable, run_episodes, trained_actors
-from sb3_cure.experiments import plots
+from sb3_cure.evaluation import plots
+from sb3_cure.evaluation.callbacks import ReconstructionCallback
+from sb3_cure.evaluation.rollouts import evenly_measured, most_uncomfortable, run_episodes, trained_actors
+from sb3_cure.evaluation.video import write_video
 from sb3_cure.experiments.grid import Cell
-from sb3_cure.experiments.video import write_video
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
-from sb3_cure.metrics import frame_stack_of
 
 #: Films and reconstructed observations are the same in all cells of a task, as far as the policies let them
 FILM_SEED = 30_000

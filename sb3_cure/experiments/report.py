@@ -22,7 +22,8 @@ import numpy as np
 from PIL import Image
 
 import sb3_cure
-from sb3_cure.experiments import plots, published, statistics, tables
+from sb3_cure.evaluation import plots
+from sb3_cure.experiments import published, statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
 from sb3_cure.experiments.tables import NONE, Table, interval_text, number_text, of_tasks, plural, ratio_text, words
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_cure.experiments.files import read_rows
+from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments.grid import comparable, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"

@@ -17,11 +17,11 @@ import numpy as np
 from rich.console import Console
 from rich.live import Live
 
-from sb3_cure.allocator import tune_allocator
+from sb3_cure.evaluation.result_files import write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
-from sb3_cure.experiments.files import write_json, write_text
 from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
+from sb3_cure.networks.allocator import tune_allocator
 
 ENGINES = ("local", "ray")
 #: In the log of a job, between two lines about the whole

@@ -12,13 +12,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_cure.callbacks import untouched_randomness
-from sb3_cure.cure_sac import CuReSAC
+from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
-from sb3_cure.evaluation import Episode, even_negatives, run_episodes, trained_actors
-from sb3_cure.experiments.files import Row, write_csv
+from sb3_cure.evaluation.callbacks import untouched_randomness
+from sb3_cure.evaluation.result_files import Row, write_csv
+from sb3_cure.evaluation.rollouts import Episode, even_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.grid import Cell
-from sb3_cure.layers import preprocess
+from sb3_cure.networks.layers import preprocess
 from sb3_cure.srl import RAE
 
 #: Plus the cell's seed: the arms of a seed start from the same states, another seed from others

@@ -4,7 +4,7 @@
 """
 
 from sb3_cure.intrinsic.base import IntrinsicReward, OwnGenerator, RewardScale
-from sb3_cure.intrinsic.dictionary import DictReward
+from sb3_cure.intrinsic.dict_reward import DictReward
 from sb3_cure.intrinsic.registry import INTRINSIC_REWARDS, get_intrinsic_class
 from sb3_cure.intrinsic.shuffled import Shuffled
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.srl.base import SRLHead
 
 #: From rows and environments of a replay buffer, [n] each, to its samples

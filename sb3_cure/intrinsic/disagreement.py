@@ -10,9 +10,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
-from sb3_cure.layers import EnsembleLinear
+from sb3_cure.networks.layers import EnsembleLinear
 
 
 class Disagreement(IntrinsicReward):

@@ -7,10 +7,10 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
-from sb3_cure.intrinsic.networks import MLP, make_network, scaled
-from sb3_cure.layers import full_precision
+from sb3_cure.intrinsic.reward_networks import MLP, make_network, scaled
+from sb3_cure.networks.layers import full_precision
 
 
 class ICM(IntrinsicReward):

@@ -3,7 +3,7 @@
 import torch as th
 from gymnasium import spaces
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.icm import ICM
 
 

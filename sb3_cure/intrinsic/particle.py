@@ -11,10 +11,11 @@ from numpy import ndarray
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
-from sb3_cure.buffers import Samples, SkipsMarked
+from sb3_cure.data.buffers import SkipsMarked
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
-from sb3_cure.intrinsic.networks import make_network, scaled
-from sb3_cure.layers import full_precision
+from sb3_cure.intrinsic.reward_networks import make_network, scaled
+from sb3_cure.networks.layers import full_precision
 
 #: Rows of the replay buffer that are looked at in one go
 CHUNK = 1000

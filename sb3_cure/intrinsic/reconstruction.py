@@ -4,10 +4,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 
-from sb3_cure.buffers import Samples
-from sb3_cure.decoders import PixelDecoder, VectorDecoder, squared_error
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
-from sb3_cure.intrinsic.networks import scaled
+from sb3_cure.intrinsic.reward_networks import scaled
+from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
 
 
 class Reconstruction(IntrinsicReward):

@@ -10,9 +10,10 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
-from sb3_cure.buffers import Samples, unmarked
+from sb3_cure.data.buffers import unmarked
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
-from sb3_cure.intrinsic.networks import DITHER, make_network, scaled
+from sb3_cure.intrinsic.reward_networks import DITHER, make_network, scaled
 
 #: Least and most observations that the statistics are taken of, and how many at a time
 ENOUGH, OBSERVATIONS, CHUNK = 256, 1000, 100

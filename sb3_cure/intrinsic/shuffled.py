@@ -7,7 +7,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp, OwnGenerator
 from sb3_cure.intrinsic.registry import get_intrinsic_class
 from sb3_cure.srl.base import SRLHead

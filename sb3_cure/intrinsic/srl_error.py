@@ -6,9 +6,9 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 
-from sb3_cure.buffers import Samples
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
-from sb3_cure.intrinsic.networks import DITHER
+from sb3_cure.intrinsic.reward_networks import DITHER
 from sb3_cure.srl.base import SRLHead
 
 

@@ -16,12 +16,12 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
-from sb3_cure.persistence.buffers import buffer_from_state, buffer_state, can_be_kept
+from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import why_not_restorable
 from sb3_cure.persistence.files import flush_to_disk
 from sb3_cure.persistence.generations import CheckpointError, Generation, Generations
+from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state, can_be_kept
 from sb3_cure.persistence.resume import Run, log_files, training_state
 
 MODEL, STATE, BUFFER = "model.zip", "state.safetensors", "replay_buffer.safetensors"

@@ -31,9 +31,9 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 from torch.nn.modules import activation
 
-from sb3_cure import encoders
-from sb3_cure.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer, SkippingReplayBuffer
 from sb3_cure.intrinsic import INTRINSIC_REWARDS
+from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
 #: Of the format of what is written

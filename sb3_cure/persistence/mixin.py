@@ -9,9 +9,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 
 from sb3_cure.persistence.archive import SavesModels
-from sb3_cure.persistence.buffers import SavesReplayBuffers
 from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_usable
 from sb3_cure.persistence.env_state import load_statistics
+from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
 from sb3_cure.persistence.resume import Resumption, Run, watch
 
 Self = TypeVar("Self", bound="Persistence")

@@ -5,11 +5,11 @@
 
 import inspect
 
-from sb3_cure.decoders import PixelDecoder
+from sb3_cure.networks.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
 from sb3_cure.srl.contrastive import CURL
-from sb3_cure.srl.dictionary import DictHead, heads_by_key
+from sb3_cure.srl.dict_head import DictHead, heads_by_key
 from sb3_cure.srl.dynamics import Forward, Inverse
 from sb3_cure.srl.self_prediction import SPR
 from sb3_cure.srl.variational import VAE

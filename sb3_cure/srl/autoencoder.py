@@ -7,10 +7,10 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from torch import nn
 
-from sb3_cure.buffers import Samples
-from sb3_cure.decoders import PixelDecoder, VectorDecoder, squared_error
-from sb3_cure.encoders import Encoder
-from sb3_cure.fast_ops import random_bytes_like
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.fast_ops import random_bytes_like
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 

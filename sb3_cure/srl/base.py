@@ -6,10 +6,10 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_cure.augmentations import Augmentation
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.layers import preprocess
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.augmentations import Augmentation
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.layers import preprocess
 
 
 class SRLOutput(NamedTuple):
@@ -41,7 +41,7 @@ class SRLHead(nn.Module):
     #: constructor gets the action space, too, as ``action_space=``
     models_transitions: ClassVar[bool] = False
     #: Whether ``loss`` runs under autocast where the agent computes in bf16. A head that says so computes its error in
-    #: fp32 (``sb3_cure.layers.full_precision``): of bf16's eight bits little would be left once it is standardised
+    #: fp32 (``layers.full_precision``): of bf16's eight bits little would be left once it is standardised
     mixed_precision: ClassVar[bool] = False
     #: Optimiser of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None

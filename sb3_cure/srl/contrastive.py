@@ -8,10 +8,10 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.augmentations import Augmentation, RandomCrop
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.layers import full_precision
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.augmentations import Augmentation, RandomCrop
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 #: Side of CURL's crops, pixels, which decides whether ``augmentation="auto"`` crops or shifts
@@ -132,7 +132,7 @@ class CURL(SRLHead):
         """Choose the negatives of ``error``, which otherwise are the first observations of training.
 
         What the error says depends on them: observations score high that look like many of the bank. To compare
-        policies, take an even mix of what they see (``sb3_cure.evaluation.even_negatives``).
+        policies, take an even mix of what they see (``sb3_cure.evaluation.rollouts.even_negatives``).
 
         :param observations: 1 to ``bank_size`` observations as stored, [n, *shape], 0-255
         :raises ValueError: if there are none, too many, or of another shape

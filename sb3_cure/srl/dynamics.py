@@ -5,9 +5,9 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.layers import full_precision, init_weights
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.layers import full_precision, init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 

@@ -8,8 +8,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.encoders import Encoder
-from sb3_cure.layers import init_weights
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.layers import init_weights
 from sb3_cure.srl.dynamics import NextLatents
 
 

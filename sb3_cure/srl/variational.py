@@ -6,9 +6,9 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.layers import full_precision
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.encoders import Encoder
+from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLOutput
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_cure.observations import image_spaces, images_of
+from sb3_cure.data.observations import image_spaces, images_of
 
 Observations = np.ndarray | dict[str, np.ndarray]
 

@@ -354,7 +354,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     - no ``episode``: a ``Monitor`` in the worker forgets the episode.
 
     ``CuReSAC`` never samples such transitions, and SB3's off-policy algorithms do not either with
-    ``replay_buffer_class=sb3_cure.buffers.SkippingReplayBuffer``. On-policy ones see a truncated episode.
+    ``replay_buffer_class=sb3_cure.data.buffers.SkippingReplayBuffer``. On-policy ones see a truncated episode.
 
     :param env_fns: Functions that make the environments
     :param timeout: Seconds that an answer may take

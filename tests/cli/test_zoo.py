@@ -196,7 +196,7 @@ def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any
 
 
 def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
-    checkpoint = {"sb3_cure.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
+    checkpoint = {"sb3_cure.evaluation.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
     train("--eval-freq", "-1", callback=[checkpoint])
     assert CuReSAC.resume("checkpoints", Filmed(episode_length=7)).num_timesteps == 20
 

@@ -17,9 +17,10 @@ from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
-from sb3_cure.experiments import cells, decoding, media, plots, run, visitation
+from sb3_cure.evaluation import decoding, plots
+from sb3_cure.evaluation.result_files import read_rows
+from sb3_cure.experiments import cells, media, run, visitation
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
 
 
@@ -141,7 +142,7 @@ def test_own_environment_and_head_are_named_by_module(tmp_path: Path, monkeypatc
     (tmp_path / "frames").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
     on_disk = {"frames_dir": str(tmp_path / "frames"), "frame_stack": 2}
-    buffer = "sb3_cure.buffers.FrameStackReplayBuffer"
+    buffer = "sb3_cure.data.buffers.FrameStackReplayBuffer"
     overrides = dict(srl="camera_of_a_grid.Head", replay_buffer_class=buffer, replay_buffer_kwargs=on_disk)
     task = "camera_of_a_grid:tests/Camera-v0"
     cell = only_cell(tmp_path, tasks=[task], methods={"cure": method(**overrides)}, budget=160)

@@ -11,8 +11,8 @@ from grids_for_tests import DMC_TASK, method, write_grid
 from sb3_cure.envs import physics_state, physics_state_names, rendering
 from sb3_cure.envs.counting import TellCell
 from sb3_cure.envs.wrappers import action_repeat_of
+from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import GridError, check_arms, load_grid
 
 WIDTHS = {"slider": 0.1, "hinge_1": 0.2}

@@ -12,8 +12,8 @@ import yaml
 from grids_for_tests import DMC_TASK, TASK, TINY, method, write_grid
 
 from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, heads, run
-from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import Grid, load_grid
 
 FOLDER = Path("tiny", "PixelBox")

@@ -16,7 +16,8 @@ from PIL import Image
 from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, write_cell, write_csv, write_grid
 
-from sb3_cure.experiments import plots, report, statistics
+from sb3_cure.evaluation import plots
+from sb3_cure.experiments import report, statistics
 from sb3_cure.experiments.results import ResultsError, read_results
 from sb3_cure.experiments.tables import NONE, conditions_table
 

@@ -18,9 +18,9 @@ from grids_for_tests import method, steps_of, write_grid
 
 import sb3_cure
 from sb3_cure import CuReSAC
+from sb3_cure.evaluation import result_files as experiment_files
+from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, heads, run
-from sb3_cure.experiments import files as experiment_files
-from sb3_cure.experiments.files import read_rows
 from sb3_cure.experiments.grid import GridError, load_grid
 
 QUICK: dict[str, Any] = dict(budget=40, evaluation=dict(every=40, episodes=1))

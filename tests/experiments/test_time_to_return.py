@@ -14,7 +14,7 @@ from gymnasium import spaces
 from PIL import Image
 
 from benchmarks import time_to_return as ttr
-from sb3_cure.experiments.files import read_rows, write_csv, write_json
+from sb3_cure.evaluation.result_files import read_rows, write_csv, write_json
 from sb3_cure.experiments.grid import GridError
 
 

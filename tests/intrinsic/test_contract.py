@@ -9,9 +9,9 @@ from stable_baselines3.common.torch_layers import NatureCNN
 from torch import nn
 from updates_for_tests import equal, filled_model, groups, moved, train_once
 
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure.networks.encoders import Encoder
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
 Latents = th.Tensor | None

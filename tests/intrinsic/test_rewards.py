@@ -19,11 +19,12 @@ from updates_for_tests import filled_model, groups, moved, sampled, train_once
 
 from benchmarks import rewards as world
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import transitions
-from sb3_cure.callbacks import CuriosityMapCallback, ExactCheckpoint
+from sb3_cure.data.buffers import transitions
+from sb3_cure.evaluation.callbacks import CuriosityMapCallback
 from sb3_cure.experiments.grid import load_grid
 from sb3_cure.intrinsic import INTRINSIC_REWARDS, IntrinsicReward, OwnGenerator, disagreement, rnd
-from sb3_cure.intrinsic.networks import make_network
+from sb3_cure.intrinsic.reward_networks import make_network
+from sb3_cure.persistence import ExactCheckpoint
 
 #: Every reward by its name, and variants of some
 ARMS: dict[str, dict[str, Any]] = {

@@ -39,9 +39,10 @@ from benchmarks.fuzz import (
     zip_of,
 )
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.buffers import Samples, SkippingReplayBuffer
-from sb3_cure.encoders import VectorEncoder
+from sb3_cure.data.buffers import SkippingReplayBuffer
+from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure.networks.encoders import VectorEncoder
 from sb3_cure.persistence import ArchiveError, Persistence
 
 

@@ -43,9 +43,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from benchmarks import faults
 from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC, make_dmc_env
-from sb3_cure.buffers import transitions
-from sb3_cure.callbacks import EvalBothCallback, ExactCheckpoint, PeriodicCallback
-from sb3_cure.persistence import ArchiveError, CheckpointError, Persistence, read_state
+from sb3_cure.data.buffers import transitions
+from sb3_cure.evaluation.callbacks import EvalBothCallback, PeriodicCallback
+from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, read_state
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
@@ -308,7 +308,7 @@ SCRIPT = textwrap.dedent(
     import torch
     from stable_baselines3.common.logger import configure
     from sb3_cure import CuReSAC, make_dmc_env
-    from sb3_cure.callbacks import ExactCheckpoint
+    from sb3_cure.persistence import ExactCheckpoint
 
     torch.set_num_threads(1)
     folder = Path(sys.argv[1])

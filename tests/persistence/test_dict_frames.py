@@ -10,9 +10,8 @@ from dictionaries_for_tests import SensorBox, sensor_model
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import DictFrameStackReplayBuffer, transitions, unmarked
-from sb3_cure.callbacks import ExactCheckpoint
-from sb3_cure.persistence import ArchiveError, read_state
+from sb3_cure.data.buffers import DictFrameStackReplayBuffer, transitions, unmarked
+from sb3_cure.persistence import ArchiveError, ExactCheckpoint, read_state
 from sb3_cure.persistence.encoding import write_state
 from sb3_cure.persistence.generations import Generations
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_buffers import ACTIONS, Twins, assert_equal, random_events, seeded_sample
 
-from sb3_cure.buffers import FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence import read_state, write_state
-from sb3_cure.persistence.buffers import buffer_from_state, buffer_state
+from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
 
 FAULTS = ("step", "step", "terminate", "break", "jump", "fault", "fault")
 

@@ -16,9 +16,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.buffers import FrameStackReplayBuffer, Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.policies import CnnPolicy, CuRePolicy
+from sb3_cure.cure.policies import CnnPolicy, CuRePolicy
+from sb3_cure.data.buffers import FrameStackReplayBuffer
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.encoders import Encoder
 from sb3_cure.srl import SRLHead, SRLOutput
 
 

@@ -13,8 +13,8 @@ from srl_for_tests import batch_of, image_space, make, noise_images, randomise, 
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_cure import make_dmc_env
-from sb3_cure.encoders import PixelEncoder, VectorEncoder
-from sb3_cure.fast_ops import from_cells, to_cells
+from sb3_cure.networks.encoders import PixelEncoder, VectorEncoder
+from sb3_cure.networks.fast_ops import from_cells, to_cells
 from sb3_cure.srl import RAE, get_srl_class
 
 # ---------------------------------------------------------------- the autoencoder's loss

@@ -11,9 +11,9 @@ from torch import nn
 from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_once
 
 from sb3_cure import CuReSAC
-from sb3_cure.buffers import Samples
-from sb3_cure.encoders import Encoder
-from sb3_cure.evaluation import srl_errors
+from sb3_cure.data.samples import Samples
+from sb3_cure.evaluation.rollouts import srl_errors
+from sb3_cure.networks.encoders import Encoder
 from sb3_cure.srl import RAE, SRL_HEADS, SRLHead, SRLOutput, get_srl_class
 
 UPDATES = pytest.mark.parametrize("update", ["joint", "sequential"])

@@ -9,8 +9,8 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from srl_for_tests import batch_of, image_space, make, noise_images, randomise, seeded
 
-from sb3_cure.augmentations import Augmentation
-from sb3_cure.encoders import Encoder, PixelEncoder
+from sb3_cure.networks.augmentations import Augmentation
+from sb3_cure.networks.encoders import Encoder, PixelEncoder
 from sb3_cure.srl import CURL
 
 # ---------------------------------------------------------------- the contrastive loss

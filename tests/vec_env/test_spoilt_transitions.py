@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from sb3_cure.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, transitions
-from sb3_cure.callbacks import ReconstructionCallback
-from sb3_cure.evaluation import most_uncomfortable
+from sb3_cure.data.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, transitions
+from sb3_cure.evaluation.callbacks import ReconstructionCallback
+from sb3_cure.evaluation.rollouts import most_uncomfortable
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore:Environment [0-9]+ :RuntimeWarning", "ignore:.*fork:DeprecationWarning")
@@ -128,8 +128,8 @@ def test_pictures_and_measurements_leave_out_marked_ones(tmp_path: Path, monkeyp
         looked_at.append(buffer.marked[rows, env_inds])
         return transitions(buffer, rows, env_inds, *rest)
 
-    for module in ("callbacks", "evaluation"):
-        monkeypatch.setattr(f"sb3_cure.{module}.transitions", look)
+    for module in ("callbacks", "rollouts"):
+        monkeypatch.setattr(f"sb3_cure.evaluation.{module}.transitions", look)
     picture = ReconstructionCallback(tmp_path)
     picture.init_callback(model)
     buffer.marked[0, 0] = True  # one that a picture from the first to the last would begin with

@@ -25,8 +25,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
-from sb3_cure import buffers, make_dmc_env
-from sb3_cure.buffers import SkippingReplayBuffer
+from sb3_cure import make_dmc_env
+from sb3_cure.data import buffers
+from sb3_cure.data.buffers import SkippingReplayBuffer
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
 from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv
 

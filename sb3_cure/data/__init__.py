@@ -1,0 +1,1 @@
+"""Data: what a batch holds, replay buffers, observations and datasets."""

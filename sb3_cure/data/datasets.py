@@ -1,0 +1,210 @@
+"""Episodes on disk: of an expert, of another agent, of a robot that was steered by hand.
+
+An episode of T steps is one ``.npz`` file of five arrays, named and shaped as Minari's ``EpisodeData``:
+``observations`` [T + 1, ...] (of dictionaries one array per key, ``observations/<key>``), ``actions`` [T, ...],
+``rewards``, ``terminations`` and ``truncations`` [T]. Observations and actions are those of the environment that the
+agent is given: images unscaled, channels first or last. No file is unpickled.
+"""
+
+import itertools
+import uuid
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import maybe_transpose
+
+from sb3_cure.data.buffers import SkipsMarked
+from sb3_cure.data.observations import by_key, copied, rows_of, stacked
+
+#: One array, or one for each key of a dictionary
+Arrays = Any
+
+
+class RecordedEpisode(NamedTuple):
+    """An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
+
+    :param observations: [T + 1, ...], or a dictionary of such arrays
+    :param actions: In the bounds of the action space, [T, ...]
+    :param rewards: [T]
+    :param terminations: [T]
+    :param truncations: [T]
+    """
+
+    observations: Arrays
+    actions: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
+
+
+def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
+    """
+    :param path: The ``.npz`` file to write
+    :param episode: What to write
+    """
+    arrays = episode._asdict()
+    if isinstance(episode.observations, dict):
+        arrays |= {f"observations/{key}": array for key, array in arrays.pop("observations").items()}
+    np.savez_compressed(path, **arrays)
+
+
+def load_episode(path: str | Path) -> RecordedEpisode:
+    """
+    :param path: A ``.npz`` file
+    :return: The episode in it
+    """
+    with np.load(path, allow_pickle=False) as file:
+        by_key = {name.partition("/")[2]: file[name] for name in file.files if name.startswith("observations/")}
+        names = RecordedEpisode._fields[1:]
+        return RecordedEpisode(by_key or file["observations"], *(file[name] for name in names))
+
+
+def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
+    """
+    :param source: A folder of ``.npz`` files, read in the order of their names, one such file, or episodes
+    :return: The episodes, one after the other
+    :raises ValueError: if the folder has no such files
+    """
+    if not isinstance(source, str | Path):
+        yield from source
+        return
+    paths = sorted(Path(source).glob("*.npz")) if Path(source).is_dir() else [Path(source)]
+    if not paths:
+        raise ValueError(f"{source} has no .npz files: write episodes with RecordEpisodes or save_episode.")
+    yield from map(load_episode, paths)
+
+
+class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
+    """Writes each episode of an environment into a folder, when it ends, or when the environment is reset or closed.
+
+    :param env: The environment as the agent sees it
+    :param folder: Where to write; it is made if it is missing
+    """
+
+    def __init__(self, env: gym.Env, folder: str | Path):
+        RecordConstructorArgs.__init__(self, folder=str(folder))
+        super().__init__(env)
+        self.folder = str(folder)
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        self._observations: list[Any] = []
+        self._steps: list[Any] = []
+        # Names are in the order in which episodes are recorded, and of no two environments alike. A run that is resumed
+        # writes those that it plays again over what it had written.
+        self._number, self._token = len(list(Path(folder).glob("*.npz"))), uuid.uuid4().hex[:8]
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """
+        :param kwargs: As of Gymnasium
+        :return: The first observation, and the environment's information
+        """
+        self._write()
+        observation, info = self.env.reset(**kwargs)
+        self._observations = [copied(observation)]
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """
+        :param action: The action
+        :return: What the environment returns
+        """
+        given = np.array(action)  # the environment may change it
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._observations.append(copied(observation))
+        self._steps.append([given, float(reward), bool(terminated), bool(truncated)])
+        if terminated or truncated:
+            self._write()
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Write an episode that has not come to its end, and close the environment."""
+        self._write()
+        super().close()
+
+    def _write(self) -> None:
+        if self._steps:
+            path = Path(self.folder, f"{self._number:06d}-{self._token}.npz")
+            columns = map(np.array, zip(*self._steps, strict=True))
+            save_episode(path, RecordedEpisode(stacked(self._observations), *columns))
+            self._number += 1
+        self._observations, self._steps = [], []
+
+
+def fill(
+    buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]
+) -> int:  # fmt: skip
+    """Add episodes to a replay buffer as if they had been collected: those of several environments side by side.
+
+    :param buffer: A replay buffer
+    :param episodes: With the attributes of ``RecordedEpisode``
+    :param scale_action: Scales actions to [-1, 1], as they are stored
+    :return: Number of transitions that were added
+    :raises ValueError: if episodes are of other spaces, or their ends cannot be filled up
+    """
+    if buffer.n_envs > 1 and not isinstance(buffer, SkipsMarked):
+        raise ValueError(
+            f"episodes differ in length, which a {type(buffer).__name__} of {buffer.n_envs} environments cannot hold: "
+            "use one environment, or a SkippingReplayBuffer."
+        )
+    source, n_added, n_rows = iter(episodes), 0, 0
+    # Each environment goes on with the next episode that is left, and in the end with transitions never sampled.
+    lanes = [_transitions(source, buffer, scale_action) for _ in range(buffer.n_envs)]
+    for row in itertools.zip_longest(*lanes):
+        n_rows, n_added = n_rows + 1, n_added + sum(each is not None for each in row)
+        blank = (*next(each for each in row if each is not None)[:-1], {"bad_transition": "no episode is left"})
+        obs, next_obs, actions, rewards, dones, infos = zip(*(each or blank for each in row), strict=True)
+        columns = (stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)))
+        buffer.add(*columns, list(infos))  # type: ignore[arg-type, call-arg]
+    if n_rows > buffer.buffer_size:
+        side_by_side = f" (those of {buffer.n_envs} environments side by side)" if buffer.n_envs > 1 else ""
+        warnings.warn(
+            f"the episodes have {n_added} transitions in {n_rows} rows{side_by_side}, but the replay buffer keeps the "
+            f"last {buffer.buffer_size} rows: make buffer_size larger.",
+            stacklevel=3,
+        )
+    return n_added
+
+
+def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Callable[[np.ndarray], np.ndarray]) -> Any:
+    """Transitions of the episodes that are left in a source, as ``ReplayBuffer.add`` takes them. An episode without an
+    end was stopped: nothing goes on from it to the next one."""
+    for episode in source:
+        observations = _as_stored(episode.observations, buffer.observation_space)
+        lengths = {name: len(getattr(episode, name)) for name in RecordedEpisode._fields[1:]}
+        lengths |= {name or "observations": len(each) - 1 for name, each in by_key(observations).items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(
+                "an episode of T steps has T actions, rewards, terminations and truncations, T + 1 observations, but "
+                f"one has for T {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
+            )
+        actions = scale_action(np.asarray(episode.actions))
+        if actions.shape[1:] != buffer.action_space.shape or np.abs(actions).max(initial=0) > 1 + 1e-6:
+            raise ValueError(
+                f"actions of an episode, of shape {actions.shape[1:]}, are not within {buffer.action_space}: "
+                "record them as the environment takes them."
+            )
+        for t, reward in enumerate(episode.rewards):
+            terminated = bool(episode.terminations[t])
+            done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)
+            info = {"TimeLimit.truncated": done and not terminated}
+            yield rows_of(observations, t), rows_of(observations, t + 1), actions[t], float(reward), done, info
+
+
+def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
+    """Observations with their channels first, if they are of the space."""
+    if isinstance(space, spaces.Dict):
+        return {key: _as_stored(observations[key], part) for key, part in space.spaces.items()}
+    array = np.asarray(observations)
+    array = maybe_transpose(array, space) if array.ndim == 1 + len(space.shape or ()) else array
+    if array.shape[1:] != space.shape or (space.dtype == np.uint8) != (array.dtype == np.uint8):
+        raise ValueError(
+            f"observations of an episode are {array.dtype} of shape {array.shape[1:]}, but the model sees {space}: "
+            "record them from an environment in the same wrappers."
+        )
+    return array

@@ -1,0 +1,65 @@
+"""What do the latents know of the image? A decoder fitted afterwards, on a frozen encoder."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_cure.cure.policies import CuRePolicy, encoder_of
+from sb3_cure.networks.decoders import PixelDecoder
+
+
+def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int = 1000, key: str = "") -> nn.Module:
+    """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
+
+    :param model: A model of any SB3 algorithm that learns from images with an encoder (``policies.encoder_of``)
+    :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W] or such by key, on the
+        model's device
+    :param updates: Updates of the decoder, of 64 observations each
+    :param key: Of the image that is drawn, where observations are dictionaries
+    :return: The decoder: latents -> images in [-0.5, 0.5]
+    :raises ValueError: if the model has no encoder
+    """
+    images, latents = _images_and_latents(model, sample(1), key)
+    shape = tuple(images.shape[1:])
+    layers = min(4, (min(shape[1:]) + 1) // 4)  # as many as small images allow
+    decoder: nn.Module = PixelDecoder(latents.shape[1], shape, n_layers=layers).to(model.device)
+    optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
+    for _ in range(updates):
+        images, latents = _images_and_latents(model, sample(64), key)
+        loss = F.mse_loss(decoder(latents), images - 0.5)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return decoder
+
+
+@th.no_grad()
+def draw_latents(
+    model: BaseAlgorithm, decoder: nn.Module, observations: Any, key: str = ""
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    :param model: The model whose latents are drawn
+    :param decoder: Its decoder, of ``fit_decoder``
+    :param observations: Observations as stored, 0-255, [B, C, H, W] or such by key
+    :param key: As of ``fit_decoder``
+    :return: What the encoder sees of them (a crop, say) and what is drawn from its latents, both 0-255, [B, C, h, w]
+    """
+    images, latents = _images_and_latents(model, observations, key)
+    return images * 255, (decoder(latents) + 0.5).clamp(0, 1) * 255
+
+
+@th.no_grad()
+def _images_and_latents(model: BaseAlgorithm, observations: Any, key: str) -> tuple[th.Tensor, th.Tensor]:
+    """What the encoder sees of observations, in [0, 1], and what it makes of that."""
+    policy: Any = model.policy
+    if isinstance(policy, CuRePolicy):
+        views = policy.center(observations)
+        return views[key] if key else views, policy.encoder(views)
+    found = encoder_of(policy)
+    if found is None:
+        raise ValueError(f"the {type(policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")
+    return observations.float() / 255, found[1](observations)

@@ -1,0 +1,60 @@
+"""A trained policy as a plain module, for ONNX, TorchScript and what else runs on a robot."""
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from torch import nn
+
+from sb3_cure.cure.policies import CuRePolicy
+from sb3_cure.data.observations import images_of
+from sb3_cure.evaluation.rollouts import trained_actors
+
+
+class DeterministicActor(nn.Module):
+    """
+    What ``predict(observation, deterministic=True)`` computes, from a batch of observations to actions of the
+    environment, without random numbers and branches, so that ``torch.onnx.export``, ``torch.export`` and
+    ``torch.jit.trace`` can follow it. The networks are the model's own: train on, and it changes with them.
+
+    :param model: A trained model of this package, or of SB3's SAC or TQC
+    :param actor: ``"task"`` or ``"curious"``; by default that of ``predict``
+    :raises ValueError: if the model has no such policy
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, model: OffPolicyAlgorithm, actor: str | None = None):
+        super().__init__()
+        trained = trained_actors(model)
+        actor = trained[0] if actor is None else actor
+        if actor not in trained:
+            raise ValueError(f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}.")
+        policy: Any = model.policy
+        self.actor: Any = policy.curious.actor if actor == "curious" else policy.actor
+        # In a tuple, so that critics and decoder are no part of what is exported
+        self._policy: Any = (model.policy,)
+        self.trunk = model.policy.encoder.trunk if isinstance(model.policy, CuRePolicy) else None
+        self._observation_space = model.observation_space
+        for name in ("low", "high"):
+            bound = th.as_tensor(getattr(model.action_space, name), dtype=th.float32, device=model.device)
+            self.register_buffer(name, bound)
+        self.train(False)
+
+    @th.no_grad()
+    def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
+        """
+        :param observations: As the agent sees them, [B, *shape], or a dictionary: images uint8, channels first
+        :return: Actions within the environment's bounds, [B, *action shape]
+        :raises ValueError: for images that are not uint8
+        """
+        for image in images_of(observations, self._observation_space).values():
+            if image.dtype != th.uint8:
+                raise ValueError(f"observations are {image.dtype}, but images must be uint8: do not divide by 255.")
+        (policy,) = self._policy
+        policy.set_training_mode(False)  # as `predict` does: the model may have trained on
+        inputs: Any = observations if self.trunk is None else self.trunk(policy.center(observations))
+        mean, *_ = self.actor.get_action_dist_params(inputs)
+        scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)
+        return self.low + scaled * (self.high - self.low)

@@ -1,0 +1,315 @@
+"""What goes wrong silently in training from pixels: criteria and thresholds of ``DiagnosticsCallback``.
+
+Each check measures one number on observations that the agent has seen, and says in a sentence what is wrong if it is
+out of bounds. A check that does not apply to a model (no images, no autoencoder, no temperature) yields nothing.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
+
+from sb3_cure.cure.policies import CuRePolicy, encoder_of
+from sb3_cure.data.buffers import transitions
+from sb3_cure.data.observations import image_spaces, images_of
+from sb3_cure.envs import render_check
+from sb3_cure.networks.layers import Conv2dReLU
+from sb3_cure.srl import RAE, DictHead
+
+#: Transitions, of all environments together, within which a constant image is looked for
+RECENT = 1000
+#: Observations of an environment that must be alike to count as constant: a robot may well lie still for a moment
+MIN_ALIKE = 30
+#: Share of a layer's units that never fire. Half of them and more are silent in runs that learn well: where all
+#: pixels are positive and of few colours, many random filters are negative everywhere
+DEAD_SHARE = 0.9
+#: Deviation of the latents between observations, as a share of their root mean square. Runs that learn well were
+#: measured at 0.3 to 0.5 after 1000 updates; in their first 500 some fell to 0.004 and came back
+LATENT_SPREAD = 0.01
+#: Share of the pixels' variance that an autoencoder must explain; the mean image explains 0
+EXPLAINED_SHARE = 0.01
+#: Nats per action dimension by which the policy's entropy must miss its target for a temperature to be running away
+ENTROPY_GAP = 0.5
+#: Deviation of the curious reward over the mean entropy term. A difference that lasts for the horizon of a discount
+#: factor of 0.99, 100 steps, then weighs less than the entropy of a single action
+CURIOUS_SHARE = 0.01
+
+
+class Finding(NamedTuple):
+    """
+    :param name: What was looked for
+    :param value: The number that was measured
+    :param problem: A sentence if the number is out of bounds, else None
+    """
+
+    name: str
+    value: float
+    problem: str | None
+
+
+class Temperature(NamedTuple):
+    """
+    :param agent: Whose it is: ``"task"`` or ``"curious"``
+    :param value: The entropy coefficient
+    :param learned: Whether it is adjusted to an entropy
+    :param log_prob: Log-probabilities of actions that the agent drew, [n]
+    """
+
+    agent: str
+    value: float
+    learned: bool
+    log_prob: th.Tensor
+
+
+@th.no_grad()
+def look(
+    model: Any, n_samples: int, min_updates: int, autoencoder_updates: int, temperature_bounds: Sequence[float]
+) -> Iterator[Finding | None]:
+    """
+    Look at a model in training, from cause to effect. Stop at the first problem, which may explain what follows: behind
+    a constant image all latents are alike, beside a huge temperature no reward counts.
+
+    :param model: An off-policy algorithm of SB3, or of this package
+    :param n_samples: Observations to look at
+    :param min_updates: Updates before networks and temperatures are judged
+    :param autoencoder_updates: Updates before the autoencoder is judged; its number is given from the start
+    :param temperature_bounds: Least and greatest temperature
+    :return: What was found; None where a check does not apply
+    """
+    yield constant_image(model, n_samples)
+    if model._n_updates < max(min_updates, 1):
+        return
+    model.policy.set_training_mode(False)
+    batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
+    temperatures = list(_temperatures(model, batch))
+    yield temperature_at_bound(temperatures, model, temperature_bounds)
+    encoded = _encode(model, batch)
+    if encoded is not None:
+        latents, silent = encoded
+        yield dead_units(silent) if silent else None
+        yield collapsed_latents(latents)
+        explained = explained_share(model, batch, latents)
+        yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
+    yield curious_reward(model, temperatures)
+
+
+# ------------------------------------------------------------------------ checks
+
+
+def constant_image(model: Any, n_samples: int) -> Finding | None:
+    """
+    Environments whose latest images are equal in every bit, while nothing moves or the camera sees nothing.
+
+    Value: number of such environments, of dictionaries of their images. Expected: 0.
+
+    :param model: The model
+    :param n_samples: Observations to look at, of all environments together
+    :return: None without images, or with fewer than ``MIN_ALIKE`` observations of each environment
+    """
+    buffer = model.replay_buffer
+    rows = min(buffer.size(), max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
+    if not image_spaces(model.observation_space) or rows < MIN_ALIKE:
+        return None
+    chosen = np.linspace(0, rows - 1, min(rows, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
+    positions = (buffer.pos - 1 - chosen) % buffer.buffer_size
+    constant: list[str] = []
+    for env in range(buffer.n_envs):
+        seen = transitions(buffer, positions, np.full(len(chosen), env)).observations
+        for key, images in images_of(seen, model.observation_space).items():
+            if bool((images == images[:1]).all()):
+                constant.append(f"{env} ({key})" if key else f"{env}")
+    problem = (
+        f"the last {rows} observations of environment {', '.join(constant)} are one and the same image: look at what "
+        "env.render() shows, and at camera_id."
+    )
+    return Finding("constant_image", len(constant), problem if constant else None)
+
+
+def dead_units(silent: dict[str, float]) -> Finding:
+    """
+    ReLUs of the encoder (channels of convolutions) that are 0 for all observations, hence get no gradient.
+
+    Value: the largest share of such units in a layer. Expected: below ``DEAD_SHARE``.
+
+    :param silent: By layer, the share of its units that are 0 for all observations
+    """
+    layer = max(silent, key=lambda name: silent[name])
+    problem = (
+        f"{silent[layer]:.0%} of the units of the encoder's layer {layer!r} are 0 for every observation and no longer "
+        "learn: start anew with a smaller learning_rate, or clip or scale the rewards."
+    )
+    return Finding("dead_units", silent[layer], problem if silent[layer] >= DEAD_SHARE else None)
+
+
+def collapsed_latents(latents: th.Tensor) -> Finding:
+    """
+    Latents that are the same whatever is observed.
+
+    Value: standard deviation between observations over root mean square. Expected: at least ``LATENT_SPREAD``.
+
+    :param latents: [n, features_dim]
+    """
+    deviation, size = latents.var(dim=0, correction=0).mean().sqrt(), latents.square().mean().sqrt()
+    spread = float(deviation / size.clamp(min=1e-12))
+    problem = (
+        f"the encoder's latents differ by {spread:.1e} of their size between observations, but should by "
+        f"{LATENT_SPREAD} at least: try a smaller learning_rate, or another srl head or srl_kwargs."
+    )
+    return Finding("collapsed_latents", spread, problem if spread < LATENT_SPREAD else None)
+
+
+def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
+    """
+    An autoencoder no better than the mean image, which is the best of all constant drawings.
+
+    Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` once there
+    was time to learn; early on it is below 0.
+
+    :param explained: The value
+    :param updates: Updates that were made
+    :param min_updates: Updates after which it is judged
+    """
+    problem = (
+        f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, but should "
+        f"explain {EXPLAINED_SHARE} at least: try another learning_rate, more filters, or srl='curl'."
+    )
+    is_bad = updates >= min_updates and explained < EXPLAINED_SHARE
+    return Finding("autoencoder", explained, problem if is_bad else None)
+
+
+def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds: Sequence[float]) -> Finding | None:
+    """
+    Temperatures that no longer weigh entropy against reward.
+
+    SAC bounds its temperature nowhere but at 0, to which it falls where the policy stays more random than the target
+    entropy asks whatever the temperature (no reward to be found, say); it rises without limit where the policy cannot
+    become as random as the target. So a learned one counts as at its bound when it lies outside of ``bounds`` *and*
+    the policy's entropy misses its target by ``ENTROPY_GAP`` nats per action dimension in the direction that drives it
+    further out: small rewards alone need a small temperature, and with it the policy meets the target. A fixed one
+    counts when it lies outside of ``bounds``, unless it is 0, which turns the entropy off.
+
+    Value: number of temperatures at a bound. Expected: 0.
+
+    :param temperatures: Of the agents that are trained
+    :param model: The model
+    :param bounds: Least and greatest temperature
+    :return: None for algorithms without temperature
+    """
+    problems = []
+    for agent, value, learned, log_prob in temperatures:
+        entropy, target = -float(log_prob.mean()), float(model.target_entropy)
+        gap = (entropy - target) / np.prod(model.action_space.shape)
+        too_low, too_high = value < bounds[0], value > bounds[1]
+        how, advice = "is fixed at", "use ent_coef='auto', or scale the rewards"
+        if learned:
+            too_low, too_high = too_low and gap > ENTROPY_GAP, too_high and gap < -ENTROPY_GAP
+            how = f"lets the entropy be {entropy:.1f} where {target:.1f} is the target, and has run to"
+            advice = "see whether it finds any reward" if too_low else "set a smaller target_entropy"
+        if (too_low or too_high) and (learned or value != 0):
+            expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected: {advice}"
+            problems.append(f"the temperature of the {agent} agent {how} {expected}.")
+    return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
+
+
+def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding | None:
+    """
+    A curious reward so small beside the entropy term that its agent acts at random.
+
+    Value: standard deviation of the curious reward in the latest update over the mean of |temperature *
+    log-probability| (what all observations earn alike steers nothing). Expected: at least ``CURIOUS_SHARE``.
+
+    :param model: The model
+    :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
+    :return: None without curiosity, without entropy term, or before the first update
+    """
+    latest = model._metrics.latest if getattr(model.policy, "intrinsic", None) is not None else {}
+    deviation = float(latest.get("train/curious_reward_std", np.nan))
+    if np.isnan(deviation) or not temperatures or temperatures[-1].value == 0:
+        return None
+    entropy = float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())
+    ratio = deviation / max(entropy, 1e-12)
+    problem = (
+        f"the curious reward varies by {deviation:.1e} while the entropy term is {entropy:.1e}, so the curious "
+        "policy is close to random: use normalize_curiosity=True, or a larger curiosity_beta."
+    )
+    return Finding("curious_reward", ratio, problem if ratio < CURIOUS_SHARE else None)
+
+
+def software_rendering(env: VecEnv) -> Finding | None:
+    """
+    Frames that the CPU draws on a machine with a GPU.
+
+    Value: 1 if so, else 0. OpenGL is asked in a process of its own, which takes a few seconds, on machines with a GPU
+    only.
+
+    :param env: Training environments
+    :return: None without a GPU, without images, or where the environments do not render MuJoCo by OpenGL
+    """
+    gpus = render_check.find_gpus()
+    renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
+    if not gpus or not renders or not image_spaces(env.observation_space):
+        return None
+    renderer = render_check.try_rendering().get("renderer")
+    problem = None if renderer is None else render_check.judge_renderer(renderer, gpus)
+    return Finding("software_rendering", problem is not None, problem)
+
+
+# ------------------------------------------------------------------- measurements
+
+
+def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str, float]] | None:
+    """Latents, [n, features_dim], and for each ReLU of the encoder the share of its units that never fire."""
+    found = encoder_of(model.policy)
+    if found is None:
+        return None
+    encoder, encode = found
+    peaks: dict[str, th.Tensor] = {}
+
+    def note(module: nn.Module, _: Any, output: th.Tensor) -> None:
+        peaks[names[module]] = output.transpose(0, 1).flatten(1).amax(dim=1)
+
+    names: dict[nn.Module, str] = {
+        module: name for name, module in encoder.named_modules() if isinstance(module, nn.ReLU | Conv2dReLU)
+    }
+    handles = [module.register_forward_hook(note) for module in names]
+    try:
+        latents = encode(batch.observations)
+    finally:
+        for handle in handles:
+            handle.remove()
+    return latents, {name: float((peak <= 0).float().mean()) for name, peak in peaks.items()}
+
+
+def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
+    """Share of the targets' variance that the autoencoder's drawings explain, of several images that of the worst; None
+    for heads that are not ``RAE``, and of images without any variance."""
+    head = getattr(model.policy, "srl", None)
+    parts: list[Any] = head.parts(latents) if isinstance(head, DictHead) else [("", head, latents)]
+    if not all(isinstance(each, RAE) for _, each, _ in parts):
+        return None
+    seen = model.policy.samples(batch, random=False)
+    shares = []
+    for key, each, own in parts:
+        shown = seen.of(key) if key else seen
+        variance = float(each.target(shown.views, dither=False).var(dim=0, correction=0).mean())
+        if variance > 0:
+            shares.append(1 - float(each.error(shown, own).mean()) / variance)
+    return min(shares, default=None)
+
+
+def _temperatures(model: Any, batch: ReplayBufferSamples) -> Iterator[Temperature]:
+    """Of the agents that are trained, the curious one last."""
+    if isinstance(model.policy, CuRePolicy):
+        features = model.policy.encoder.trunk(model.policy.center(batch.observations))
+        for name, agent in model.policy.agents.items():
+            if name == "curious" or model.task:
+                log_prob = agent.actor.action_log_prob(features)[1]
+                yield Temperature(name, float(agent.temperature()), agent.log_ent_coef is not None, log_prob)
+    elif hasattr(model, "log_ent_coef"):
+        learned = model.log_ent_coef is not None
+        value = model.log_ent_coef.exp() if learned else model.ent_coef_tensor
+        yield Temperature("task", float(value), learned, model.actor.action_log_prob(batch.observations)[1])

@@ -1,0 +1,490 @@
+"""Figures of the experiments, in one style. Each function takes numbers and writes one PNG of 256 colours."""
+
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Literal, TypeAlias
+
+import numpy as np
+from matplotlib import style
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
+from PIL import Image
+
+from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
+from sb3_cure.evaluation.rollouts import Uncomfortable, binned_errors
+
+#: Matplotlib style file of all figures: ``plt.style.use(STYLE)``
+STYLE = Path(__file__).with_name("plots.mplstyle")
+#: Colour of each policy
+COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
+#: Where colours are taken by arms
+LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
+_ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
+_ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
+
+#: Arm, actor, ends of the error bar (None: none), the values whose mean is shown (one per seed), and what is written
+#: above
+Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
+PathOrFile: TypeAlias = Path | IO[bytes]
+
+
+#: Decorates what draws
+in_style = style.context(STYLE)
+
+
+def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) -> None:
+    """
+    :param figure: A figure
+    :param path: File to write: 256 colours take a quarter of the room
+    :param dpi: Pixels per inch
+    :param tight: Whether to fit the paper to what is drawn
+    """
+    file = io.BytesIO()
+    figure.savefig(file, dpi=dpi, bbox_inches="tight" if tight else None)
+    with Image.open(file) as image:
+        few = image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        few.save(path, "PNG", optimize=True)
+
+
+def _plain(text: str) -> str:
+    """Names are no formulas: matplotlib reads between dollar signs, and hides what begins with an underscore."""
+    return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
+
+
+# Curves
+
+
+def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
+    """
+    :param methods: Arms of an experiment
+    :param baseline: The one that the others are compared with: grey
+    :return: A colour for each; after thirteen of them they repeat
+    """
+    names = [method for method in methods if method != baseline]
+    return {baseline: "#555555", **{name: _ARM_COLORS[index % 13] for index, name in enumerate(names)}}
+
+
+def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
+    """Return (deterministic actions) over environment steps, with the random policy as a line.
+
+    :param path: File to write
+    :param rows: Evaluations with ``environment_steps`` and ``task_return``
+    :param random_return: Mean return of uniformly random actions
+    :param title: Title of the figure
+    """
+    steps = np.array([row["environment_steps"] for row in rows])
+    returns = {"task": np.array([[row["task_return"] for row in rows]])}
+    returns["random"] = np.full((1, len(rows)), random_return)
+    curves = {f"{actor} policy": (steps, values) for actor, values in returns.items()}
+    colors = {f"{actor} policy": COLORS[actor] for actor in returns}
+    learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
+
+
+def learning_curves(
+    path: PathOrFile,
+    curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool = False,
+) -> None:
+    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
+
+    :param path: File to write
+    :param curves: By task and arm: environment steps [n] and values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    """
+    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
+    policy_curves(path, of_task, colors, ylabel, logarithmic)
+
+
+@in_style
+def policy_curves(
+    path: PathOrFile,
+    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
+    colors: Mapping[str, str],
+    ylabel: str,
+    logarithmic: bool,
+    actors: Sequence[str] = (),
+) -> None:
+    """As ``learning_curves``, with arms by colour and policies by line style.
+
+    :param path: File to write
+    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
+    :param colors: By arm
+    :param ylabel: What the values are
+    :param logarithmic: Whether the values have a logarithmic axis
+    :param actors: Policies that the legend names
+    """
+    figure, panels = _panels(len(curves), height=2.9)
+    seeds: dict[str, set[int]] = {}
+    for axes, (task, lines) in zip(panels, curves.items(), strict=True):
+        for (arm, actor), (steps, values) in lines.items():
+            seeds.setdefault(arm, set()).add(len(values))
+            mean = values.mean(axis=0)
+            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor])
+            if len(values) > 1:
+                std = values.std(axis=0, ddof=1)
+                low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
+                axes.fill_between(steps, low, mean + std, color=colors[arm], alpha=0.18, linewidth=0)
+        axes.set(title=_plain(task), xlabel="environment steps", ylabel=ylabel)
+        axes.set_yscale("log" if logarithmic else "linear")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    handles = {}
+    for arm, counts in seeds.items():
+        n = " to ".join(map(str, sorted({min(counts), max(counts)})))
+        handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], color=colors[arm])
+    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
+    _legend(figure, handles)
+    save(figure, path)
+
+
+@in_style
+def paired_differences(
+    path: PathOrFile,
+    rows: Sequence[tuple[str, str, np.ndarray, tuple[float, float | None, float | None]]],
+    colors: Mapping[str, str],
+    xlabel: str,
+) -> None:
+    """Differences from the baseline: one line each, with every pair of seeds as a dot.
+
+    :param path: File to write
+    :param rows: Arm, label of the line, differences by pair, and their mean with its interval
+    :param colors: By arm
+    :param xlabel: What the differences are of
+    """
+    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(rows)))
+    axes = figure.subplots()
+    axes.axvline(0, color="#333333", linewidth=1)
+    for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
+        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5, markersize=3.5)
+        if low is not None and high is not None:
+            axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
+        axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
+    axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
+    axes.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
+    # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
+    reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
+    axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
+    save(figure, path)
+
+
+@in_style
+def aggregate_scores(
+    path: PathOrFile,
+    iqm: Mapping[str, tuple[float, float, float]],
+    taus: np.ndarray,
+    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
+    colors: Mapping[str, str],
+) -> None:
+    """Interquartile means (left) and performance profiles (right) with their intervals.
+
+    :param path: File to write
+    :param iqm: By arm: value, low, high
+    :param taus: Scores at which the profiles are read, [n]
+    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
+    :param colors: By arm
+    """
+    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))))
+    left, right = figure.subplots(1, 2)
+    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
+        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
+        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
+    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
+    left.invert_yaxis()
+    ends = [end for _, *ends in iqm.values() for end in ends]
+    pad = 0.06 * (max(ends) - min(ends)) or 0.05
+    left.set(xlabel="interquartile mean of the final score", title="IQM", xlim=(min(ends) - pad, max(ends) + pad))
+    for arm, (share, lower, upper) in profiles.items():
+        right.step(taus, share, where="post", color=colors[arm], label=_plain(arm))
+        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
+    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
+    save(figure, path)
+
+
+# Bars
+
+
+def visitation_bars(
+    path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
+) -> None:
+    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
+
+    :param path: File to write
+    :param panels: By title: its bars
+    :param lines: By title: values to compare with, by name
+    """
+    actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
+
+
+@in_style
+def actor_bars(
+    path: PathOrFile,
+    panels: Mapping[str, Sequence[Bar]],
+    ylabel: str,
+    lines: Mapping[str, Mapping[str, float]] | None = None,
+) -> None:
+    """Policies in groups of arms, coloured by actor.
+
+    A bar is as high as the mean; with lines across to compare with the axis is logarithmic, where bars have no foot, so
+    that a mark shows the mean.
+
+    :param path: File to write
+    :param panels: By title: its bars
+    :param ylabel: What is measured
+    :param lines: By title: values to compare with, by name; None: none, and a linear axis
+    """
+    figure, places = _panels(len(panels), height=3.3)
+    for axes, (title, rows) in zip(places, panels.items(), strict=True):
+        arms = list(dict.fromkeys(arm for arm, *_ in rows))
+        ticks, position = [], 0.0
+        for arm in arms:
+            group = [row for row in rows if row[0] == arm]
+            ticks.append(position + (len(group) - 1) / 2)
+            for _, actor, ends, values, text in group:
+                color, mean = COLORS.get(actor, "#2ca02c"), float(values.mean())
+                low, high = ends or (mean, float(values.max()))
+                if lines is None:
+                    axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=_plain(actor))
+                else:
+                    axes.plot([position, position], [low, high], color=color, linewidth=1.2)
+                    axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
+                axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
+                note = axes.annotate(text, (position, high), (0, 3), textcoords="offset points", fontsize=7)
+                note.set(ha="center", va="bottom")
+                position += 1
+            position += 0.7
+        axes.set_xticks(ticks, [_plain(arm) for arm in arms], rotation=15 if len(arms) > 3 else 0)
+        axes.set(title=_plain(title), ylabel=ylabel, xlim=(-0.7, position - 1))
+        for (label, value), dashes in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
+            axes.axhline(value, color="#333333", linewidth=1, linestyle=dashes, label=_plain(label))
+        means = [float(values.mean()) for *_, values, _ in rows]
+        if lines is not None and max(means) > 0:
+            axes.set_yscale("log")
+            # Of contrastive errors the lowest is often zero: keep the means in sight.
+            least = min(mean for mean in means if mean > 0)
+            axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
+        (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
+        axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
+    _shared_legend(figure, places)
+    save(figure, path)
+
+
+@in_style
+def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]], title: str) -> None:
+    """R² of each coordinate of the true state, a bar for each probe.
+
+    Bars end at -0.1: how much worse than the mean a prediction is tells nothing more; the number stands beside it.
+
+    :param path: File to write
+    :param probes: By what is compared (times of training, heads): R² by coordinate, of ``evaluation.state_probe``
+    :param title: Title of the figure
+    """
+    names = list(next(iter(probes.values())))
+    height = 0.8 / len(probes)
+    figure = Figure(figsize=(7.0, 1.3 + 0.34 * len(names) * max(1, 0.6 * len(probes))))
+    axes = figure.subplots()
+    colors = arm_colors(list(probes), next(iter(probes)))
+    for index, (label, values) in enumerate(probes.items()):
+        places = np.arange(len(names)) + (index - (len(probes) - 1) / 2) * height
+        widths = np.clip([values[name] for name in names], -0.1, None)
+        axes.barh(places, widths, 0.9 * height, color=colors[label], alpha=0.85, label=_plain(label))
+        for place, width, name in zip(places, widths, names, strict=True):
+            text = f"{round(values[name], 2) + 0:.2f}" if np.isfinite(width) else "n/a"
+            axes.text(max(np.nan_to_num(width), 0) + 0.01, place, text, va="center", fontsize=7)
+    axes.axvline(0, color="#333333", linewidth=1)
+    axes.set_yticks(range(len(names)), [_plain(name.replace("_", " ")) for name in names])
+    axes.set(xlim=(-0.1, 1.08), ylim=(len(names) - 0.5, -0.5), xlabel="R² of episodes left out", title=_plain(title))
+    axes.grid(False, axis="y")
+    _shared_legend(figure, [axes])
+    save(figure, path)
+
+
+def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with so many axes, at most three in a row, as wide as a page."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=({1: 6.5, 2: 9.0, 3: 11.0}[columns], height * rows + 0.5))
+    grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, grid[:count]
+
+
+def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """What any panel shows, once, below all of them."""
+    shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    _legend(figure, shown)
+
+
+def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
+    columns = max(1, min(len(handles), int(figure.get_figwidth() // 2.4)))
+    figure.set_figheight(figure.get_figheight() + 0.21 * max(-(-len(handles) // columns) - 2, 0))  # two have room
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
+# Images
+
+
+def _picture(image: np.ndarray) -> np.ndarray:
+    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
+    return image[..., 0] if image.shape[-1] == 1 else image
+
+
+def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
+    """Images [C, H, W] of one or three channels, side by side."""
+    strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
+    axes.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    axes.tick_params(bottom=False, labelbottom=False)
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+
+
+@in_style
+def reconstructions_over_training(
+    path: Path, observed: np.ndarray, rows: Sequence[tuple[int, np.ndarray]], title: str
+) -> None:
+    """The same observations as they are drawn at several times of training, one row each, below the observations.
+
+    :param path: File to write
+    :param observed: One frame of each observation, uint8 [n, C, H, W] with C = 1 or 3
+    :param rows: Agent steps of training, and what is drawn then of the same shape
+    :param title: Title of the figure
+    """
+    strips = {"seen by the agent": observed}
+    for steps, drawn in rows:
+        error = np.square((drawn.astype(np.float32) - observed) / 255).mean()
+        strips[f"{steps:,} agent steps\nMSE {error:.2g}"] = drawn
+    (n, _, height, width), inches = observed.shape, 10.0
+    figure = Figure(figsize=(inches, 0.4 + len(strips) * (inches - 1.2) * height / (n * width)))
+    figure.get_layout_engine().set(h_pad=0.02, hspace=0)  # type: ignore[union-attr, call-arg]
+    for axes, (label, images) in zip(figure.subplots(len(strips), squeeze=False).flat, strips.items(), strict=True):
+        _show(axes, images)
+        axes.set_yticks([height / 2], [label])
+    figure.suptitle(title)
+    save(figure, path, 120, tight=True)
+
+
+@in_style
+def uncomfortable_frames(
+    path: Path, found: Uncomfortable, frame_stack: int, title: str, drawn: np.ndarray | None = None
+) -> None:
+    """The observations with the highest SRL error, worst first, each with its error and age.
+
+    :param path: File to write
+    :param found: What ``sb3_cure.evaluation.rollouts.most_uncomfortable`` found, of images
+    :param frame_stack: Frames per observation, of which the newest is shown
+    :param title: Title of the figure
+    :param drawn: Their reconstructions, shown beside them, uint8 like ``found.observations``, or None
+    :raises ValueError: if the observations are not so many frames, grey or in colour
+    """
+    channels, left_over = divmod(found.observations.shape[1], frame_stack)
+    if left_over or channels not in (1, 3, 4):
+        raise ValueError(
+            f"frame_stack is {frame_stack}, but the observations have {found.observations.shape[1]} channels, of which "
+            "each frame takes 3, or 1 if it is grey: give the environment's frame_stack."
+        )
+    pairs = [found.observations] if drawn is None else [found.observations, drawn]
+    columns = min(len(found.errors), 8 if drawn is None else 4)
+    n_rows = -(-len(found.errors) // columns)
+    figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5))
+    grid = figure.subplots(n_rows, columns, squeeze=False).flat
+    for place in grid:
+        place.set_axis_off()
+    gap = np.full((channels, found.observations.shape[2], 1), 255, np.uint8)
+    for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
+        frames = [images[index, -channels:] for images in pairs]
+        _show(grid[index], [frames[0], *(part for each in frames[1:] for part in (gap, each))])
+        grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
+    note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
+    note += f", and how many times the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
+    figure.suptitle(f"{title}\n{note}", fontsize=10, wrap=True)
+    save(figure, path, 120)
+
+
+@in_style
+def curiosity_map(
+    path: Path,
+    visits: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    names: Sequence[str],
+    title: str,
+    coordinates: tuple[str, str] | None = None,
+    units: Sequence[str] | None = None,
+    bins: int = 24,
+) -> None:
+    """Where each policy goes and what SRL error it meets there, over two coordinates of the true state.
+
+    One row per policy: on the left the number of steps in each bin, on the right their mean SRL error (left out if no
+    policy has errors). Axes and colours are the same for all policies.
+
+    :param path: File to write
+    :param visits: By policy, the states of all steps, [n, d], and their SRL errors, [n] or empty
+    :param names: Names of the coordinates of a state, [d]
+    :param title: Title of the figure
+    :param coordinates: Names of the two to show; by default ``telling_coordinates``
+    :param units: Units of the coordinates, [d]; angles ("rad") are shown from -pi to pi
+    :param bins: Bins along each axis
+    :raises ValueError: if ``coordinates`` are not two of the names
+    """
+    coordinates = coordinates or telling_coordinates(list(names))
+    check_coordinates(coordinates, names)
+    columns = [list(names).index(name) for name in coordinates]
+    both = [None if units is None else units[column] for column in columns]
+    places = {actor: states[:, columns] for actor, (states, _) in visits.items()}
+    seen = np.concatenate(list(places.values()))
+    x_edges, y_edges = (np.linspace(*_span(seen[:, axis], both[axis]), bins + 1) for axis in (0, 1))
+    edges = x_edges, y_edges
+    binned = {actor: binned_errors(places[actor], errors, edges) for actor, (_, errors) in visits.items()}
+
+    means = np.concatenate([mean[np.isfinite(mean)] for _, mean in binned.values()])
+    kinds = ["steps in bin"] + (["mean error"] if len(means) else [])
+    most = max(2, max(counts.max() for counts, _ in binned.values()))
+    norms: list[Normalize] = [LogNorm(1, most)]
+    if len(means):
+        norms.append(PowerNorm(0.5, means.min(), means.max()))  # most errors are far below the highest
+    figure = Figure(figsize=(4.6 * len(kinds), 3.6 * len(visits) + 0.4))
+    grid = figure.subplots(len(visits), len(kinds), squeeze=False, sharex=True, sharey=True)
+    meshes = []
+    for row, (actor, (counts, mean)) in zip(grid, binned.items(), strict=True):
+        for place, values, norm, map_name in zip(row, (counts, mean), norms, ("viridis", "plasma"), strict=False):
+            shown = np.ma.masked_where(counts == 0, values).T
+            meshes.append(place.pcolormesh(*edges, shown, norm=norm, cmap=map_name))
+            place.set_facecolor("0.92")
+            place.set_title(f"{actor} policy", color=COLORS[actor])
+            place.grid(False)
+            _name_axes(place, coordinates, both, edges)
+    for kind, column, mesh in zip(kinds, grid.T, meshes, strict=False):  # the meshes of the first row
+        bar = figure.colorbar(mesh, ax=list(column), label=kind, aspect=20 * len(column), pad=0.02)
+        if kind == kinds[0]:
+            ticks = [count * 10**power for power in range(9) for count in (1, 2, 5) if count * 10**power <= most]
+            bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
+            bar.ax.minorticks_off()
+    n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
+    figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", wrap=True)
+    save(figure, path, 120, tight=True)
+
+
+def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
+    """Ends of an axis: the full circle for angles, else from the least to the greatest value."""
+    low, high = float(values.min()), float(values.max())
+    if unit == "rad" and max(-low, high) <= np.float32(np.pi):
+        return -np.pi, np.pi
+    return (low, high) if high > low else (low - 0.5, high + 0.5)
+
+
+def _name_axes(
+    axes: Axes, coordinates: tuple[str, str], units: Sequence[str | None], edges: Sequence[np.ndarray]
+) -> None:
+    """Labels with units; angles have ticks at multiples of pi / 2."""
+    labels = coordinate_labels(coordinates)
+    for axis, label, unit, ends in zip((axes.xaxis, axes.yaxis), labels, units, edges, strict=True):
+        axis.set_label_text(f"{label} [{unit}]" if unit else label)
+        axis.set_tick_params(labelbottom=True, labelleft=True)
+        if ends[-1] == np.pi:
+            axis.set_ticks([-np.pi, -np.pi / 2, 0, np.pi / 2, np.pi], ["-π", "-π/2", "0", "π/2", "π"])

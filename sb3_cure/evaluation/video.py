@@ -1,0 +1,126 @@
+"""Videos of a policy with its SRL error drawn in."""
+
+import functools
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import imageio.v2 as imageio
+import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: F401  (imageio looks for it late: at the first frame)
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from sb3_cure.evaluation.rollouts import Episode
+
+MIN_WIDTH = 256
+RED, GREY = "#d62728", "#bbbbbb"
+
+
+def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, title: str = "") -> None:
+    """One episode as MP4: the camera's picture above, the SRL error up to now below.
+
+    :param path: File to write, ``*.mp4``
+    :param episode: Episode with ``frames`` (rendered with ``render=True``); without ``srl_errors`` none are drawn
+    :param fps: Pictures per second, one per agent step
+    :param action_repeat: Environment steps per agent step, for the caption
+    :param title: What is seen, put before the caption; wrapped where it is wider than the picture
+    """
+    # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
+    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
+        for picture in annotated_frames(episode, action_repeat, title):
+            writer.append_data(picture)  # type: ignore[attr-defined]
+
+
+def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
+    """Several policies at once, as ``write_video``, with one scale of the errors.
+
+    :param path: File to write, ``*.mp4``
+    :param episodes: Episodes with ``frames``, by title; all end with the shortest
+    :param fps: Pictures per second, one per agent step
+    :param action_repeat: Environment steps per agent step, for the captions
+    """
+    top = max(float(episode.srl_errors.max(initial=0)) for episode in episodes.values())
+    columns = [annotated_frames(episode, action_repeat, title, top) for title, episode in episodes.items()]
+    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
+        for pictures in zip(*columns, strict=False):
+            height = max(len(picture) for picture in pictures)
+            padded = [np.pad(each, ((0, height - len(each)), (0, 0), (0, 0)), constant_values=255) for each in pictures]
+            writer.append_data(np.concatenate(padded, axis=1))  # type: ignore[attr-defined]
+
+
+def annotated_frames(
+    episode: Episode, action_repeat: int = 1, title: str = "", top: float | None = None
+) -> Iterator[np.ndarray]:
+    """The pictures of ``write_video``.
+
+    :param episode: As there
+    :param action_repeat: As there
+    :param title: As there
+    :param top: Error at the upper end of the curve; None: the episode's highest
+    :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
+    """
+    returns = episode.rewards.cumsum()
+    if top is None:
+        top = float(episode.srl_errors.max(initial=0))
+    for step, frame in enumerate(episode.frames):
+        caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
+        errors = episode.srl_errors[: step + 1]
+        yield _with_panel(frame, title, caption, errors, len(episode.frames), top)
+
+
+def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray, length: int, top: float) -> np.ndarray:
+    """The frame above a panel with text and, if there are errors, the newest one as a number and all as a curve."""
+    factor = -(-MIN_WIDTH // frame.shape[1])
+    frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
+    height, width = frame.shape[:2]
+    unit = width // 64  # sizes follow the picture's
+    line_height, curve_height = 4 * unit, 10 * unit if len(errors) else 0
+    # Only the title may be wrapped: it stays as it is, and all pictures have to have the same number of lines.
+    lines = [*_wrapped(title, 3 * unit, width - 2 * unit), caption]
+    if len(errors):
+        lines.append(f"SRL error {errors[-1]:.5f} (highest {top:.5f})")
+    size = (width + width % 2, height + line_height * len(lines) + curve_height + 2 * unit)
+    picture = Image.new("RGB", (size[0], size[1] + size[1] % 2), "white")
+    picture.paste(Image.fromarray(frame))
+    draw = ImageDraw.Draw(picture)
+    for index, line in enumerate(lines):
+        color = RED if len(errors) and line is lines[-1] else "black"
+        place = (unit, height + index * line_height + unit // 2)
+        draw.text(place, line, fill=color, font=_font(_fitting_size(line, 3 * unit, width - 2 * unit)))
+    if len(errors):
+        left, right, bottom = unit, width - unit, picture.height - unit
+        draw.line([(left, bottom), (right, bottom)], fill=GREY)
+        points = [
+            (left + (right - left) * index / max(length - 1, 1), bottom - curve_height * error / top if top else bottom)
+            for index, error in enumerate(errors.tolist())
+        ]
+        draw.line(points, fill=RED, width=max(unit // 2, 1))
+        x, y = points[-1]
+        draw.ellipse((x - unit / 2, y - unit / 2, x + unit / 2, y + unit / 2), fill=RED)
+    return np.asarray(picture)
+
+
+#: By size; loading one takes longer than drawing a line
+_font = functools.cache(ImageFont.load_default)
+
+
+def _width(line: str, size: int) -> float:
+    """Of its pixels: glyphs such as ``_`` end beyond where the next one would begin."""
+    return _font(size).getbbox(line)[2]
+
+
+@functools.cache
+def _wrapped(text: str, size: int, width: int) -> list[str]:
+    """As few lines as fit into a width; words are broken only where one alone is wider."""
+    for length in range(len(text), 1, -1):
+        lines = textwrap.wrap(text, length, break_on_hyphens=False)
+        if all(_width(line, size) <= width for line in lines):
+            return lines
+    return [text] if text else []
+
+
+def _fitting_size(line: str, size: int, width: int) -> int:
+    """The size, or as much smaller as a line with long numbers asks for."""
+    while size > 1 and _width(line, size) > width:
+        size -= 1
+    return size

@@ -1,0 +1,80 @@
+"""What intrinsic rewards are made of: how they see observations, and their networks."""
+
+import itertools
+import math
+from collections.abc import Iterable
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from torch import nn
+
+from sb3_cure.networks.layers import FlattenImage, FullPrecision, preprocess
+
+#: Variance of uniform noise within a step of 1/32, the dither of 5-bit images (SAC-AE), where pixels are in [0, 1]: how
+#: little a pixel must vary to count as constant
+DITHER = 8.1e-5
+
+
+def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
+    """
+    :param observations: As stored, [B, *shape]
+    :param space: Their space
+    :return: Images in [-0.5, 0.5] in NHWC memory order, [B, C, H, W]; anything else as a vector, [B, n]
+    """
+    if is_image_space(space, check_channels=False):
+        return observations.contiguous(memory_format=th.channels_last).float().div_(255).sub_(0.5)
+    return preprocess(observations, space).flatten(1)
+
+
+class MLP(FullPrecision):
+    """Linear maps with ReLUs in between, in fp32, whatever convolutions before them compute in.
+
+    :param sizes: Of the input, the hidden layers and the output
+    """
+
+    def __init__(self, sizes: Iterable[int]):
+        layers = [layer for pair in itertools.pairwise(sizes) for layer in (nn.Linear(*pair), nn.ReLU())]
+        super().__init__(*layers[:-1])
+        init(self)
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [B, n]
+        :return: fp32, [B, m]
+        """
+        return super().forward(inputs.float())
+
+
+def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16, n_layers: int = 3) -> nn.Sequential:
+    """A network of what ``scaled`` returns: convolutions of stride 2 if these are images, then ``MLP``.
+
+    :param space: Space of the observations
+    :param sizes: Of the hidden layers and the output
+    :param n_filters: Channels of the convolutions
+    :param n_layers: How many there are
+    :return: The network
+    """
+    if not is_image_space(space, check_channels=False):
+        return MLP([get_flattened_obs_dim(space), *sizes])
+    channels, *size = space.shape  # type: ignore[misc]
+    layers: list[nn.Module] = []
+    for _ in range(n_layers):
+        layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
+        channels, size = n_filters, [(side + 1) // 2 for side in size]
+    network = init(nn.Sequential(*layers, FlattenImage()))
+    network.append(MLP([n_filters * math.prod(size), *sizes]))
+    return network.to(memory_format=th.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def init(network: nn.Sequential) -> nn.Sequential:
+    """Orthogonal weights of gain sqrt(2), as in RND's code: all taps of a kernel count, unlike with ``init_weights``.
+
+    :param network: Its layers are initialised in place, biases become 0
+    :return: The same
+    """
+    for layer in network:
+        if isinstance(layer, nn.Linear | nn.Conv2d):
+            nn.init.orthogonal_(layer.weight, math.sqrt(2))
+            nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return network

@@ -1,0 +1,1 @@
+"""Networks: encoders, decoders, layers, fast kernels, augmentations and numerical precision."""

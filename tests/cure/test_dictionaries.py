@@ -1,0 +1,498 @@
+"""Observations that are dictionaries: of images and vectors, and of vectors alone."""
+
+import io
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from dictionaries_for_tests import Goal, SensorBox, sensor_model
+from envs_for_tests import KillNow, PixelBox, VectorBox, differences, state_of, tiny_model
+from gymnasium import spaces
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from torch.nn import functional as F
+from updates_for_tests import BATCH, StraightLine, prepare, sampled, train_once
+
+from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.data.buffers import DictFrameStackReplayBuffer, unmarked
+from sb3_cure.data.samples import Samples
+from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
+from sb3_cure.networks.encoders import DictEncoder
+from sb3_cure.networks.layers import VectorNorm
+from sb3_cure.srl import CURL, RAE, DictHead, SRLHead, SRLOutput
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
+
+# ------------------------------------------------------------------------------- one key is no other method
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"srl": "curl", "update": "sequential"},
+        {"intrinsic": "reconstruction", "intrinsic_kwargs": {"n_filters": 4, "n_layers": 2}},
+        {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 28}, "curiosity": "bonus"},
+        {"srl": None, "curiosity": None, "augmentation": "shift"},
+    ],
+)
+def test_one_image_trains_as_without_dictionary(kwargs: dict[str, Any]) -> None:
+    """Latents, actions and every parameter after updates are those of the plain image, bit for bit."""
+    network = {"features_extractor_kwargs": {"features_dim": 8, "n_filters": 4, "n_layers": 2}}
+    plain = tiny_model("CnnPolicy", PixelBox(), **kwargs, policy_kwargs=network).learn(30)
+    ours = sensor_model(SensorBox(("front",)), **kwargs).learn(30)
+    assert plain._n_updates == ours._n_updates == 20
+    for mine, theirs in zip(ours.policy.parameters(), plain.policy.parameters(), strict=True):
+        assert th.equal(mine, theirs)
+    image = plain.observation_space.sample()
+    actions, _ = ours.predict({"front": image}, deterministic=True)
+    np.testing.assert_array_equal(actions, plain.predict(image, deterministic=True)[0])
+    seen = th.as_tensor(image[None])
+    assert th.equal(ours.policy.encode({"front": seen}), plain.policy.encode(seen))
+
+
+class Flat(gym.ObservationWrapper):
+    """As one vector."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (6,), np.float32)
+
+    def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        return np.concatenate([observation[key] for key in self.env.observation_space]).astype(np.float32)
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"srl": None, "intrinsic": "reconstruction"}, {"update": "sequential"}])
+def test_dictionary_without_images_acts_as_one_vector(kwargs: dict[str, Any]) -> None:
+    """Of an environment in the style of Gymnasium-Robotics, bit for bit."""
+    network = {"features_extractor_kwargs": {"features_dim": 8, "hidden_dim": 16}}
+    ours = tiny_model("MultiInputPolicy", Goal(), **kwargs, policy_kwargs=network).learn(30)
+    plain = tiny_model("MlpPolicy", Flat(Goal()), **kwargs, policy_kwargs=network).learn(30)
+    assert ours._n_updates == 20
+    assert differences(state_of(ours), state_of(plain)) == []
+
+
+def test_hindsight() -> None:
+    """With SB3's own buffer for it."""
+    model = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer, policy_kwargs={}).learn(30)
+    assert type(model.replay_buffer) is HerReplayBuffer
+    assert model._n_updates > 0 and np.isfinite(float(model._metrics.latest["train/srl_error"]))
+
+
+# --------------------------------------------------------------------------------- several keys, written out
+
+
+class HandWrittenEncoder(th.nn.Module):
+    """What the encoder of two images and a vector computes, from its parameters.
+
+    :param encoder: A ``DictEncoder``, copied
+    """
+
+    def __init__(self, encoder: DictEncoder):
+        super().__init__()
+        self.of = encoder
+
+    def trunk(self, observations: dict[str, th.Tensor]) -> Any:
+        features = []
+        for key, trunk in zip(("front", "wrist"), self.of.trunk.trunks, strict=True):
+            first, second = (layer for layer in trunk if isinstance(layer, th.nn.Conv2d))
+            hidden = F.relu(F.conv2d(observations[key], first.weight, first.bias, stride=2))
+            hidden = F.relu(F.conv2d(hidden, second.weight, second.bias))
+            features.append(hidden.permute(0, 2, 3, 1).reshape(len(hidden), -1))
+        return (*features, observations["joints"])
+
+    def projection(self, features: tuple[th.Tensor, ...]) -> th.Tensor:
+        front, wrist, vector = self.of.projection.parts
+        latents = []
+        for part, feature in ((front, features[0]), (wrist, features[1])):
+            projected = feature @ part.linear.weight.T + part.linear.bias
+            latents.append(th.tanh(self.normalise(projected, part.norm)))
+        ones = th.ones(len(features[2]), 1)
+        latents.append(self.normalise(th.cat([features[2], ones, -ones], dim=1), vector.norm))
+        return th.cat(latents, dim=1)
+
+    def normalise(self, values: th.Tensor, norm: Any) -> th.Tensor:
+        centred = values - values.mean(dim=1, keepdim=True)
+        size = (centred.square().mean(dim=1, keepdim=True) + 1e-5).sqrt()
+        return centred / size * norm.weight + norm.bias
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        return self.projection(self.trunk(observations))
+
+
+class TwoCameras(StraightLine):
+    """An update of the agent with two images and a vector."""
+
+    def __init__(self, model: CuReSAC):
+        super().__init__(model)
+        self.encoder, self.encoder_target = map(HandWrittenEncoder, (self.encoder, self.encoder_target))
+
+    def scaled(self, observations: Any) -> Any:
+        if isinstance(observations, dict):
+            return {key: self.scaled(part) for key, part in observations.items()}
+        return super().scaled(observations)
+
+    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        losses, errors, joint = [], [], self.head
+        for i, key in enumerate(("front", "wrist")):
+            self.head = joint.heads[i]
+            loss, error = super().srl(batch.of(key), latents[:, 8 * i : 8 * i + 8])
+            losses.append(loss)
+            errors.append(error / error.std(unbiased=False))
+        self.head = joint
+        return losses[0] + losses[1], (errors[0] + errors[1]) / 2
+
+
+@pytest.mark.parametrize("algorithm", [CuReSAC, CuReTQC])
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[CuReSAC], update: str) -> None:
+    """Every loss, and every parameter, target and temperature after it."""
+    quantiles = {} if algorithm is CuReSAC else {"n_quantiles": 5}
+    model = sensor_model(
+        SensorBox(),
+        algorithm,
+        learning_starts=40,
+        learning_rate=0.03,
+        tau=0.2,
+        encoder_tau=0.6,
+        gamma=0.95,
+        curiosity_beta=0.7,
+        curiosity_gamma=0.8,
+        curiosity_prob=0.0,
+        update=update,
+        policy_kwargs={
+            "optimizer_class": th.optim.SGD,
+            "features_extractor_kwargs": {"features_dim": 8, "n_filters": 4, "n_layers": 2},
+            **quantiles,
+        },
+    ).learn(40)
+    prepare(model)
+    for norm in (model.policy.encoder.projection.parts[2].norm, model.policy.actor.features_extractor.parts[2].norm):
+        assert th.equal(norm.weight, th.ones(4))
+    np.random.seed(1)
+    batch = Samples(*model.replay_buffer.sample(BATCH))
+    batch = batch._replace(views=batch.observations)
+    th.manual_seed(1)
+    written_out = TwoCameras(model)
+    expected = written_out.update(batch, update == "sequential")
+    before = StraightLine(model).groups()
+    logged = train_once(model)
+    assert {name: logged[name] for name in expected} == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    for old, actual, wanted in zip(before, StraightLine(model).groups(), written_out.groups(), strict=True):
+        distance = float((wanted - old).norm())
+        assert float((actual - wanted).norm()) < 2e-3 * distance + 1e-6 * float(old.norm()) + 1e-7
+
+
+# -------------------------------------------------------------------------------------------------- the encoder
+
+
+def test_target_encoder_shares_nothing_with_the_encoder() -> None:
+    """Its encoders of single images, which heads are given, are made of its own weights; and nothing is there twice."""
+    policy = sensor_model().policy
+    for encoder in (policy.encoder, policy.encoder_target):
+        own = {id(parameter) for parameter in encoder.parameters()}
+        parts = [parameter for image in encoder.images.values() for parameter in image.parameters()]
+        assert {id(part) for part in parts} < own
+        assert len(own - {id(part) for part in parts}) == 2  # of the vectors' norm
+        assert len(list(encoder.state_dict())) == len(own)
+    assert not {id(p) for p in policy.encoder.parameters()} & {id(p) for p in policy.encoder_target.parameters()}
+
+
+@pytest.mark.parametrize("n", [1, 2, 7])
+def test_norm_of_vectors_loses_nothing(n: int) -> None:
+    """Two robots whose joints differ in size or in a shift alone look different, also of a single joint."""
+    norm, vector = VectorNorm(n), th.randn(1, n, generator=th.Generator().manual_seed(0))
+    seen = norm(th.cat([vector, 2 * vector, vector + 1, -vector]))
+    assert seen.shape == (4, n + 2) and (seen.std(dim=1, correction=0) - 1).abs().max() < 1e-3
+    assert min(float((a - b).detach().norm()) for i, a in enumerate(seen) for b in seen[:i]) > 0.05
+
+
+def test_vectors_are_not_drowned() -> None:
+    """A joint moves what the actor reads as much as an image does, whose features are 450 times as many."""
+    model = sensor_model()
+    policy, space = model.policy, model.observation_space
+    space.seed(0)
+    seen = [{key: th.as_tensor(part[None]) for key, part in space.sample().items()} for _ in range(2)]
+    features = [policy.encoder.trunk(policy.center(each)) for each in seen]
+    latents = policy.actor.features_extractor(features[0])
+    assert latents.shape == (1, 8 + 8 + 4)
+    moved = policy.actor.features_extractor((*features[0][:2], features[1][2]))
+    assert (moved - latents)[:, 16:].norm() > 0.5
+    assert features[0][0].numel() == 900 and features[0][2].numel() == 2
+
+
+def test_each_image_has_its_own_settings() -> None:
+    """``by_key`` over what the head asks for over the shared ones; cameras differ in size."""
+    network = {
+        "features_dim": 6,
+        "n_filters": 4,
+        "n_layers": 2,
+        "by_key": {"wrist": {"n_layers": 1, "features_dim": 3}},
+    }
+    crops = {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 24}}
+    model = sensor_model(**crops, policy_kwargs={"features_extractor_kwargs": network})
+    encoder = model.policy.encoder
+    assert (encoder.images["front"].n_layers, encoder.images["wrist"].n_layers) == (2, 1)
+    assert [encoder.slices[key] for key in ("front", "wrist")] == [slice(0, 6), slice(6, 9)]
+    assert encoder.features_dim == 6 + 3 + 4
+    assert not any(image.projection.tanh for image in encoder.images.values())  # as CURL asks of crops
+    assert not model.policy.actor.features_extractor.parts[0].tanh
+
+
+def test_head_chooses_an_augmentation_for_each_image() -> None:
+    """CURL crops what is larger than 84 pixels and shifts the rest; each image is moved by itself, vectors stay."""
+
+    class Large(SensorBox):
+        def __init__(self) -> None:
+            super().__init__(size=90)
+
+    augmentation = sensor_model(Large(), srl="curl").policy.augmentation
+    assert {key: type(part) for key, part in augmentation.images.items()} == {"front": RandomCrop, "wrist": RandomShift}
+    assert augmentation.view_space["front"].shape == (6, 84, 84) and augmentation.view_space["joints"].shape == (2,)
+    assert type(sensor_model().policy.augmentation) is Augmentation
+    shifted = sensor_model(srl="curl").policy.augmentation
+    index = th.arange(28, dtype=th.uint8).expand(8, 6, 28, 28)
+    seen = {"front": index, "wrist": index, "joints": th.zeros(8, 2)}
+    views = shifted(seen, th.Generator().manual_seed(0))
+    assert not th.equal(views["front"], views["wrist"]) and views["joints"] is seen["joints"]
+    assert th.equal(shifted.center(seen)["front"], index)
+
+
+# ------------------------------------------------------------------------------------------------ heads, rewards
+
+
+def test_error_is_the_mean_over_images_in_their_own_deviations() -> None:
+    """Whatever the sizes of their numbers; measured without noise it does not move the deviations."""
+    model = sensor_model().learn(40)
+    head, policy = model.policy.srl, model.policy
+    assert isinstance(head, DictHead) and [type(each) for each in head.heads] == [RAE, RAE]
+    batch = policy.samples(model.replay_buffer.sample(16), random=False)
+    latents = policy.encode(batch.observations)
+    before = head.mean_error.variances.clone()
+    errors = [
+        each.error(batch.of(key), latents[:, policy.encoder.slices[key]])
+        for key, each in zip(("front", "wrist"), head.heads, strict=True)
+    ]
+    deviations = (before / head.mean_error.weight).sqrt()
+    expected = (errors[0] / deviations[0] + errors[1] / deviations[1]) / 2
+    th.testing.assert_close(policy.error(batch), expected)
+    assert th.equal(head.mean_error.variances, before) and float(before.min()) > 0
+    # A sensor whose numbers are a thousand times as large weighs the same.
+    alike = th.stack([errors[0], 1000 * errors[1]])
+    head.mean_error.variances.copy_(before * th.tensor([1.0, 1e6]))
+    th.testing.assert_close(head.mean_error(alike, learns=False), expected)
+    head.mean_error(th.full((2, 16), th.inf), learns=True)
+    assert head.mean_error.variances.isfinite().all()
+
+
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_error_per_pixel_is_that_of_each_images_own_head(target: str) -> None:
+    """Over the running deviation of each pixel; then the mean over images, each in its own deviation."""
+    settings: dict[str, Any] = dict(intrinsic_kwargs={"per_pixel": True}, curiosity_target=target)
+    model = sensor_model(**settings, learning_rate=0.0, learning_starts=40).learn(40)
+    policy, found = model.policy, []
+    policy.scale.register_forward_pre_hook(lambda _, args: found.append(args[0].clone()))
+    batch = sampled(model)
+    about: Any = batch.observations if target == "observation" else batch.next_observations
+    latents, errors = policy.encode(about), []
+    for key, head in zip(("front", "wrist"), policy.srl.heads, strict=True):  # type: ignore[arg-type, union-attr]
+        drawn = head.reconstruct(latents[:, policy.encoder.slices[key]]).float() / 255  # type: ignore[operator, index]
+        seen = about[key].float() / 255
+        errors.append(((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1))
+    train_once(model)
+    # A spread below a thousandth of the errors' size counts as rounding.
+    expected = sum(e / th.maximum(e.var(correction=0), 1e-6 * e.square().mean()).sqrt() for e in errors) / 2
+    th.testing.assert_close(found[0], expected.detach(), rtol=1e-3, atol=1e-5)  # type: ignore[union-attr]
+    measured = policy.samples(model.replay_buffer.sample(5), random=False)  # type: ignore[union-attr]
+    assert policy.error(measured).shape == (5,)
+
+
+class Dynamics(SRLHead):
+    """Predicts the joined latents of the next step."""
+
+    needs_next_latents = True
+
+    def __init__(self, encoder: Any, observation_space: spaces.Space):
+        super().__init__(encoder, observation_space)
+        self.model = th.nn.Linear(encoder.features_dim + 2, encoder.features_dim)
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        assert next_latents is not None and latents.shape == next_latents.shape == (len(batch.actions), 20)
+        assert set(batch.observations) == {"front", "joints", "wrist"}
+        error = (self.model(th.cat([latents, batch.actions], dim=1)) - next_latents).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+class Brightness(SRLHead):
+    """A head of a user who knows of images alone."""
+
+    def __init__(self, encoder: Any, observation_space: spaces.Box, start: float = 0.0):
+        super().__init__(encoder, observation_space)
+        self.map = th.nn.Linear(encoder.features_dim, 1)
+        th.nn.init.constant_(self.map.bias, start)
+
+    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+        goal = self.preprocess(batch.views).mean(dim=(1, 2, 3))
+        error = (self.map(latents)[:, 0] - goal).square()
+        return SRLOutput(error.mean(), error.detach())
+
+
+MODES: dict[str, tuple[type[CuReSAC], dict[str, Any]]] = {
+    "rae, joint": (CuReSAC, {}),
+    "curl, sequential": (CuReTQC, {"srl": "curl", "update": "sequential"}),
+    "next observation": (CuReSAC, {"curiosity_target": "next_observation", "curiosity_gamma": 0.0}),
+    "bonus": (CuReTQC, {"curiosity": "bonus", "intrinsic": "reconstruction"}),
+    "random": (CuReSAC, {"curiosity": "random", "curiosity_prob": 0.5}),
+    "curious alone": (CuReTQC, {"task": False, "srl": "curl"}),
+    "alternating": (CuReSAC, {"srl_schedule": "alternating", "srl_period": 2}),
+    "head of one's own": (CuReTQC, {"srl": Brightness, "srl_kwargs": {"start": 0.1}}),
+    "dynamics": (CuReSAC, {"srl": Dynamics, "intrinsic": "reconstruction"}),
+    "no head": (CuReSAC, {"srl": None, "intrinsic": "reconstruction", "augmentation": "shift"}),
+    "episodes": (CuReSAC, {"curiosity_bout": "episode", "precision": "bf16"}),
+}
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_every_mode_trains_saves_and_loads(name: str) -> None:
+    """To equal predictions, and to an equal next update."""
+    algorithm, kwargs = MODES[name]
+    if "reconstruction" in kwargs.values():
+        kwargs = {**kwargs, "intrinsic_kwargs": {"n_filters": 4, "n_layers": 2}}
+    model = sensor_model(make_vec_env(SensorBox, 2, seed=0), algorithm, **kwargs).learn(30)
+    assert model._n_updates > 0 and isinstance(model.replay_buffer, DictFrameStackReplayBuffer)
+    assert all(value.isfinite() for value in model._metrics.latest.values())
+    archive, buffer = io.BytesIO(), io.BytesIO()
+    model.save(archive)
+    model.save_replay_buffer(buffer)
+    own = {"srl": kwargs["srl"]} if isinstance(kwargs.get("srl"), type) else {}
+    loaded = algorithm.load(archive, make_vec_env(SensorBox, 2), custom_objects=own, device="cpu")
+    loaded.load_replay_buffer(buffer)
+    observation = {key: np.stack([part] * 2) for key, part in model.observation_space.sample().items()}
+    for _ in range(2):
+        actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
+        np.testing.assert_array_equal(*actions)
+        for each in (model, loaded):
+            np.random.seed(0)
+            th.manual_seed(0)
+            each.set_logger(model.logger)
+            each.train(2, 8)
+        assert differences(state_of(model), state_of(loaded)) == []
+
+
+@pytest.mark.parametrize("collector", ["curious", "random"])
+def test_pretraining(collector: str) -> None:
+    model = sensor_model(curiosity=None)
+    before = [parameter.clone() for parameter in model.policy.encoder.images["wrist"].parameters()]
+    model.pretrain(16, collector=collector)
+    assert not all(map(th.equal, before, model.policy.encoder.images["wrist"].parameters()))
+    assert model.replay_buffer.size() == 0 and model.learn(14)._n_updates == 4
+
+
+def test_compiled_parts_reach_into_each_head() -> None:
+    """Decoders of all images; not a list of heads, which is never called."""
+    policy = sensor_model().policy
+    policy.compile_networks()
+    assert all(head.decoder._compiled_call_impl is not None for head in policy.srl.heads)
+    assert policy.encoder.trunk._compiled_call_impl is not None
+
+
+# ------------------------------------------------------------------------------------------------ environments
+
+
+def test_other_vectors_and_several_environments() -> None:
+    """Discrete numbers are one-hot; curious and random actors act in some environments of several."""
+    keys = ("front", "joints", "mode")
+    for curiosity in ("separate", "random"):
+        env = make_vec_env(SensorBox, 3, env_kwargs={"keys": keys})
+        model = sensor_model(env, curiosity=curiosity, curiosity_prob=0.5).learn(45)
+        assert model.policy.encoder.vector_dim == 2 + 3 and model._n_updates > 0
+
+
+class Flawed(SensorBox):
+    """Every fifth observation has a joint that is not a number."""
+
+    def observe(self, first: bool = False) -> Any:
+        seen = super().observe(first)
+        return {**seen, "joints": seen["joints"] * np.float32(np.nan if self.n_steps % 5 == 4 else 1)}
+
+
+@pytest.mark.parametrize("env_class", [Flawed, Goal])
+def test_faulty_transitions_are_never_sampled(env_class: Any) -> None:
+    """With and without images; faults of a worker are survived, too."""
+    environments = [lambda: Monitor(env_class())] * 2
+    env = FaultTolerantSubprocVecEnv(environments, on_env_fault="restart", start_method="fork")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        kwargs = {"policy_kwargs": {"features_extractor_kwargs": {"features_dim": 8}}} if env_class is Goal else {}
+        model = sensor_model(env, on_bad_transition="skip", curiosity_prob=0.5, **kwargs).learn(40, KillNow(7, 15))
+    buffer = model.replay_buffer
+    assert isinstance(buffer, DictFrameStackReplayBuffer) and buffer.marked.sum() >= 2
+    assert sum(env.restarts) == 2
+    rows, env_inds, _ = unmarked(buffer)
+    assert not buffer.marked[rows, env_inds].any() and len(rows) == buffer.size() * 2 - buffer.marked.sum()
+    assert all(value.isfinite().all() for value in buffer.sample(500).observations.values())
+    env.close()
+
+
+def test_black_camera_is_told_apart() -> None:
+    """A camera that stays black beside one that does not is warned of by its key."""
+
+    class Dark(SensorBox):
+        def observe(self, first: bool = False) -> Any:
+            seen = super().observe(first)
+            return {**seen, "wrist": seen["wrist"] // 255}
+
+    with pytest.warns(UserWarning, match=r"no pixel of the images 'wrist' so far is brighter than 1 of 255"):
+        sensor_model(Dark(), learning_starts=200).learn(101)
+
+
+def test_stacked_by_sb3() -> None:
+    """``VecFrameStack`` stacks images and vectors; frames are kept once."""
+    env = VecFrameStack(make_vec_env(SensorBox, 2, env_kwargs={"frame_stack": 1, "tells_frame_stack": False}), 3)
+    model = sensor_model(env).learn(30)
+    assert {key: image.frame_stack for key, image in model.replay_buffer.images.items()} == {"front": 3, "wrist": 3}
+    assert model.policy.encoder.vector_dim == 6
+
+
+def test_normalised_vectors_beside_images() -> None:
+    """As they come out of ``VecNormalize``; the buffer keeps the original ones."""
+    env = VecNormalize(make_vec_env(SensorBox, 1), norm_obs_keys=["joints"])
+    model = sensor_model(env).learn(30)
+    batches = []
+    for normalizer in (env, None):
+        np.random.seed(0)
+        batches.append(model.replay_buffer.sample(64, env=normalizer).observations)
+    expected = (batches[1]["joints"].numpy() - env.obs_rms["joints"].mean) / np.sqrt(env.obs_rms["joints"].var + 1e-8)
+    np.testing.assert_allclose(batches[0]["joints"], expected, rtol=1e-4, atol=1e-5)
+    assert th.equal(batches[0]["front"], batches[1]["front"]) and batches[0]["front"].dtype == th.uint8
+    with pytest.raises(ValueError, match="images arrive as float32"):
+        sensor_model(VecNormalize(make_vec_env(SensorBox, 1)))
+
+
+# ---------------------------------------------------------------------------------------------------- refusals
+
+
+def test_extractor_that_mixes_images_cannot_have_heads() -> None:
+    network = {"features_extractor_class": CombinedExtractor, "features_extractor_kwargs": {"cnn_output_dim": 8}}
+    env, alone = SensorBox(size=64, keys=("front", "joints")), {**network, "share_encoder": True}
+    with pytest.raises(ValueError, match="srl=RAE learns from each image of a dictionary by itself"):
+        sensor_model(env, policy_kwargs=network)
+    model = sensor_model(env, srl=None, curiosity=None, policy_kwargs=alone)
+    assert model.learn(14)._n_updates == 4
+
+
+def test_contrast_needs_an_image() -> None:
+    with pytest.raises(ValueError, match="srl='curl' compares two views of one image"):
+        tiny_model("MultiInputPolicy", Goal(), srl="curl")
+
+
+def test_heads_of_a_plain_image_are_not_in_a_dictionary() -> None:
+    """Nothing is between an image and its head."""
+    assert type(tiny_model("CnnPolicy", PixelBox()).policy.srl) is RAE
+    assert type(tiny_model("CnnPolicy", PixelBox(), srl="curl").policy.srl) is CURL
+    assert type(tiny_model("MlpPolicy", VectorBox()).policy.augmentation) is Augmentation

@@ -1,0 +1,358 @@
+"""Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import minari
+import numpy as np
+import pytest
+from dictionaries_for_tests import Goal
+from envs_for_tests import Cliff, PixelBox, VectorBox, differences, state_of, tiny_model
+from minari.data_collector import EpisodeBuffer
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.vec_env import VecNormalize
+from updates_for_tests import ALGORITHMS
+
+from sb3_cure import CuReSAC
+from sb3_cure.data.buffers import SkippingReplayBuffer, transitions, unmarked
+from sb3_cure.data.datasets import RecordedEpisode, RecordEpisodes, load_episode, save_episode
+from sb3_cure.evaluation.rollouts import run_episodes
+from sb3_cure.persistence import ExactCheckpoint
+
+both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
+
+
+def record(make: Any, folder: Path, steps: int) -> gym.Env:
+    """Random actions; the last episode has no end."""
+    env = RecordEpisodes(make(), folder)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+    env.close()
+    return env
+
+
+class InPlace(VectorBox):
+    """Writes each observation into one place, and scales the actions that it is given."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.seen = np.zeros(2, np.float32)
+        super().reset(**kwargs)
+        return self.observe(), {}
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        self.seen[:] = self.position
+        return self.seen
+
+    def step(self, action: np.ndarray) -> Any:
+        step = super().step(action)
+        action *= 0.5
+        return step
+
+
+def test_environments_may_write_into_what_they_are_given_and_give(tmp_path: Path) -> None:
+    """Files, and episodes that measure policies, hold what there was."""
+    plain, in_place = record(VectorBox, tmp_path / "plain", 9), record(InPlace, tmp_path / "in place", 9)
+    first, second = (load_episode(next((tmp_path / name).iterdir())) for name in ("plain", "in place"))
+    for ours, theirs in zip(first, second, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    model = tiny_model("MlpPolicy", VectorBox(), srl="inverse")
+    measured = [next(run_episodes(model, env.env, 1, "random", seed=0)) for env in (plain, in_place)]
+    np.testing.assert_array_equal(measured[0].observations, measured[1].observations)
+    np.testing.assert_allclose(measured[0].srl_errors, measured[1].srl_errors, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["HerReplayBuffer", "NStepReplayBuffer"])
+def test_stopped_episodes_do_not_go_on_in_the_next(kind: str) -> None:
+    """SB3's own buffers take goals and returns of several steps from one episode."""
+    if kind == "HerReplayBuffer":
+        model = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer)
+    else:
+        model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None, n_steps=3)
+    episodes = []
+    for number in range(4):
+        states = np.full((9, 2), number / 4)
+        seen: Any = states.astype(np.float32)
+        if kind == "HerReplayBuffer":
+            seen = {key: states for key in ("observation", "achieved_goal", "desired_goal")}
+        nothing = np.zeros(8, bool)
+        episodes.append(
+            RecordedEpisode(seen, np.zeros((8, 2), np.float32), np.full(8, float(number)), nothing, nothing)
+        )
+    assert model.load_transitions(episodes) == 32
+    assert type(model.replay_buffer).__name__ == kind
+    batch: Any = model.replay_buffer.sample(200)
+    if kind == "HerReplayBuffer":
+        np.testing.assert_array_equal(batch.observations["desired_goal"], batch.observations["achieved_goal"])
+        assert (batch.dones == 0).all()
+    else:
+        steps = np.log(batch.discounts.numpy()) / np.log(model.gamma)
+        expected = batch.observations[:, :1].numpy() * 4 * (1 - model.gamma**steps) / (1 - model.gamma)
+        np.testing.assert_allclose(batch.rewards, expected, rtol=1e-4)
+
+
+def test_lengths_of_an_episode_must_agree() -> None:
+    """A camera that saw twice as often as actions were taken would pair them wrongly."""
+    model, n = tiny_model("MlpPolicy", VectorBox()), 5
+    ends = np.zeros(n, bool)
+    twice = RecordedEpisode(np.zeros((2 * n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ends, ends)
+    with pytest.raises(
+        ValueError, match=r"T \+ 1 observations, but one has for T 5 \(actions\), .* 10 \(observations\)"
+    ):
+        model.load_transitions([twice])
+    assert model.replay_buffer.size() == 0
+
+
+def test_rows_of_several_environments_are_counted() -> None:
+    """One long episode beside a short one fills the buffer's rows, and the rest of them is empty."""
+    envs = make_vec_env(VectorBox, 2)
+    model, episodes = tiny_model("MlpPolicy", envs, buffer_size=40), []
+    for n in (30, 5):
+        ends = np.zeros(n, bool)
+        episodes.append(RecordedEpisode(np.zeros((n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ends, ends))
+    with pytest.warns(UserWarning, match="35 transitions in 30 rows .*2 environments side by side.* the last 20 rows"):
+        model.load_transitions(episodes)
+
+
+@both_algorithms
+@pytest.mark.parametrize(
+    ("policy", "make"),
+    [
+        ("CnnPolicy", PixelBox),
+        ("CnnPolicy", lambda: PixelBox(1, channels_last=True)),
+        ("MlpPolicy", Cliff),
+        ("MlpPolicy", lambda: VectorBox(low=-1.0, high=3.0)),
+    ],
+    ids=["stacked frames", "channels last", "terminations", "asymmetric actions"],
+)
+def test_loaded_transitions_are_those_collected(algorithm: str, policy: str, make: Any, tmp_path: Path) -> None:
+    """What a model collects, and what another one reads from the files that a wrapper wrote meanwhile, are the same."""
+    collector = tiny_model(policy, RecordEpisodes(make(), tmp_path), ALGORITHMS[algorithm], learning_starts=10**6)
+    collector.learn(45)
+    collector.env.close()
+    reader = tiny_model(policy, make(), ALGORITHMS[algorithm])
+    assert reader.load_transitions(tmp_path) == 45 and reader.num_timesteps == 0
+    rows = np.arange(45), np.zeros(45, int)
+    ours, theirs = (transitions(each.replay_buffer, *rows) for each in (reader, collector))
+    for name, value in theirs._asdict().items():
+        if value is not None:
+            np.testing.assert_allclose(getattr(ours, name), value, atol=1e-6, err_msg=name)
+    assert (ours.dones.sum() > 0) == (make is Cliff)
+
+
+def test_several_environments_share_the_episodes(tmp_path: Path) -> None:
+    """Each transition once; what fills up the shorter one is never sampled."""
+    record(VectorBox, tmp_path, 50)
+    lengths = [len(load_episode(path).rewards) for path in sorted(tmp_path.glob("*.npz"))]
+    assert sum(lengths) == 50 and len(lengths) > 2
+    model = tiny_model("MlpPolicy", make_vec_env(VectorBox, 2))
+    assert model.load_transitions(tmp_path) == 50
+    good, env_inds, _ = unmarked(model.replay_buffer)
+    assert len(good) == 50 and len(set(env_inds)) == 2
+    read = transitions(model.replay_buffer, good, env_inds).rewards.flatten().tolist()
+    written = np.concatenate([load_episode(path).rewards for path in tmp_path.glob("*.npz")])
+    np.testing.assert_allclose(sorted(read), np.sort(written), atol=1e-6)
+    model.replay_buffer = ReplayBuffer(100, model.observation_space, model.action_space, "cpu", 2)
+    with pytest.raises(ValueError, match="episodes differ in length"):
+        model.load_transitions(tmp_path)
+
+
+@pytest.mark.parametrize("make", [VectorBox, PixelBox, lambda: SimpleMultiObsEnv(discrete_actions=False)])
+def test_datasets_of_minari_are_read(make: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Minari writes and loads them: the same transitions as from files of our own."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    env = record(make, tmp_path / "ours", 12)
+    episodes = [load_episode(path) for path in sorted((tmp_path / "ours").glob("*.npz"))]
+    buffers = [
+        EpisodeBuffer(
+            observations=episode.observations,
+            actions=list(episode.actions),
+            rewards=[float(reward) for reward in episode.rewards],
+            terminations=list(episode.terminations),
+            truncations=list(episode.truncations),
+        )
+        for episode in episodes
+    ]
+    minari.create_dataset_from_buffers(
+        "test/random-v0", buffers, observation_space=env.observation_space, action_space=env.action_space,
+        jpeg_encoding=False, data_format="hdf5",
+    )  # fmt: skip
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    policy = "CnnPolicy" if make is PixelBox else policy
+    models = [tiny_model(policy, make(), srl=None, curiosity=None) for _ in range(2)]
+    assert models[0].load_transitions(tmp_path / "ours") == 12
+    assert models[1].load_transitions(minari.load_dataset("test/random-v0")) == 12
+    rows = np.arange(12), np.zeros(12, int)
+    ours, theirs = (transitions(model.replay_buffer, *rows) for model in models)
+    assert not differences(ours._asdict(), theirs._asdict())
+
+
+def test_episodes_in_float64_are_read() -> None:
+    """By their attributes, as most datasets of Minari have them; for returns of several steps, too."""
+    rng = np.random.default_rng(0)
+    episode = SimpleNamespace(
+        id=0, observations=rng.uniform(-1, 1, (6, 2)), actions=rng.uniform(-1, 1, (5, 2)), rewards=rng.normal(size=5),
+        terminations=np.zeros(5, bool), truncations=np.arange(5) == 4, infos={},
+    )  # fmt: skip
+    model = tiny_model("MlpPolicy", VectorBox(), n_steps=3)
+    assert model.load_transitions([episode, episode]) == 10
+    model.learn(15)
+
+
+def test_dictionaries_keep_their_keys(tmp_path: Path) -> None:
+    make = lambda: SimpleMultiObsEnv(discrete_actions=False)  # noqa: E731
+    record(make, tmp_path, 12)
+    episode = load_episode(min(tmp_path.glob("*.npz")))
+    assert set(episode.observations) == {"img", "vec"} and len(episode.observations["vec"]) == len(episode.actions) + 1
+    model = CuReSAC("MultiInputPolicy", make(), srl=None, curiosity=None, buffer_size=20, learning_starts=5)
+    assert model.load_transitions(tmp_path) == 12
+    np.testing.assert_array_equal(model.replay_buffer.observations["vec"][0, 0], episode.observations["vec"][0])
+
+
+def test_what_does_not_fit_is_one_sentence(tmp_path: Path) -> None:
+    record(VectorBox, tmp_path / "vectors", 5)
+    model = tiny_model("CnnPolicy", PixelBox())
+    for source, sentence in (
+        (tmp_path / "vectors", "observations of an episode are float32 of shape"),
+        (tmp_path, "has no .npz files"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            model.load_transitions(source)
+    vectors = tiny_model("MlpPolicy", VectorBox(), buffer_size=3)
+    far = load_episode(min((tmp_path / "vectors").glob("*.npz")))
+    with pytest.raises(ValueError, match="actions of an episode"):
+        vectors.load_transitions([far._replace(actions=3 * np.ones_like(far.actions))])
+    with pytest.warns(UserWarning, match="make buffer_size larger"):
+        vectors.load_transitions([far])
+
+
+def test_files_are_not_unpickled(tmp_path: Path) -> None:
+    episode = RecordedEpisode(*(np.array([{"any": "object"}], dtype=object) for _ in range(5)))
+    save_episode(tmp_path / "pickled.npz", episode)
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        tiny_model("MlpPolicy", VectorBox()).load_transitions(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------ learning from them
+
+
+@both_algorithms
+def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_path: Path) -> None:
+    record(PixelBox, tmp_path, 60)
+    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm])
+    model.load_transitions(tmp_path)
+    before = state_of(model)
+    losses = []
+    step = model._update_srl
+    model._update_srl = lambda *args: losses.append(step(*args).mean().item()) or step(*args)  # type: ignore[method-assign, func-returns-value]
+    model.fit_representation(60, log_interval=25)
+    del model._update_srl  # type: ignore[attr-defined]
+    assert np.mean(losses[-10:]) < np.mean(losses[:10])
+    changed = {name.split("[")[0].split(".")[0] for name in _changed(before["policy"], state_of(model)["policy"])}
+    assert changed == {"encoder", "encoder_target", "srl"}
+    assert (model.num_timesteps, model._n_updates, model.task, model.curiosity) == (0, 0, True, "separate")
+    assert model.replay_buffer.size() == 60
+    model.learn(14)
+    assert model._n_updates == 4 and model.replay_buffer.size() == 74
+
+
+def _changed(first: Any, second: Any) -> list[str]:
+    return [name for name in first if differences(first[name], second[name])]
+
+
+def test_learn_after_fitting_begins_as_without_it(tmp_path: Path) -> None:
+    """The same random warm-up, so that runs of one seed stay paired."""
+    record(PixelBox, tmp_path, 30)
+    plain = tiny_model("CnnPolicy", PixelBox()).learn(10)
+    fitted = tiny_model("CnnPolicy", PixelBox())
+    fitted.load_transitions(tmp_path)
+    fitted.fit_representation(3).learn(10)
+    np.testing.assert_array_equal(fitted.replay_buffer.actions[30:40], plain.replay_buffer.actions[:10])
+
+
+def test_schedules_follow_the_updates(tmp_path: Path) -> None:
+    """Also after a training that has come to their end."""
+    record(VectorBox, tmp_path, 30)
+    seen: list[float] = []
+    model = tiny_model("MlpPolicy", VectorBox(), learning_rate=lambda progress: seen.append(progress) or 1e-3)  # type: ignore[func-returns-value]
+    model.learn(15)
+    model.load_transitions(tmp_path)
+    seen.clear()
+    model.fit_representation(4, log_interval=1)
+    assert seen[:4] == [1, 0.75, 0.5, 0.25]
+
+
+def test_nothing_to_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="srl is None"):
+        tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None).fit_representation(1)
+    with pytest.raises(ValueError, match="call load_transitions"):
+        tiny_model("CnnPolicy", PixelBox()).fit_representation(1)
+
+
+class Interrupt(BaseCallback):
+    """Stands in for a kill."""
+
+    def __init__(self, at: int = 25):
+        super().__init__()
+        self.at = at
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == self.at:
+            raise KeyboardInterrupt
+        return True
+
+
+def test_calls_that_were_over_are_skipped_after_a_kill(tmp_path: Path) -> None:
+    """A script that is run again neither loads nor fits twice, and ends as one that was not killed."""
+    record(VectorBox, tmp_path / "episodes", 20)
+
+    def script(model: CuReSAC, *callbacks: BaseCallback) -> CuReSAC:
+        model.load_transitions(tmp_path / "episodes")
+        return model.fit_representation(5).learn(40, callback=list(callbacks))
+
+    checkpoint = ExactCheckpoint(10, tmp_path / "checkpoints")
+    with pytest.raises(KeyboardInterrupt):
+        script(tiny_model("MlpPolicy", VectorBox()), checkpoint, Interrupt())
+    resumed = script(CuReSAC.resume(tmp_path / "checkpoints", VectorBox(), device="cpu"))
+    whole = script(tiny_model("MlpPolicy", VectorBox()))
+    assert type(whole.replay_buffer) is SkippingReplayBuffer and whole.replay_buffer.size() == 60
+    assert differences(state_of(whole), state_of(resumed)) == []
+
+
+def test_resumed_run_records_each_episode_once(tmp_path: Path) -> None:
+    """Those that it plays again, too, which the killed run had written after its last checkpoint."""
+
+    def make(folder: str) -> gym.Env:
+        return RecordEpisodes(VectorBox(), tmp_path / folder)
+
+    def recorded(folder: str) -> list[list[float]]:
+        return [load_episode(path).rewards.tolist() for path in sorted((tmp_path / folder).glob("*.npz"))]
+
+    arguments: dict[str, Any] = dict(learning_starts=10**6)
+    whole = tiny_model("MlpPolicy", make("whole"), **arguments).learn(80)
+    whole.env.close()  # type: ignore[union-attr]
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint = ExactCheckpoint(15, tmp_path / "checkpoints")
+        tiny_model("MlpPolicy", make("parts"), **arguments).learn(80, callback=[checkpoint, Interrupt(44)])
+    n_written = len(recorded("parts"))
+    resumed = CuReSAC.resume(tmp_path / "checkpoints", make("parts"), device="cpu").learn(80)
+    assert resumed.num_timesteps == 80 and n_written > 1
+    resumed.env.close()  # type: ignore[union-attr]
+    assert recorded("parts") == recorded("whole")
+
+
+def test_unknown_statistics_are_refused(tmp_path: Path) -> None:
+    """VecNormalize would show all of it as the same."""
+    record(VectorBox, tmp_path, 20)
+    model = tiny_model("MlpPolicy", VecNormalize(make_vec_env(VectorBox, 1)))
+    with pytest.raises(ValueError, match="VecNormalize has no statistics"):
+        model.load_transitions(tmp_path)

@@ -1,0 +1,410 @@
+"""``DiagnosticsCallback`` warns of each fault once, of nothing else, and of nothing in runs that are well."""
+
+import functools
+import re
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from dictionaries_for_tests import SensorBox
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rl_zoo3.utils import get_callback_list
+from sb3_contrib import TQC
+from stable_baselines3 import DQN, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure.envs import render_check
+from sb3_cure.evaluation import diagnostics
+from sb3_cure.evaluation.callbacks import DiagnosticsCallback, EvalBothCallback
+from sb3_cure.srl import SRLHead, SRLOutput
+
+
+class Still(PixelBox):
+    """The camera looks elsewhere."""
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        return np.concatenate(self.frames)
+
+
+class Collapsing(SRLHead):
+    """Its loss is least where all latents are alike."""
+
+    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
+        error = (latents - latents.mean(dim=0)).square().mean(dim=1)
+        return SRLOutput(error.mean(), error.detach())
+
+
+class Constant(th.nn.Module):
+    """A decoder that always draws the same, [1, C, H, W]."""
+
+    def __init__(self, drawing: th.Tensor):
+        super().__init__()
+        self.drawing = drawing
+
+    def forward(self, latents: th.Tensor) -> th.Tensor:
+        return self.drawing.expand(len(latents), -1, -1, -1)
+
+
+class Kept(KVWriter):
+    """Keeps all that is logged."""
+
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        self.rows.append(dict(key_values))
+
+    def close(self) -> None:
+        pass
+
+
+def watch(model: BaseAlgorithm, steps: int, **arguments: Any) -> tuple[list[str], dict[str, float]]:
+    """Train with the callback.
+
+    :param model: A model
+    :param steps: Agent steps
+    :param arguments: Of the callback
+    :return: Names of what was warned of and the sentences, and what was logged last under ``diagnostics/``
+    """
+    callback = DiagnosticsCallback(**{**dict(every=25, min_updates=40), **arguments})
+    kept = Kept()
+    model.set_logger(Logger(None, [kept]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model.learn(steps, callback, log_interval=1)
+    model.logger.dump()
+    sentences = [str(each.message) for each in caught if "agent steps:" in str(each.message)]
+    assert len(sentences) == len(callback.warned), (sentences, callback.warned)
+    logged: dict[str, float] = {}
+    for row in kept.rows:
+        logged.update({key.split("/")[1]: row[key] for key in row if key.startswith("diagnostics/")})
+    return [*callback.warned, *sentences], logged
+
+
+# ------------------------------------------------------------------ runs that are well
+
+
+@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_a_good_run_is_warned_of_nothing(srl: str, curiosity: str) -> None:
+    """All checks look, none of them warns; they look only after ``min_updates``."""
+    warned, logged = watch(tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity), 200)
+    assert warned == []
+    expected = {"constant_image", "temperature", "dead_units", "collapsed_latents", "curious_reward"}
+    assert set(logged) == expected | ({"autoencoder"} if srl == "rae" else set())
+    assert (logged["constant_image"], logged["temperature"]) == (0, 0)
+    assert logged["collapsed_latents"] > 5 * diagnostics.LATENT_SPREAD
+    assert logged["curious_reward"] > 10 * diagnostics.CURIOUS_SHARE
+
+
+@pytest.mark.parametrize("srl, min_updates", [("rae", 200), pytest.param("curl", 580, marks=pytest.mark.long)])
+def test_real_pixels_are_warned_of_nothing(srl: str, min_updates: int) -> None:
+    """Some hundred updates on DeepMind Control, judged when the latents have unfolded, which takes CURL longer.
+
+    With four filters, as in the other tests, some seeds need longer still.
+    """
+    env = make_dmc_env("cartpole", "swingup", image_size=40, renderer="fast", seed=0)
+    networks = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 16, "n_layers": 3}}
+    model = tiny_model("CnnPolicy", env, srl=srl, policy_kwargs=networks)
+    warned, logged = watch(model, min_updates + 110, min_updates=min_updates)
+    assert warned == [], logged
+    assert {"dead_units", "collapsed_latents", "curious_reward"} <= set(logged)
+    env.close()
+
+
+def test_an_autoencoder_that_learns_is_better_than_the_mean_image() -> None:
+    """What it explains rises from below 0 to more than is asked of it."""
+    kwargs = dict(features_extractor_kwargs=dict(n_filters=8, n_layers=2))
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None, learning_rate=3e-3, policy_kwargs=kwargs)
+    _, early = watch(model, 100, min_updates=1)
+    assert early["autoencoder"] < 0
+    model._phase = lambda: (True, False)  # type: ignore[method-assign]  # the head alone, which is quicker
+    model.train(700, 16)
+    warned, late = watch(model, 110, autoencoder_updates=700)
+    assert warned == []
+    assert late["autoencoder"] > 2 * diagnostics.EXPLAINED_SHARE
+
+
+def pixel_sac(**arguments: Any) -> SAC:
+    """SB3's own, from pixels."""
+    policy_kwargs = dict(net_arch=[16], features_extractor_kwargs=dict(features_dim=64))
+    return SAC("CnnPolicy", PixelBox(size=40), policy_kwargs=policy_kwargs, **arguments)
+
+
+class Discrete(VectorBox):
+    """For DQN: left or right."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = gym.spaces.Discrete(2)  # type: ignore[assignment]
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.n_steps += 1
+        return self.observe(), float(action), False, self.n_steps >= self.episode_length, {}
+
+
+OTHERS: dict[str, tuple[Any, set[str]]] = {
+    "plain CuReSAC": (
+        functools.partial(tiny_model, "CnnPolicy", PixelBox(size=40), srl=None, curiosity=None),
+        {"constant_image", "temperature", "dead_units", "collapsed_latents"},
+    ),
+    "vectors": (
+        functools.partial(tiny_model, "MlpPolicy", VectorBox()),
+        {"temperature", "dead_units", "collapsed_latents", "autoencoder", "curious_reward"},
+    ),
+    "SAC": (pixel_sac, {"constant_image", "temperature", "dead_units", "collapsed_latents"}),
+    "TQC": (functools.partial(TQC, "MlpPolicy", VectorBox(), policy_kwargs=dict(net_arch=[16])), {"temperature"}),
+    "TD3": (functools.partial(TD3, "MlpPolicy", VectorBox(), policy_kwargs=dict(net_arch=[16])), set()),
+    "DQN": (functools.partial(DQN, "MlpPolicy", Discrete(), train_freq=1), set()),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_algorithms(name: str) -> None:
+    """What applies to them is looked at, the rest is left out."""
+    make, expected = OTHERS[name]
+    warned, logged = watch(make(learning_starts=10, batch_size=8, buffer_size=300, seed=0), 80)
+    assert warned == []
+    assert set(logged) == expected
+
+
+# ------------------------------------------------------------------------------ faults
+
+
+def with_dead_units(n_filters: int, n_dead: int) -> CuReSAC:
+    """Some filters of the second convolution have a bias that no image overcomes."""
+    kwargs = dict(features_extractor_kwargs=dict(n_filters=n_filters, n_layers=2))
+    model = tiny_model("CnnPolicy", PixelBox(), policy_kwargs=kwargs)
+    with th.no_grad():
+        model.policy.encoder.trunk[1].bias[:n_dead] = -10  # type: ignore[index, union-attr]
+    return model
+
+
+def with_constant_drawings() -> CuReSAC:
+    """Nothing of the latents comes through the decoder's first layer; what it draws is the mean colour."""
+    model = tiny_model("CnnPolicy", PixelBox())
+    with th.no_grad():
+        model.policy.srl.decoder.linear.bias.fill_(-1e3)  # type: ignore[union-attr]
+    return model
+
+
+box = functools.partial(tiny_model, "CnnPolicy")
+FAULTS: dict[str, tuple[Any, str, str]] = {
+    "camera": (lambda: box(Still()), "constant_image", r"the last 49 observations of environment 0 are"),
+    "one camera": (lambda: box(DummyVecEnv([PixelBox, Still])), "constant_image", r"observations of environment 1 are"),
+    "dead": (lambda: with_dead_units(16, 15), "dead_units", r"94% of the units of the encoder's layer 'trunk.1' are 0"),
+    "all dead": (lambda: with_dead_units(4, 4), "dead_units", r"100% of the units"),
+    "collapse": (
+        lambda: box(PixelBox(), srl=Collapsing, task=False, curiosity_encoder_grad=False),
+        "collapsed_latents",
+        r"latents differ by .*e-\d+ of their size .* by 0\.01 at least",
+    ),
+    "drawings": (
+        with_constant_drawings,
+        "autoencoder",
+        r"the autoencoder explains -\d.* explain 0\.01 at least",
+    ),
+    "hot": (
+        lambda: box(PixelBox(), target_entropy=5.0, ent_coef_lr_factor=600.0),
+        "temperature",
+        r"entropy be 1\.\d where 5\.0 is the target, and has run to \d.*e\+\d+, .*: set a smaller target_entropy",
+    ),
+    "cold": (
+        lambda: box(PixelBox(), target_entropy=-50.0, ent_coef_lr_factor=200.0),
+        "temperature",
+        r"where -50\.0 is the target, and has run to \d.*e-\d+, .*: see whether it finds any reward",
+    ),
+    "fixed hot": (lambda: box(PixelBox(), ent_coef=1e6), "temperature", r"task agent is fixed at 1\.0e\+06"),
+    "fixed cold": (lambda: box(PixelBox(), ent_coef=1e-8), "temperature", r"task agent is fixed at 1\.0e-08"),
+    "SB3's": (
+        lambda: pixel_sac(learning_starts=10, batch_size=8, seed=0, ent_coef=1e6),
+        "temperature",
+        r"is fixed at 1\.0e\+06",
+    ),
+    "curious": (
+        lambda: box(PixelBox(), curiosity_beta=1e-2, normalize_curiosity=False),
+        "curious_reward",
+        r"the curious reward varies by .*e-0[67] while the entropy term is .*: use normalize_curiosity=True",
+    ),
+    "bonus": (
+        lambda: box(PixelBox(), curiosity="bonus", curiosity_beta=1e-3, normalize_curiosity=False),
+        "curious_reward",
+        r"the curious reward varies by .*e-0[67]",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_warned_of_once(fault: str) -> None:
+    """And of nothing else; the number that tells it is logged, at each look."""
+    make, name, sentence = FAULTS[fault]
+    warned, logged = watch(make(), 110, **({"autoencoder_updates": 40} if fault == "drawings" else {}))
+    assert len(warned) == 2, warned
+    assert warned[0] == name, (warned, logged)
+    assert re.search(rf"^After \d+ agent steps: .*{sentence}", warned[1]), warned[1]
+    assert name in logged
+
+
+def test_a_temperature_of_zero_is_meant() -> None:
+    """It turns the entropy term off."""
+    assert watch(box(PixelBox(), ent_coef=0.0), 80)[0] == []
+
+
+def test_small_rewards_need_a_small_temperature() -> None:
+    """A learned temperature beyond its bounds is well where the policy meets its target."""
+    model = box(PixelBox(), learning_starts=10)
+    model.learn(20)
+    log_prob = th.full((8,), float(-model.target_entropy))  # type: ignore[arg-type]
+    for log_prob_off, problem in ((0.0, False), (0.9, False), (-1.1, True)):
+        temperature = diagnostics.Temperature("task", 1e-6, True, log_prob + log_prob_off)
+        assert bool(diagnostics.temperature_at_bound([temperature], model, (1e-4, 1e2)).problem) == problem  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("software", [True, False])
+def test_software_rendering_on_a_gpu_machine(software: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Said when training starts; not where the GPU draws."""
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(th.cuda, "get_device_name", lambda index: "NVIDIA H200")
+    renderer = "llvmpipe (LLVM 15.0.6, 256 bits)" if software else "NVIDIA H200/PCIe/SSE2"
+    monkeypatch.setattr(render_check, "try_rendering", lambda: {"renderer": renderer})
+    env = make_dmc_env("cartpole", "swingup", image_size=40)
+    warned, logged = watch(tiny_model("CnnPolicy", env), 30)
+    env.close()
+    assert logged["software_rendering"] == software
+    if not software:
+        assert warned == []
+        return
+    assert warned[0] == "software_rendering" and len(warned) == 2
+    assert warned[1].startswith("After 0 agent steps: OpenGL renders on the CPU (llvmpipe (LLVM 15.0.6, 256 bits)), a")
+
+
+def test_rendering_is_not_asked_about_without_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither without a GPU, nor where nothing is rendered by OpenGL: it takes a process of its own."""
+    monkeypatch.setattr(render_check, "try_rendering", lambda: pytest.fail("rendered"))
+    monkeypatch.setattr(render_check, "find_gpus", lambda: [])
+    env = make_dmc_env("cartpole", "swingup", image_size=40)
+    assert diagnostics.software_rendering(DummyVecEnv([lambda: env])) is None
+    env.close()
+    monkeypatch.setattr(render_check, "find_gpus", lambda: ["NVIDIA H200"])
+    assert diagnostics.software_rendering(DummyVecEnv([PixelBox])) is None
+
+
+# -------------------------------------------------------------------------- criteria
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3), st.integers(2, 40))
+def test_spread_of_latents(seed: int, scale: float, n: int) -> None:
+    """Does not depend on the scale or the order of the latents; is 0 for equal ones; independent ones have 1."""
+    generator = th.Generator().manual_seed(seed)
+    latents = th.randn(n, 7, generator=generator)
+    spread = diagnostics.collapsed_latents(latents).value
+    other = diagnostics.collapsed_latents(scale * latents[th.randperm(n, generator=generator)]).value
+    assert other == pytest.approx(spread, rel=1e-4)
+    assert diagnostics.collapsed_latents(latents - latents.mean(dim=0)).value == pytest.approx(1, rel=1e-4)
+    same = diagnostics.collapsed_latents(latents[:1].expand(n, -1))
+    assert same.value < 1e-6 and same.problem is not None
+
+
+@functools.cache
+def untrained() -> CuReSAC:
+    """Made once for all examples."""
+    return box(PixelBox())
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1))
+def test_no_constant_drawing_explains_anything(seed: int) -> None:
+    """Whatever the images and the drawing: the mean image is the best of them, and explains 0."""
+    model = untrained()
+    generator = th.Generator().manual_seed(seed)
+    head = model.policy.srl
+    observations = th.randint(0, 256, (9, 6, 36, 36), dtype=th.uint8, generator=generator)
+    batch = ReplayBufferSamples(observations, *[None] * 4)  # type: ignore[arg-type]
+    latents = th.zeros(9, model.policy.encoder.features_dim)
+    mean = head.target(observations, dither=False).mean(dim=0, keepdim=True)  # type: ignore[union-attr]
+    for drawing in (mean, th.rand(mean.shape, generator=generator) - 0.5):
+        head.decoder = Constant(drawing)  # type: ignore[union-attr]
+        explained = diagnostics.explained_share(model, batch, latents)
+        assert explained is not None and explained < 1e-5
+        assert diagnostics.autoencoder(explained, 5000, 5000).problem is not None
+        assert diagnostics.autoencoder(explained, 4999, 5000).problem is None
+
+
+# ------------------------------------------------------------------------- the callback
+
+
+@pytest.mark.parametrize("srl", ["rae", "curl"])
+def test_looking_changes_nothing(srl: str) -> None:
+    """The same training, bit for bit, as without the callback."""
+    watched = tiny_model("CnnPolicy", PixelBox(), srl=srl)
+    _, logged = watch(watched, 35, every=7, min_updates=0)
+    alone = tiny_model("CnnPolicy", PixelBox(), srl=srl).learn(35)
+    assert "collapsed_latents" in logged
+    assert differences(state_of(watched), state_of(alone)) == []
+    assert np.array_equal(watched.replay_buffer.actions, alone.replay_buffer.actions)  # type: ignore[union-attr]
+
+
+def test_rl_zoo_makes_it_from_yaml() -> None:
+    """The form of rl-zoo3's ``callback:`` key, with arguments and without."""
+    text = """
+    callback:
+      - sb3_cure.evaluation.callbacks.DiagnosticsCallback
+      - sb3_cure.evaluation.callbacks.DiagnosticsCallback:
+          every: 500
+          temperature_bounds: [1e-3, 10]
+    """
+    plain, other = get_callback_list(yaml.safe_load(text))
+    assert (plain.every, other.every, other._arguments[-1]) == (1000, 500, (0.001, 10))
+    model = box(PixelBox())
+    callbacks: list[BaseCallback] = [plain, other]
+    assert model.learn(20, callbacks).num_timesteps == 20
+
+
+def test_images_of_dictionaries_are_looked_at() -> None:
+    """A camera that stands still beside one that does not, and drawings that hold nothing of one image."""
+
+    class HalfStill(SensorBox):
+        def observe(self, first: bool = False) -> Any:
+            return {**super().observe(first), "wrist": np.zeros((6, 28, 28), np.uint8)}
+
+    with pytest.warns(UserWarning) as caught:
+        model = tiny_model("MultiInputPolicy", HalfStill())
+        model.learn(50, DiagnosticsCallback(every=49, autoencoder_updates=1))
+    sentences = [str(warning.message) for warning in caught]
+    assert any("observations of environment 0 (wrist) are one and the same image" in each for each in sentences)
+    batch = model.replay_buffer.sample(16)  # type: ignore[union-attr]
+    latents = model.policy.encode(batch.observations)
+    front = diagnostics.explained_share(model, batch, latents)
+    model.policy.srl.heads[0].decoder.linear.weight.data.zero_()  # type: ignore[union-attr]
+    assert front is not None
+    explained = diagnostics.explained_share(model, batch, latents)
+    assert explained is not None and explained < 0.01
+
+
+def test_what_other_callbacks_write_hides_nothing() -> None:
+    """The logger forgets what it has written, as it is when an evaluation comes first."""
+    model = tiny_model("CnnPolicy", PixelBox(), normalize_curiosity=False, ent_coef=1.0)
+    looking = DiagnosticsCallback(25, 16, min_updates=10)
+    with pytest.warns(UserWarning, match="curious reward varies"):
+        model.learn(50, callback=[EvalBothCallback(PixelBox(), 25, 1), looking])
+    assert "curious_reward" in looking.warned
+
+
+def test_a_constant_image_of_many_environments() -> None:
+    """However few rows they need for the number of observations that is looked at."""
+    venv = DummyVecEnv([Still] * 40)
+    model = tiny_model("CnnPolicy", venv, buffer_size=4000, learning_starts=2000).learn(40 * 35)
+    assert diagnostics.constant_image(model, 64).problem is not None
