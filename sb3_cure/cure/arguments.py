@@ -6,15 +6,13 @@ SB3's own arguments are SB3's to check.
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from gymnasium import spaces
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
-from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
-from sb3_cure.srl import SRLHead, get_srl_class
+from sb3_cure.data.buffers import FrameStackReplayBuffer
+from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure.srl import SRLHead
 
 Rate = Annotated[float, Field(ge=0, le=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -26,7 +24,7 @@ Schedule = Callable[[float], float]
 class CuReArguments(BaseModel):
     """Types, ranges and choices; defaults are the constructor's."""
 
-    model_config = ConfigDict(from_attributes=True, arbitrary_types_allowed=True, extra="forbid")
+    model_config = ConfigDict(from_attributes=True, arbitrary_types_allowed=True)
 
     srl: str | type[SRLHead] | None
     srl_kwargs: dict[str, Any]
@@ -53,13 +51,12 @@ class CuReArguments(BaseModel):
     ent_coef_lr_factor: Factor
     update: Literal["joint", "sequential"]
     precision: Literal["auto", "fp32", "bf16"]
-    compile: Literal["auto"] | StrictBool
     overlap: StrictBool
-    on_bad_transition: Literal["raise", "skip"]
 
 
 def check_arguments(model: Any) -> None:
-    """
+    """Refuse arguments out of their range, and combinations that would silently train something else.
+
     :param model: A CuRe model, its arguments set
     :raises ValueError: for the first that cannot work, in one sentence
     """
@@ -67,53 +64,58 @@ def check_arguments(model: Any) -> None:
         CuReArguments.model_validate(model)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ValueError(f"{first['loc'][0]} is {first['input']!r}: {first['msg'].lower()}.") from None
-    _check_combinations(model)
+        raise ValueError(f"{first['loc'][0]}={first['input']!r} is not valid: {first['msg'].lower()}.") from None
+    for is_wrong, sentence in _conflicts(model):
+        if is_wrong:
+            raise ValueError(sentence)
 
 
-def _check_combinations(model: Any) -> None:
-    """What would train something else than what was asked for, without a word."""
-    reward = get_intrinsic_class(model.intrinsic).configured(**model.intrinsic_kwargs)
-    curious = model.curiosity in ("separate", "bonus")
-    if model.srl is None and model.srl_kwargs:
-        raise ValueError(f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.")
-    if model.srl is not None:
-        get_srl_class(model.srl)
-    if curious and reward.needs_srl and model.srl is None:
-        raise ValueError(
-            f"curiosity={model.curiosity!r} is rewarded by intrinsic={model.intrinsic!r}, which is the error of an SRL "
-            "head, but srl is None: choose srl='rae', srl='curl' or a head of your own, or set curiosity=None."
-        )
-    if not model.task and model.curiosity not in ("separate", "random"):
-        raise ValueError(f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.")
-    if model.curiosity == "separate" and model.curiosity_gamma == 0 and model.curiosity_target == "observation":
-        raise ValueError(
+def _conflicts(model: Any) -> list[tuple[bool, str]]:
+    """Conditions that must not hold, each with what to do instead."""
+    buffer: type = model.replay_buffer_class or FrameStackReplayBuffer
+    ours = issubclass(buffer, FrameStackReplayBuffer)
+    separate = model.curiosity == "separate"
+    return [
+        (
+            model.srl is None and bool(model.srl_kwargs),
+            f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.",
+        ),
+        (
+            not model.task and model.curiosity not in ("separate", "random"),
+            f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.",
+        ),
+        (
+            separate and model.curiosity_gamma == 0 and model.curiosity_target == "observation",
             "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
-            "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0."
-        )
-    if model.n_steps > 1 and model.curiosity == "bonus":
-        raise ValueError(
-            f"n_steps={model.n_steps} sums the task's rewards over steps, but curiosity='bonus' is a reward of single "
-            "ones: set n_steps=1, or curiosity='separate'."
-        )
-    if issubclass(model.replay_buffer_class or object, NStepReplayBuffer) and not model.everything_off:
-        raise ValueError(
-            "SB3's NStepReplayBuffer returns observations of n steps later, which heads and rewards would take for the "
-            "next ones: leave replay_buffer_class out and give n_steps."
-        )
-    if not model.everything_off and not issubclass(model.policy_class, CuRePolicy):
-        raise ValueError(
-            f"the policy is {model.policy_class.__name__}, but SRL and curiosity need a kind of CuRePolicy: use "
-            "'CnnPolicy', 'MlpPolicy' or 'MultiInputPolicy', or set srl=None and curiosity=None, which is the base "
-            "class."
-        )
-    if model.use_sde and not model.everything_off:
-        raise ValueError("use_sde=True explores by noise of one actor's own features: it needs srl=curiosity=None.")
-    space = model.observation_space
-    for part in space.spaces.values() if isinstance(space, spaces.Dict) else [space]:
-        if len(part.shape or ()) == 3 and not is_image_space(part) and not model.everything_off:
-            raise ValueError(
-                f"images arrive as {part.dtype}, but the encoder and the replay buffer take uint8 in [0, 255]: return "
-                f"(255 * image).astype({np.uint8.__name__}), and use VecNormalize with norm_obs=False (or with "
-                "norm_obs_keys)."
-            )
+            "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0.",
+        ),
+        (
+            model.n_steps > 1 and model.curiosity == "bonus",
+            f"n_steps={model.n_steps} sums the task's rewards over steps, but curiosity='bonus' rewards single steps: "
+            "set n_steps=1, or curiosity='separate'.",
+        ),
+        (
+            issubclass(buffer, NStepReplayBuffer) or (model.n_steps > 1 and not ours),
+            f"{buffer.__name__} has no n-step returns that keep the next observation of one step, which heads and "
+            "rewards need: leave replay_buffer_class out, and set n_steps.",
+        ),
+        (
+            model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer),
+            f"optimize_memory_usage=True makes {buffer.__name__} return the next episode's first observation at the end "
+            "of an episode: leave replay_buffer_class out, which keeps each frame once anyway.",
+        ),
+        (
+            not issubclass(model.policy_class, CuRePolicy),
+            f"the policy is {model.policy_class.__name__}, which has no shared encoder: use 'CnnPolicy', 'MlpPolicy' or "
+            "'MultiInputPolicy'.",
+        ),
+        (
+            model.use_sde,
+            "use_sde=True explores by noise on one actor's own features, which the shared encoder changes: leave it out.",
+        ),
+        (
+            "share_features_extractor" in model.policy_kwargs,
+            "share_features_extractor is not an argument here, as the encoder is always shared and trained by the "
+            "critics: leave it out.",
+        ),
+    ]

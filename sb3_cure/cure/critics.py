@@ -1,11 +1,9 @@
-"""What differs between SAC and TQC: critics with one value or with quantiles, their target, loss and value.
+"""Critics on the latents of the shared encoder: SAC's twin Q-values and TQC's truncated quantiles.
 
-Both act on the latents of the shared encoder. Wherever a value is formed, [B, K] are K values of each sample:
-K = 1 for SAC (the smallest of the twin Q values), the quantiles that are kept for TQC.
+Wherever a value is formed, [B, K] are K values of each sample: K = 1 for SAC, the quantiles that are kept for TQC.
 """
 
 from itertools import chain, pairwise
-from typing import Any
 
 import torch as th
 from sb3_contrib.common.utils import quantile_huber_loss
@@ -16,14 +14,14 @@ from sb3_cure.networks.layers import EnsembleLinear, run_mlp
 
 
 class LatentCritic(nn.Module):
-    """Several critics on the latents of the shared encoder, which they do not own.
+    """Several critics side by side on the latents of the shared encoder, which they do not own.
 
     :param features_dim: Size of the latents
     :param action_dim: Size of the actions
     :param net_arch: Hidden layers
     :param activation_fn: Activation function
     :param n_critics: Number of critics
-    :param n_values: Values that each critic returns: 1, or its quantiles
+    :param n_values: Values that each critic returns
     """
 
     optimizer: th.optim.Optimizer
@@ -44,7 +42,8 @@ class LatentCritic(nn.Module):
         self.ensemble = nn.Sequential(*chain(*hidden), EnsembleLinear(n_critics, sizes[-1], n_values))
 
     def forward(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
+        """Compute the values of all critics.
+
         :param latents: [B, features_dim]
         :param actions: In [-1, 1], [B, action_dim]
         :return: Values in fp32, [B, n_critics, n_values]
@@ -52,103 +51,75 @@ class LatentCritic(nn.Module):
         inputs = th.cat([latents, actions], dim=1).expand(self.n_critics, -1, -1)
         return run_mlp(self.ensemble, inputs).transpose(0, 1)
 
+    def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Compute the values to bootstrap from, without the entropy; asked of target critics.
 
-class TwinQ:
-    """SAC's critics: the target and the actor's value are the smallest Q (Haarnoja et al. 2018).
-
-    :param model: The algorithm, asked at each use for settings that may change
-    """
-
-    def __init__(self, model: Any):
-        self.model = model
-
-    @staticmethod
-    def make(
-        features_dim: int, action_dim: int, net_arch: list[int], activation_fn: type[nn.Module], **kwargs: Any
-    ) -> LatentCritic:
-        """
-        :param features_dim: Size of the latents
-        :param action_dim: Size of the actions
-        :param net_arch: Hidden layers
-        :param activation_fn: Activation function
-        :param kwargs: ``n_critics``
-        :return: The critics
-        """
-        return LatentCritic(features_dim, action_dim, net_arch, activation_fn, **kwargs)
-
-    def next_values(self, target: LatentCritic, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        :param target: Target critics
         :param latents: Latents of the next observations, [B, features_dim]
         :param actions: Next actions, [B, action_dim]
-        :return: Values to bootstrap from, without the entropy, [B, 1]
+        :return: [B, K]
         """
-        return target(latents, actions).amin(dim=1)
+        raise NotImplementedError
 
-    def loss(self, values: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
-        :param values: Of the critics, [B, n_critics, 1]
-        :param target: [B, 1]
-        :return: Half the sum of the critics' mean squared errors, as SB3's SAC
-        """
-        return 0.5 * F.mse_loss(values, target.unsqueeze(1).expand_as(values)) * values.shape[1]
+    def loss(self, latents: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """Compute the critics' loss.
 
-    def value(self, critic: LatentCritic, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        :param critic: Critics
         :param latents: [B, features_dim]
         :param actions: [B, action_dim]
-        :return: What the actor maximises, [B, 1]
+        :param target: [B, K]
+        :return: Scalar
         """
-        return critic(latents, actions).amin(dim=1)
+        raise NotImplementedError
+
+    def value(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """Compute what the actor maximises.
+
+        :param latents: [B, features_dim]
+        :param actions: [B, action_dim]
+        :return: [B, 1]
+        """
+        raise NotImplementedError
 
 
-class TruncatedQuantiles(TwinQ):
-    """TQC's critics: quantiles, of which the largest are dropped from the target (Kuznetsov et al. 2020)."""
+class TwinCritic(LatentCritic):
+    """SAC's critics: the target and the actor's value are the smallest Q-value (Haarnoja et al., 2018)."""
 
-    @staticmethod
-    def make(
+    def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self(latents, actions).amin(dim=1)
+
+    def loss(self, latents: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
+        values = self(latents, actions)  # half the sum of the critics' mean squared errors, as in SB3's SAC
+        return 0.5 * F.mse_loss(values, target.unsqueeze(1).expand_as(values)) * self.n_critics
+
+    def value(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self(latents, actions).amin(dim=1)
+
+
+class QuantileCritic(LatentCritic):
+    """TQC's critics: quantiles, of which the largest are dropped from the target (Kuznetsov et al., 2020).
+
+    :param n_quantiles: Quantiles of each critic
+    :param top_quantiles_to_drop_per_net: Quantiles to drop for each critic
+    """
+
+    def __init__(
+        self,
         features_dim: int,
         action_dim: int,
         net_arch: list[int],
         activation_fn: type[nn.Module],
+        n_critics: int = 2,
         n_quantiles: int = 25,
-        **kwargs: Any,
-    ) -> LatentCritic:
-        """
-        :param features_dim: Size of the latents
-        :param action_dim: Size of the actions
-        :param net_arch: Hidden layers
-        :param activation_fn: Activation function
-        :param n_quantiles: Quantiles of each critic
-        :param kwargs: ``n_critics``
-        :return: The critics
-        """
-        return LatentCritic(features_dim, action_dim, net_arch, activation_fn, n_values=n_quantiles, **kwargs)
+        top_quantiles_to_drop_per_net: int = 2,
+    ):
+        super().__init__(features_dim, action_dim, net_arch, activation_fn, n_critics, n_values=n_quantiles)
+        self.n_kept = (n_quantiles - top_quantiles_to_drop_per_net) * n_critics
 
-    def next_values(self, target: LatentCritic, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        :param target: Target critics
-        :param latents: Latents of the next observations, [B, features_dim]
-        :param actions: Next actions, [B, action_dim]
-        :return: The quantiles that are kept, in ascending order, [B, K]
-        """
-        quantiles, _ = th.sort(target(latents, actions).flatten(1))
-        return quantiles[:, : quantiles.shape[1] - self.model.top_quantiles_to_drop_per_net * target.n_critics]
+    def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self(latents, actions).flatten(1).sort().values[:, : self.n_kept]
 
-    def loss(self, values: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
-        :param values: Quantiles of the critics, [B, n_critics, n_quantiles]
-        :param target: [B, K]
-        :return: Quantile Huber loss, averaged over quantiles, as sb3-contrib's TQC
-        """
-        return quantile_huber_loss(values, target.unsqueeze(1), sum_over_quantiles=False)
+    def loss(self, latents: th.Tensor, actions: th.Tensor, target: th.Tensor) -> th.Tensor:
+        # Averaged over quantiles, as in sb3-contrib's TQC
+        return quantile_huber_loss(self(latents, actions), target.unsqueeze(1), sum_over_quantiles=False)
 
-    def value(self, critic: LatentCritic, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """
-        :param critic: Critics
-        :param latents: [B, features_dim]
-        :param actions: [B, action_dim]
-        :return: Mean of all quantiles, [B, 1]
-        """
-        return critic(latents, actions).mean(dim=2).mean(dim=1, keepdim=True)
+    def value(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self(latents, actions).mean(dim=2).mean(dim=1, keepdim=True)

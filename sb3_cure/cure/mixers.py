@@ -20,21 +20,20 @@ class CuriousMixer:
 
     def __init__(self, seed: int | None = None):
         self.rng = np.random.default_rng(seed)
-        #: Who acts in each environment, [n_envs]; empty before the first step
+        #: Where the curious actor acts, [n_envs]; empty before the first step
         self.curious: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        #: Where an episode begins with the next step, [n_envs]
-        self.starts: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
         #: Where a bout of the curious actor begins with this step, [n_envs]
         self.begins: npt.NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        #: What a random second actor does in its bout, [n_envs, *action shape]
+        #: Actions that a random second actor holds for its bout, [n_envs, *action shape]
         self.held: npt.NDArray[Any] = np.zeros(0)
-        self.n_steps = 0
-        self.n_curious = 0
-        self.n_bouts = 0
+        self.n_steps = self.n_curious = self.n_bouts = 0
 
-    def choose(self, n_envs: int, probability: float | Schedule, bout: float | str, progress: float) -> np.ndarray:
-        """
-        :param n_envs: Number of environments
+    def choose(
+        self, starts: npt.NDArray[np.bool_], probability: float | Schedule, bout: float | str, progress: float
+    ) -> npt.NDArray[np.bool_]:
+        """Choose who acts in the next step.
+
+        :param starts: Where an episode begins with this step, [n_envs]
         :param probability: p_c in [0, 1], or a schedule of the remaining progress
         :param bout: L >= 1 in agent steps, or ``"episode"``: redraw at resets only
         :param progress: Remaining progress: 1 at the start of training, 0 at its end
@@ -43,27 +42,24 @@ class CuriousMixer:
         """
         p = float(probability(progress) if callable(probability) else probability)
         if not 0 <= p <= 1:
-            raise ValueError(
-                f"curiosity_prob is {p} at a remaining progress of {progress:.2f}, but lies within [0, 1]."
-            )
+            raise ValueError(f"curiosity_prob must be in [0, 1], but is {p} at a remaining progress of {progress:.2f}.")
+        n_envs = len(starts)
         if len(self.curious) != n_envs:
-            self.curious, self.starts = np.zeros(n_envs, dtype=bool), np.ones(n_envs, dtype=bool)
-        before = self.curious & ~self.starts
+            self.curious, starts = np.zeros(n_envs, dtype=bool), np.ones(n_envs, dtype=bool)
+        before = self.curious & ~starts
         if bout == 1:
-            self.curious = self.rng.random(n_envs) < p
-            self.begins = self.curious
+            self.begins = self.curious = self.rng.random(n_envs) < p
         else:
-            redraws = self.starts if bout == "episode" else self.starts | (self.rng.random(n_envs) < 1 / float(bout))
+            redraws = starts if bout == "episode" else starts | (self.rng.random(n_envs) < 1 / float(bout))
             self.curious = np.where(redraws, self.rng.random(n_envs) < p, self.curious)
             self.begins = self.curious & redraws
-        self.starts = np.zeros(n_envs, dtype=bool)
         self.n_steps += n_envs
         self.n_curious += int(self.curious.sum())
         self.n_bouts += int((self.curious & ~before).sum())
         return self.curious
 
     def hold(self, sample: Callable[[], npt.NDArray[Any]]) -> npt.NDArray[Any]:
-        """Actions of a random second actor where it acts: drawn where a bout begins, and held until it ends.
+        """Get the actions of a random second actor: drawn where a bout begins, and held until it ends.
 
         :param sample: Draws an action
         :return: Where it acts, [n, *action shape]
@@ -76,9 +72,10 @@ class CuriousMixer:
         return self.held[self.curious]
 
     def pop_metrics(self) -> dict[str, float]:
-        """
-        :return: Share of curious steps since the last call, in [0, 1], and the mean length of curious stretches in
-            agent steps, by their logged names; empty if there were no steps
+        """Get what happened since the last call.
+
+        :return: Share of curious steps in [0, 1], and mean length of curious stretches in agent steps, by their logged
+            names; empty if there were no steps
         """
         if self.n_steps == 0:
             return {}
@@ -89,14 +86,16 @@ class CuriousMixer:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: All that the draws to come depend on
+        """Get all that the draws to come depend on.
+
+        :return: Arrays and numbers by name
         """
         return {**vars(self), "rng": self.rng.bit_generator.state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Of ``state_dict``
+        """Load what ``state_dict`` has returned.
+
+        :param state: Result of ``state_dict``
         """
         self.rng.bit_generator.state = state["rng"]
         vars(self).update({name: value for name, value in state.items() if name != "rng"})
