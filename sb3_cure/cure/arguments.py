@@ -73,17 +73,11 @@ def check_arguments(model: Any) -> None:
 
 def _check_combinations(model: Any) -> None:
     """What would train something else than what was asked for, without a word."""
-    reward = get_intrinsic_class(model.intrinsic).configured(**model.intrinsic_kwargs)
-    curious = model.curiosity in ("separate", "bonus")
+    get_intrinsic_class(model.intrinsic)
     if model.srl is None and model.srl_kwargs:
         raise ValueError(f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.")
     if model.srl is not None:
         get_srl_class(model.srl)
-    if curious and reward.needs_srl and model.srl is None:
-        raise ValueError(
-            f"curiosity={model.curiosity!r} is rewarded by intrinsic={model.intrinsic!r}, which is the error of an SRL "
-            "head, but srl is None: choose srl='rae', srl='curl' or a head of your own, or set curiosity=None."
-        )
     if not model.task and model.curiosity not in ("separate", "random"):
         raise ValueError(f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.")
     if model.curiosity == "separate" and model.curiosity_gamma == 0 and model.curiosity_target == "observation":

@@ -28,7 +28,7 @@ from sb3_cure.cure.policies import ActorCritic, CuRePolicy
 from sb3_cure.data.buffers import SkipsMarked, choose_replay_buffer, transitions
 from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.intrinsic import IntrinsicReward, RewardInputs, get_intrinsic_class
 from sb3_cure.networks.augmentations import Augmentation
 from sb3_cure.networks.precision import resolve_compile, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -267,12 +267,9 @@ class CuRe(OffPolicyAlgorithm):
     def _policy_choices(self) -> dict[str, Any]:
         """What this algorithm's own arguments ask of the policy."""
         intrinsic = get_intrinsic_class(self.intrinsic) if self.curiosity in ("separate", "bonus") else None
-        declared = IntrinsicReward if intrinsic is None else intrinsic.configured(**self.intrinsic_kwargs)
         frame_stack = self.replay_buffer_kwargs.get("frame_stack", 1)
-        told = {"frame_stack": frame_stack, "curiosity_target": self.curiosity_target}
         sources = {
             "srl": self.srl is not None,
-            "intrinsic": declared.trains_encoder,
             "task": self.task,
             "curious": self._has_curious_agent and self.curiosity_encoder_grad,
         }
@@ -282,7 +279,8 @@ class CuRe(OffPolicyAlgorithm):
             augmentation=self.augmentation,
             augmentation_kwargs=self.augmentation_kwargs,
             intrinsic_class=intrinsic,
-            intrinsic_kwargs={**{name: told[name] for name in declared.asks}, **self.intrinsic_kwargs},
+            intrinsic_kwargs=self.intrinsic_kwargs,
+            reward_settings={"frame_stack": frame_stack, "curiosity_target": self.curiosity_target},
             curious=self._has_curious_agent,
             encoder_sources=tuple(name for name, trains in sources.items() if trains),
             update=self.update,
@@ -484,11 +482,13 @@ class CuRe(OffPolicyAlgorithm):
             next_latents = {goal: policy.encoder_target(next_views[goal]).float() for goal in set(goals.values())}
         encoder.begin(views, *next_views.values())
 
-        srl_error, rewards, curious_rewards = None, batch.rewards, None
+        rewards, curious_rewards = batch.rewards, None
+        reward = policy.intrinsic if learns_rl else None
         if policy.srl is not None:
-            srl_error = self._update_srl(policy.srl, batch, learns_srl)
-        if policy.intrinsic is not None and learns_rl:
-            curious_rewards = self._update_intrinsic(policy.intrinsic, batch, srl_error)
+            curious_rewards = self._update_srl(policy.srl, batch, learns_srl, reward)
+        if reward is not None:
+            if curious_rewards is None:
+                curious_rewards = self._update_intrinsic(reward, batch, None)
             if self.curiosity == "bonus":
                 rewards = rewards + curious_rewards
         if "task" in goals:
@@ -503,15 +503,17 @@ class CuRe(OffPolicyAlgorithm):
         self._metrics.record(encoder.end())
         self._update_targets(learns_rl)
 
-    def _update_srl(self, srl: SRLHead, batch: Samples, trains: bool) -> th.Tensor:
+    def _update_srl(
+        self, srl: SRLHead, batch: Samples, trains: bool, reward: IntrinsicReward | None
+    ) -> th.Tensor | None:
         """UpdateSRL: train the head and, through the latents, the encoder.
 
-        :return: SRL error of the observations (or next observations) that an intrinsic reward may be made of, [B]
+        :return: Scaled reward, [B, 1], if it is computed from the head, hence before the head's step
         """
         encoder = self.policy.encoder_update
         runs = [encoder.run(), encoder.next_run()] if srl.needs_next_latents else [encoder.run()]
         read = [_read(run.latents, trains) for run in runs]
-        with th.set_grad_enabled(trains), self._autocast(srl.mixed_precision):
+        with th.set_grad_enabled(trains):
             loss, error = srl.loss(batch, *(latents for _, latents in read))
         latents = runs[0].latents.detach()
         if error.shape != (len(latents),) or error.requires_grad or error.dtype in (th.bfloat16, th.float16):
@@ -519,6 +521,14 @@ class CuRe(OffPolicyAlgorithm):
                 f"{type(srl).__name__}.loss returned an error of shape {tuple(error.shape)} in {error.dtype} "
                 f"(requires_grad={error.requires_grad}), but it is one number per sample, detached, in fp32."
             )
+        variance = latents.var(dim=0, correction=0).mean()
+        self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
+        curious_rewards = None
+        if reward is not None and reward.needs_srl:
+            of_transitions = srl.needs_next_latents or srl.models_transitions
+            if self.curiosity_target == "next_observation" and not of_transitions:
+                error = self._next_error(srl, batch)
+            curious_rewards = self._update_intrinsic(reward, batch, error.float())
         if trains:
             self._learn_from("srl", loss.float(), srl.optimizer, "srl", read)
             if all(copy.grad is None and copy.requires_grad for _, copy in read):
@@ -528,18 +538,17 @@ class CuRe(OffPolicyAlgorithm):
                     stacklevel=2,
                 )
             srl.after_step()
-        variance = latents.var(dim=0, correction=0).mean()
-        self._metrics.record({"srl_loss": loss, "srl_error": error.float().mean(), "latent_variance": variance})
-        of_transitions = srl.needs_next_latents or srl.models_transitions
-        about_next = self.curiosity_target == "next_observation" and not of_transitions
-        if about_next and self.policy.intrinsic is not None and self.policy.intrinsic.needs_srl:
-            with th.no_grad(), self._autocast(srl.mixed_precision):
-                views = self.policy.augmentation(batch.next_observations)
-                latents = self.policy.encoder(self.policy.preprocess(views)).float()
-                # With nothing else, so that no head takes (s', a, s') for a transition.
-                shown = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
-                error = srl.loss(shown, latents).error
-        return error.float()
+        return curious_rewards
+
+    @th.no_grad()
+    def _next_error(self, srl: SRLHead, batch: Samples) -> th.Tensor:
+        """SRL error of the next observations, by encoder and head as they are, [B]."""
+        views = self.policy.augmentation(batch.next_observations)
+        with self._autocast():
+            latents = self.policy.encoder(self.policy.preprocess(views)).float()
+        # With nothing else, so that no head takes (s', a, s') for a transition.
+        shown = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
+        return srl.loss(shown, latents).error
 
     def _update_intrinsic(self, intrinsic: IntrinsicReward, batch: Samples, srl_error: th.Tensor | None) -> th.Tensor:
         """The intrinsic reward of this batch, and the step of what computes it.
@@ -548,11 +557,15 @@ class CuRe(OffPolicyAlgorithm):
 
         :return: Scaled reward, [B, 1]
         """
-        intrinsic.attach(self.replay_buffer, self._look_up, self._encode_centred)  # type: ignore[arg-type]
-        read = self._read_centred(batch, intrinsic)
-        latents, next_latents = [read[name][1] if name in read else None for name in ("latents", "next_latents")]
-        with self._autocast(intrinsic.mixed_precision):
-            loss, raw = intrinsic.loss(batch, latents, next_latents, srl_error)
+        read: dict[str, Read] = {}
+
+        def latents_of(name: str) -> th.Tensor:
+            read[name] = self._read_centred(batch, name, intrinsic.trains_encoder)
+            return read[name][1]
+
+        assert self.replay_buffer is not None
+        inputs = RewardInputs(batch, srl_error, latents_of, self.replay_buffer, self._look_up, self._encode_centred)
+        loss, raw = intrinsic.loss(inputs)
         raw = raw.detach().float()
         if loss is not None:
             self._learn_from("intrinsic reward", loss.float(), intrinsic.optimizer, "intrinsic", list(read.values()))
@@ -569,17 +582,14 @@ class CuRe(OffPolicyAlgorithm):
         )
         return reward
 
-    def _read_centred(self, batch: Samples, intrinsic: IntrinsicReward) -> dict[str, Read]:
-        """The latents that a reward reads, of centred views, by the online encoder."""
-        encoder, read = self.policy.encoder_update, {}
-        for name in intrinsic.reads:
-            if type(self.policy.augmentation) is Augmentation:  # then all others see the centred views, too
-                latents = (encoder.run() if name == "latents" else encoder.next_run()).latents
-            else:
-                observations = batch.observations if name == "latents" else batch.next_observations
-                latents = self._encode_centred(observations, intrinsic.trains_encoder)
-            read[name] = _read(latents, intrinsic.trains_encoder)
-        return read
+    def _read_centred(self, batch: Samples, name: str, gradient: bool) -> Read:
+        """Latents of centred views, by the online encoder, and the copy that a reward reads."""
+        encoder = self.policy.encoder_update
+        if type(self.policy.augmentation) is Augmentation:  # then all others see the centred views, too
+            latents = (encoder.run() if name == "observations" else encoder.next_run()).latents
+        else:
+            latents = self._encode_centred(getattr(batch, name), gradient)
+        return _read(latents, gradient)
 
     def _look_up(self, rows: np.ndarray, env_inds: np.ndarray) -> Samples:
         """Transitions of the replay buffer by their places, as heads and rewards get them."""

@@ -21,7 +21,7 @@ from sb3_cure.cure.critics import LatentCritic, TwinQ
 from sb3_cure.cure.encoder_update import EncoderUpdate
 from sb3_cure.data.observations import image_spaces, images_of, join, sensed_space
 from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic import DictReward, IntrinsicReward, RewardScale
+from sb3_cure.intrinsic import IntrinsicReward, RewardScale, make_reward
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
 from sb3_cure.networks.layers import full_precision, init_weights, preprocess, run_mlp, set_mode
@@ -147,6 +147,7 @@ class CuRePolicy(BasePolicy):
     :param augmentation_kwargs: Its arguments
     :param intrinsic_class: Class of the intrinsic reward, or None
     :param intrinsic_kwargs: Its arguments
+    :param reward_settings: ``frame_stack`` and ``curiosity_target``, for rewards that read them
     :param curious: Whether there is a curious actor-critic
     :param encoder_sources: Which losses train the encoder
     :param update: ``"sequential"`` or ``"joint"``, see ``EncoderUpdate``
@@ -184,6 +185,7 @@ class CuRePolicy(BasePolicy):
         augmentation_kwargs: dict[str, Any] | None = None,
         intrinsic_class: type[IntrinsicReward] | None = None,
         intrinsic_kwargs: dict[str, Any] | None = None,
+        reward_settings: dict[str, Any] | None = None,
         curious: bool = False,
         encoder_sources: tuple[str, ...] = ("task",),
         update: str = "joint",
@@ -217,6 +219,7 @@ class CuRePolicy(BasePolicy):
             augmentation=augmentation,
             augmentation_kwargs=augmentation_kwargs,
             update=update,
+            reward_settings=reward_settings,
         )
         #: What encoder, head and rewards take observations for
         self.sensed_space = sensed_space(observation_space)
@@ -233,6 +236,8 @@ class CuRePolicy(BasePolicy):
             self._build_intrinsic(intrinsic_class, intrinsic_kwargs or {})
         if curious:
             self.curious = self._make_actor_critic()
+        if self.intrinsic is not None and self.intrinsic.trains_encoder and "intrinsic" not in encoder_sources:
+            encoder_sources = (*encoder_sources, "intrinsic")
         self.encoder_update = EncoderUpdate(
             self.encoder, encoder_sources, update, optimizer_class, lr=self.learning_rate, **self.optimizer_kwargs
         )
@@ -286,12 +291,10 @@ class CuRePolicy(BasePolicy):
 
     def _build_intrinsic(self, intrinsic_class: type[IntrinsicReward], kwargs: dict[str, Any]) -> None:
         self._intrinsic_choice = intrinsic_class, kwargs
-        per_image = isinstance(self.sensed_space, spaces.Dict) and intrinsic_class.configured(**kwargs).per_image
-        make: Any = functools.partial(DictReward, intrinsic_class) if per_image else intrinsic_class
+        settings = {**(self._choices["reward_settings"] or {}), "srl": self.srl}
+        space, size = self.sensed_space, self.encoder.features_dim
         with _seeded(self._intrinsic_seed):
-            self.intrinsic = make(self.sensed_space, self.action_space, self.encoder.features_dim, **kwargs)
-        assert self.intrinsic is not None
-        self.intrinsic.bind(self.srl)
+            self.intrinsic = make_reward(intrinsic_class, space, self.action_space, size, settings, kwargs)  # type: ignore[arg-type]
         parameters = [parameter for parameter in self.intrinsic.parameters() if parameter.requires_grad]
         self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
 

@@ -247,10 +247,15 @@ class Pretraining(CuRe):
         if self._compiles:
             policy.compile_networks()
         update = policy.encoder_update
-        for source in choices["encoder_sources"]:
+        for source in self._encoder_sources():
             if source not in update.mean_squares:
                 update.add_source(source)
         self._setup_curious_temperature()
+
+    def _encoder_sources(self) -> set[str]:
+        reward = self.policy.intrinsic
+        own = {"intrinsic"} if reward is not None and reward.trains_encoder else set()
+        return own | set(self._policy_choices()["encoder_sources"])
 
     def _end_pretraining(self, keeps_transitions: bool = False) -> None:
         if self._before_pretraining is None:
@@ -262,7 +267,7 @@ class Pretraining(CuRe):
             policy.curious = None
             if self.curiosity != "bonus":  # which has the reward, too
                 policy.intrinsic = None
-            for source in policy.encoder_update.mean_squares.keys() - set(self._policy_choices()["encoder_sources"]):
+            for source in policy.encoder_update.mean_squares.keys() - self._encoder_sources():
                 policy.encoder_update.remove_source(source)
         policy.default_agent = self._policy_choices()["default_agent"]
         if self.curiosity == "bonus":
