@@ -46,9 +46,9 @@ class RND(IntrinsicReward):
             self.space = spaces.Box(0, 255, (channels // frame_stack, height, width), np.uint8)
         self.target = make_network(self.space, [hidden_dim, n_outputs], n_filters).requires_grad_(False)
         self.predictor = make_network(self.space, [hidden_dim, hidden_dim, hidden_dim, n_outputs], n_filters)
-        example = scaled(th.as_tensor(self.space.sample())[None], self.space)[0]
-        self.register_buffer("mean", th.zeros_like(example))
-        self.register_buffer("variance", th.zeros_like(example))
+        shape = scaled(th.as_tensor(self.space.sample())[None], self.space).shape[1:]
+        self.register_buffer("mean", th.zeros(shape))
+        self.register_buffer("variance", th.zeros(shape))
         # Whether the statistics are final; and the same as a Python bool, which waits for no device (None: read it)
         self.register_buffer("measured", th.tensor(False))
         self._is_measured: bool | None = None

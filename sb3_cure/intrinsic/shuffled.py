@@ -22,7 +22,8 @@ class Shuffled(IntrinsicReward):
         self, *args: Any, settings: dict[str, Any], of: str | type[IntrinsicReward] = "srl_error", **kwargs: Any
     ):
         super().__init__(*args)
-        self.of = make_reward(get_intrinsic_class(of), *args, settings, kwargs)
+        spaces_of = self.observation_space, self.action_space
+        self.of = make_reward(get_intrinsic_class(of), *spaces_of, self.features_dim, settings, kwargs)
         self.random = OwnGenerator(stream=1)
         for name in ("needs_srl", "trains_encoder", "measures"):
             setattr(self, name, getattr(self.of, name))

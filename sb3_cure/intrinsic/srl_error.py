@@ -46,7 +46,7 @@ class SRLError(IntrinsicReward):
             )
         self._srl: tuple[Any] = (srl,)
         example = th.as_tensor(self.observation_space.sample())[None]
-        self.register_buffer("variance", th.zeros_like(self._target(example)[0]))
+        self.register_buffer("variance", th.zeros(self._target(example).shape[1:]))
         self.register_buffer("weight", th.zeros(()))
 
     @classmethod

@@ -93,7 +93,8 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
 def _restore(buffer: Any, state: dict[str, Any], name: str, leave_out: tuple[str, ...] = ()) -> None:
     """Put counters and arrays into a new buffer, and into those that it is made of."""
     counters, images, given_images = state["counters"], getattr(buffer, "images", {}), state.get("images", {})
-    vars(buffer).update({key: type(getattr(buffer, key, 0))(value) for key, value in counters.items()})
+    kinds = {"n_added": int, **{key: type(value) for key, value in vars(buffer).items()}}
+    vars(buffer).update({key: kinds[key](value) for key, value in counters.items()})
     if images.keys() != given_images.keys():
         raise ArchiveError(f"{name} has other images than this model: load the replay buffer of the same environment.")
     for key, image in images.items():
