@@ -106,6 +106,8 @@ class SkipsMarked(ReplayBuffer):
     """
 
     marked: ndarray  # bool [buffer_size, n_envs]
+    #: Rows that were ever added
+    n_added: int = 0
     #: Rows and environments of the latest batch, [batch_size] each
     last_sampled: tuple[ndarray, ndarray] | None = None
 
@@ -117,6 +119,7 @@ class SkipsMarked(ReplayBuffer):
             this one included, are marked (default: 1)
         :return: Which transitions of this row are marked, bool [n_envs]
         """
+        self.n_added += 1
         self.marked[self.pos] = marks = np.array([is_marked(info) for info in infos])
         for i in np.flatnonzero(marks):
             n_steps = min(infos[i].get("env_fault_steps", 1), self.buffer_size)

@@ -1,7 +1,8 @@
 """The contract between the agent and an intrinsic reward, and how rewards are scaled."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -10,101 +11,127 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
 from sb3_cure.data.samples import Samples
-from sb3_cure.srl.base import SRLHead
 
-#: From rows and environments of a replay buffer, [n] each, to its samples
-LookUp = Callable[[np.ndarray, np.ndarray], Samples]
+
+class RewardInputs:
+    """What an intrinsic reward may read in one update; latents are computed when they are first read.
+
+    :param batch: The true transitions
+    :param srl_error: SRL error of each sample, before the head's step, detached, [B]; None without SRL
+    :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
+    :param replay_buffer: The replay buffer, which has just drawn the batch
+    :param look_up: Returns stored transitions by rows and environments, [n] each
+    :param encode: Returns latents without a graph, [n, features_dim], of stored observations, [n, *shape]
+    """
+
+    def __init__(
+        self,
+        batch: Samples,
+        srl_error: th.Tensor | None,
+        read: Callable[[str], th.Tensor],
+        replay_buffer: ReplayBuffer,
+        look_up: Callable[[np.ndarray, np.ndarray], Samples],
+        encode: Callable[[Any], th.Tensor],
+    ):
+        self.batch, self.srl_error = batch, srl_error
+        self.replay_buffer, self.look_up, self.encode = replay_buffer, look_up, encode
+        self._read = read
+
+    @cached_property
+    def latents(self) -> th.Tensor:
+        """The online encoder's latents of the centred views, fp32, [B, features_dim]."""
+        return self._read_with_graph("observations")
+
+    @cached_property
+    def next_latents(self) -> th.Tensor:
+        """The same of the next observations, [B, features_dim]."""
+        return self._read_with_graph("next_observations")
+
+    def of(self, key: str, where: slice = slice(None)) -> "RewardInputs":
+        """Return the inputs of a reward that sees one image of a dictionary.
+
+        :param key: Key of the image
+        :param where: The part of the latents that it reads
+        :return: The same inputs, observations without their keys
+        """
+        return RewardInputs(
+            self.batch.of(key),
+            self.srl_error,
+            lambda name: (self.latents if name == "observations" else self.next_latents)[:, where],
+            self.replay_buffer,
+            lambda rows, env_inds: self.look_up(rows, env_inds).of(key),
+            self.encode,
+        )
+
+    def _read_with_graph(self, name: str) -> th.Tensor:
+        # Other losses may share this pass of the encoder: it needs its graph, even if the reward works under no_grad.
+        with th.enable_grad():
+            return self._read(name)
 
 
 class IntrinsicReward(nn.Module):
-    """What the curious agent is rewarded for. Subclass it, implement ``loss``, and pass the class as ``intrinsic=``.
+    """Base class of intrinsic rewards. Subclass it, implement ``loss``, and pass the class as ``intrinsic=``.
 
-    The reward is computed afresh for each sampled batch, so that it is never stale. Targets, statistics and memories
-    belong into buffers, which are saved; random numbers come from a generator of its own (``OwnGenerator``), so that
-    runs of one seed that differ in their reward alone draw alike elsewhere. What is declared below may depend on
-    arguments: set it on ``self``, and let ``configured`` tell it before there is an object.
+    Rewards are computed anew for each sampled batch, so they are never stale. Keep targets, statistics and memories in
+    buffers, which are saved, and draw random numbers from an ``OwnGenerator``, so that runs of one seed with different
+    rewards draw alike elsewhere. A constructor that names ``frame_stack`` (frames per image), ``curiosity_target`` or
+    ``srl`` (the head; keep it in a tuple, so that it is not registered twice) gets that setting of the agent.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
     :param features_dim: Size of the latents
     """
 
-    #: Whether the reward is made of the SRL error, so that ``srl=None`` is refused
+    #: Whether the reward is computed from the SRL head: it is then computed before the head's step, and ``srl=None`` is
+    #: refused
     needs_srl: bool = False
-    #: Which of ``"latents"`` and ``"next_latents"`` the reward reads; the other ones are None
-    reads: tuple[str, ...] = ()
     #: Whether the latents keep their graph, so that this loss trains the encoder, too
     trains_encoder: bool = False
-    #: Whether ``loss`` runs under autocast where the agent computes in bf16; the reward itself is fp32
-    mixed_precision: bool = False
-    #: Whether policies are measured by ``error`` rather than by the SRL error
+    #: Whether policies are measured by ``error`` instead of by the SRL error
     measures: bool = False
-    #: Whether the reward reads observations as one image or vector: of a dictionary, each image then has a reward of
-    #: its own (``DictReward``). Else a reward that reads observations gets the dictionary
-    per_image: bool = False
-    #: What the constructor is told of the agent unless ``intrinsic_kwargs`` says otherwise: ``"frame_stack"`` (frames
-    #: per image that the replay buffer knows of, else 1), ``"curiosity_target"``
-    asks: ClassVar[tuple[str, ...]] = ()
-    #: Optimiser of the reward's own parameters, set by the policy; None if it has none
+    #: Optimizer of the reward's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Box, features_dim: int):
         super().__init__()
+        self.observation_space, self.action_space, self.features_dim = observation_space, action_space, features_dim
 
     @classmethod
-    def configured(cls, **kwargs: Any) -> "type[IntrinsicReward]":
-        """
+    def is_per_image(cls, **kwargs: Any) -> bool:
+        """Return whether each image of a dictionary gets a reward of its own (``DictReward``).
+
         :param kwargs: The reward's arguments
-        :return: The class whose ``needs_srl``, ``trains_encoder`` and ``asks`` hold with them
+        :return: By default False: ``loss`` gets the observations as a dictionary
         """
-        return cls
+        return False
 
-    def bind(self, srl: SRLHead | None) -> None:
-        """Called once by the policy.
+    def loss(self, inputs: RewardInputs) -> tuple[th.Tensor | None, th.Tensor]:
+        """Compute the rewards of a batch, as they are before the step that the loss then makes.
 
-        :param srl: The SRL head, if there is one
-        :raises ValueError: if it is not one that the reward can be made of
+        :param inputs: The batch, its latents and its SRL error, and a look-up of stored transitions
+        :return: Loss of the reward's own parameters (None if it has none), and the reward of each sample, detached, [B]
         """
-
-    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
-        """Called by the algorithm before each ``loss``, for rewards that look beyond the batch.
-
-        :param replay_buffer: The replay buffer, which has just drawn the batch
-        :param look_up: What it holds: samples by rows and environments, [n] each
-        :param encode: The online encoder: latents, [n, features_dim], of centred views of stored observations
-        """
-
-    def forget(self) -> None:
-        """Called when the replay buffer was emptied: forget what refers to it."""
-
-    def loss(
-        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
-    ) -> tuple[th.Tensor | None, th.Tensor]:
-        """The reward of a batch, as it is before the step that the loss then makes.
-
-        :param batch: The true transitions
-        :param latents: The online encoder's latents of the centred views, fp32, [B, features_dim]
-        :param next_latents: The same of the next observations, [B, features_dim]
-        :param srl_error: SRL error of each sample, detached, [B]; None without SRL
-        :return: Loss of the reward's own parameters (None if it has none), and the reward, detached, [B]
-        """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must implement loss(inputs)")
 
     def error(self, observations: th.Tensor, latents: th.Tensor) -> th.Tensor:
-        """What policies are measured by, if ``measures`` says so.
+        """Compute the error by which policies are measured if ``measures`` is True.
 
         :param observations: As stored, [B, *shape]
-        :param latents: Theirs, [B, features_dim]
-        :return: [B]
+        :param latents: Their latents, [B, features_dim]
+        :return: Error of each observation, [B]
         """
         raise NotImplementedError(f"{type(self).__name__} must implement error(observations, latents)")
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
-        """
+        """Draw observations from latents.
+
         :param latents: [B, features_dim]
-        :return: Observations as drawn (images in 0-255), or None if nothing is drawn
+        :return: Observations (images in 0-255), or None if the reward does not decode
         """
         return None
+
+    def forget(self) -> None:
+        """Forget what refers to the replay buffer, which was emptied."""
 
 
 class OwnGenerator(nn.Module):
@@ -115,18 +142,17 @@ class OwnGenerator(nn.Module):
 
     def __init__(self, stream: int = 0):
         super().__init__()
-        # While a reward is built, torch's seed is one that is the same under every reward.
+        # While a reward is built, torch's seed is the same under every reward.
         self.generator = th.Generator().manual_seed(th.initial_seed() + stream)
 
     def get_extra_state(self) -> th.Tensor:
-        """
-        :return: State of the generator
-        """
+        """Return the state of the generator."""
         return self.generator.get_state()
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """
-        :param state: Of ``get_extra_state``
+        """Restore the state of the generator.
+
+        :param state: Result of ``get_extra_state``
         """
         self.generator.set_state(state.cpu())
 
@@ -153,25 +179,26 @@ class RewardScale(nn.Module):
         self.register_buffer("weight", th.zeros(()))
 
     def forget(self) -> None:
-        """Begin the average anew."""
+        """Reset the running deviation."""
         self.variance.zero_()
         self.weight.zero_()
 
     @th.no_grad()
     def forward(self, reward: th.Tensor, beta: float, normalize: bool, center: bool) -> th.Tensor:
-        """
+        """Scale the rewards of a batch, and update the running deviation.
+
         :param reward: Raw reward of each sample, [B]
         :param beta: Factor of the reward, beta in the paper
-        :param normalize: Whether to standardise; False is the paper's letter
-        :param center: Whether the mean is subtracted when standardising. Not for a bonus on top of a task's reward,
-            which would make long episodes neither better nor worse: it is divided by its root mean square, as in
-            units of its deviation an error that varies little would be clipped to a constant
+        :param normalize: Whether to standardise; False is the paper's formula
+        :param center: Whether to subtract the mean when standardising. Not for a bonus added to a task's reward, which
+            would make long episodes neither better nor worse: it is divided by its root mean square, as in units of
+            its deviation an error that varies little would be clipped to a constant
         :return: Scaled reward, [B, 1]
         """
         if normalize:
             mean = reward.mean()
             variance = (reward - mean if center else reward).square().mean()
-            # A spread below a thousandth of the rewards' size is rounding: rewards that are all alike earn nothing.
+            # A spread below a thousandth of the rewards' size is rounding: rewards that are all alike are worth 0.
             variance = th.maximum(variance, 1e-6 * reward.square().mean())
             finite = variance.isfinite()
             self.variance.copy_(th.where(finite, self.variance.lerp(variance, 1 - self.decay), self.variance))
@@ -179,7 +206,7 @@ class RewardScale(nn.Module):
             self.weight.copy_(
                 th.where(finite, self.weight.lerp(th.ones_like(self.weight), 1 - self.decay), self.weight)
             )
-            # Not a number as long as no finite rewards were seen: those that are not reach no critic.
+            # NaN until the first finite batch: rewards that are not finite reach no critic.
             deviation = (self.variance / self.weight).sqrt() + 1e-8
             reward = ((reward - mean if center else reward) / deviation).clamp(-self.clip, self.clip)
         return beta * reward.unsqueeze(1)

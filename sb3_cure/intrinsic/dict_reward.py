@@ -1,115 +1,113 @@
-"""One intrinsic reward for each image of a dictionary."""
+"""How rewards are built, and one reward for each image of a dictionary."""
 
-from collections.abc import Callable
+import inspect
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
 from sb3_cure.data.buffers import stacks_by_key
-from sb3_cure.data.observations import image_spaces
-from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
+from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.networks.layers import MeanError
-from sb3_cure.srl.base import SRLHead
-from sb3_cure.srl.dict_head import DictHead, heads_by_key
+from sb3_cure.srl import DictHead, heads_by_key
+
+
+def make_reward(
+    reward_class: type[IntrinsicReward],
+    observation_space: spaces.Space,
+    action_space: spaces.Box,
+    features_dim: int,
+    settings: dict[str, Any],
+    kwargs: dict[str, Any],
+) -> IntrinsicReward:
+    """Build an intrinsic reward, with those settings of the agent that its constructor names.
+
+    :param reward_class: Class of the reward
+    :param observation_space: Space of the stored observations
+    :param action_space: Action space
+    :param features_dim: Size of the latents
+    :param settings: ``frame_stack``, ``curiosity_target`` and ``srl`` (the head or None) of the agent
+    :param kwargs: The reward's arguments, which override the settings
+    :return: The reward; of a dictionary one for each image, if its class says so (``is_per_image``)
+    :raises ValueError: if the reward needs a head, and there is none
+    """
+    if reward_class.needs_srl and settings.get("srl") is None:
+        raise ValueError(
+            f"the intrinsic reward {reward_class.__name__} is computed from an SRL head, but srl is None: choose "
+            "srl='rae', srl='curl' or a head of your own, another intrinsic reward, or curiosity=None."
+        )
+    if isinstance(observation_space, spaces.Dict) and reward_class.is_per_image(**kwargs):
+        return DictReward(reward_class, observation_space, action_space, features_dim, settings=settings, **kwargs)
+    named = inspect.signature(reward_class).parameters
+    offered = {**settings, "settings": settings}  # rewards that build others pass them on
+    own = {name: value for name, value in offered.items() if name in named}
+    return reward_class(observation_space, action_space, features_dim, **{**own, **kwargs})
 
 
 class DictReward(IntrinsicReward):
     """A reward of one class for each image of a dictionary: their mean, each divided by its running deviation.
 
-    All of them read the joined latents; those that are made of the SRL error read their own image's, as its head does.
+    All of them read the joint latents; those that are computed from the SRL head read their own image's, as its head
+    does.
 
-    :param reward_class: Class of the rewards, which says ``per_image = True``
-    :param observation_space: Space of the stored observations
-    :param action_space: Action space
-    :param features_dim: Size of the joined latents
+    :param reward_class: Class of the rewards
+    :param args: As of ``IntrinsicReward``
+    :param settings: As of ``make_reward``
     :param kwargs: Arguments of each reward
     """
 
-    def __init__(
-        self,
-        reward_class: type[IntrinsicReward],
-        observation_space: spaces.Dict,
-        action_space: spaces.Box,
-        features_dim: int,
-        **kwargs: Any,
-    ):
-        super().__init__(observation_space, action_space, features_dim)
-        images = image_spaces(observation_space)
-        self.keys = list(images)
-        stacks = stacks_by_key(observation_space, kwargs["frame_stack"]) if "frame_stack" in kwargs else {}
-        own = {key: {"frame_stack": stack} for key, stack in stacks.items()}
-        self.rewards = nn.ModuleList(
-            reward_class(space, action_space, features_dim, **{**kwargs, **own.get(key, {})})
-            for key, space in images.items()
-        )
-        self.mean_reward = MeanError(len(images))
-        # Which of the joined latents each reward reads
-        self._slices = dict.fromkeys(self.keys, slice(None))
-        for name in ("needs_srl", "reads", "trains_encoder", "mixed_precision", "measures"):
+    def __init__(self, reward_class: type[IntrinsicReward], *args: Any, settings: dict[str, Any], **kwargs: Any):
+        super().__init__(*args)
+        observation_space, srl = args[0], settings.get("srl")
+        heads, self.rewards = heads_by_key(srl), nn.ModuleList()
+        stacks = stacks_by_key(observation_space, {"frame_stack": 1, **settings, **kwargs}["frame_stack"])
+        for key, stack in stacks.items():
+            own = {**settings, "frame_stack": stack, "srl": heads.get(key, srl)}
+            given = {**kwargs, "frame_stack": stack} if "frame_stack" in kwargs else kwargs
+            space = observation_space[key]
+            self.rewards.append(make_reward(reward_class, space, self.action_space, self.features_dim, own, given))
+        self.mean_reward = MeanError(len(stacks))
+        self.slices = dict.fromkeys(stacks, slice(None))
+        if reward_class.needs_srl and isinstance(srl, DictHead):
+            self.slices = dict(zip(srl.keys, srl.slices, strict=True))
+        for name in ("needs_srl", "trains_encoder", "measures"):
             setattr(self, name, getattr(self.rewards[0], name))
 
-    def bind(self, srl: SRLHead | None) -> None:
-        """
-        :param srl: The SRL head
-        """
-        if self.needs_srl and isinstance(srl, DictHead):
-            self._slices = dict(zip(srl.keys, srl.slices, strict=True))
-        heads = heads_by_key(srl)
-        for key, reward in self._parts():
-            reward.bind(heads.get(key, srl))
+    def loss(self, inputs: RewardInputs) -> tuple[th.Tensor | None, th.Tensor]:
+        """Add the losses up, and average the rewards.
 
-    def attach(self, replay_buffer: ReplayBuffer, look_up: LookUp, encode: Callable[[Any], th.Tensor]) -> None:
-        """
-        :param replay_buffer: The replay buffer
-        :param look_up: What it holds; each reward sees its own image
-        :param encode: The online encoder
-        """
-        for key, reward in self._parts():
-            reward.attach(replay_buffer, lambda *places, key=key: look_up(*places).of(key), encode)
-
-    def forget(self) -> None:
-        """For each reward."""
-        for _, reward in self._parts():
-            reward.forget()
-
-    def loss(
-        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
-    ) -> tuple[th.Tensor | None, th.Tensor]:
-        """
-        :param batch: The true transitions, observations by key
-        :param latents: Joined latents, [B, features_dim]
-        :param next_latents: The same of the next observations, [B, features_dim]
-        :param srl_error: SRL error of each sample, [B]
+        :param inputs: Observations by key
         :return: Sum of the losses, and the mean reward, [B]
         """
-        found = []
-        for key, reward in self._parts():
-            read = [None if each is None else each[:, self._slices[key]] for each in (latents, next_latents)]
-            found.append(reward.loss(batch.of(key), *read, srl_error))
-        losses = [loss.float() for loss, _ in found if loss is not None]
+        found = [reward.loss(inputs.of(key, where)) for key, where, reward in self._parts()]
+        losses = [loss for loss, _ in found if loss is not None]
         rewards = self.mean_reward([reward for _, reward in found], learns=True)
         return th.stack(losses).sum() if losses else None, rewards
 
     def error(self, observations: Any, latents: th.Tensor) -> th.Tensor:
-        """
+        """Average the errors by which policies are measured.
+
         :param observations: As stored, by key
-        :param latents: Joined latents, [B, features_dim]
+        :param latents: Joint latents, [B, features_dim]
         :return: [B]
         """
-        parts = [(observations[key], latents[:, self._slices[key]], reward) for key, reward in self._parts()]
-        return self.mean_reward([reward.error(seen, own) for seen, own, reward in parts], learns=False)
+        errors = [reward.error(observations[key], latents[:, where]) for key, where, reward in self._parts()]
+        return self.mean_reward(errors, learns=False)
 
     def reconstruct(self, latents: th.Tensor) -> dict[str, th.Tensor] | None:  # type: ignore[override]
+        """Draw each image.
+
+        :param latents: Joint latents, [B, features_dim]
+        :return: Images by key, or None if the rewards do not decode
         """
-        :param latents: Joined latents, [B, features_dim]
-        :return: Images by key, or None if nothing is drawn
-        """
-        drawn = {key: reward.reconstruct(latents) for key, reward in self._parts()}
+        drawn = {key: reward.reconstruct(latents[:, where]) for key, where, reward in self._parts()}
         return None if None in drawn.values() else drawn
 
-    def _parts(self) -> list[tuple[str, Any]]:
-        return list(zip(self.keys, self.rewards, strict=True))
+    def forget(self) -> None:
+        """Let each reward forget what refers to the replay buffer."""
+        for _, _, reward in self._parts():
+            reward.forget()
+
+    def _parts(self) -> list[tuple[str, slice, Any]]:
+        return [(*item, reward) for item, reward in zip(self.slices.items(), self.rewards, strict=True)]

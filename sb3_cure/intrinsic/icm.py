@@ -1,16 +1,13 @@
-"""Intrinsic curiosity module (ICM): what a model of the next step gets wrong of what actions change."""
+"""Intrinsic curiosity module (ICM): the error of a forward model in features that depend on actions."""
 
 from typing import Any
 
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic.base import IntrinsicReward
+from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import MLP, make_network, scaled
-from sb3_cure.networks.layers import full_precision
 
 
 class ICM(IntrinsicReward):
@@ -19,77 +16,50 @@ class ICM(IntrinsicReward):
     The forward model's own loss does not reach the features, which would make them easy to predict by making them
     constant (Burda et al., 2019, section 2.1).
 
-    :param observation_space: Space of the stored observations
-    :param action_space: Action space
-    :param features_dim: Size of the features
-    :param encoder: ``"shared"``: the features are the agent's latents, and the inverse model is one more source that
-        trains their encoder; ``"own"``: they come from a network of the reward's own
+    :param args: As of ``IntrinsicReward``
+    :param encoder: ``"shared"``: the features are the agent's latents, and the inverse model trains their encoder, too;
+        ``"own"``: they come from a network of the reward's own (of a dictionary one for each image)
     :param n_filters: Channels of its convolutions
     :param hidden_dim: Width of the models' hidden layer
     :raises ValueError: for another encoder
     """
 
-    reads: tuple[str, ...] = ("latents", "next_latents")
     trains_encoder = True
 
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_space: spaces.Box,
-        features_dim: int,
-        encoder: str = "shared",
-        n_filters: int = 16,
-        hidden_dim: int = 256,
-    ):
-        super().__init__(observation_space, action_space, features_dim)
+    def __init__(self, *args: Any, encoder: str = "shared", n_filters: int = 16, hidden_dim: int = 256):
+        super().__init__(*args)
         if encoder not in ("shared", "own"):
             raise ValueError(f"encoder is {encoder!r} in intrinsic_kwargs: choose 'shared' or 'own'.")
-        self.observation_space = observation_space
-        action_dim = get_action_dim(action_space)
+        features_dim, action_dim = self.features_dim, get_action_dim(self.action_space)
         self.forward_model = MLP([features_dim + action_dim, hidden_dim, features_dim])
         self.inverse_model = MLP([2 * features_dim, hidden_dim, action_dim])
         self.encoder: nn.Sequential | None = None
         if encoder == "own":
-            self.reads, self.trains_encoder, self.mixed_precision = (), False, True
-            self.encoder = make_network(observation_space, [hidden_dim, features_dim], n_filters)
+            self.trains_encoder = False
+            self.encoder = make_network(self.observation_space, [hidden_dim, features_dim], n_filters)
             self.norm = nn.LayerNorm(features_dim)
 
     @classmethod
-    def configured(cls, encoder: str = "shared", **kwargs: Any) -> type[IntrinsicReward]:
-        """
-        :param encoder: As of the constructor
-        :param kwargs: Its other arguments
-        :return: This class, or one that does not train the agent's encoder
-        """
-        return cls if encoder == "shared" else OwnEncoder
+    def is_per_image(cls, encoder: str = "shared", **kwargs: Any) -> bool:
+        """Return whether the features come from an image."""
+        return encoder == "own"
 
-    def loss(
-        self, batch: Samples, latents: th.Tensor | None, next_latents: th.Tensor | None, srl_error: th.Tensor | None
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :param batch: Its actions are what the inverse model is to tell, in [-1, 1]
-        :param latents: [B, features_dim], or None with an encoder of its own
-        :param next_latents: The same
-        :param srl_error: Unused
+    def loss(self, inputs: RewardInputs) -> tuple[th.Tensor, th.Tensor]:
+        """Predict the action from the features before and after it, and the next features from the action.
+
+        :param inputs: Its latents (or observations, with an encoder of the reward's own) and actions are read
         :return: Mean squared errors of both models, and the forward model's of each sample, [B]
         """
-        if self.encoder is not None:
-            latents, next_latents = self._encode(batch.observations), self._encode(batch.next_observations)
-        assert latents is not None and next_latents is not None
-        told = self.inverse_model(th.cat([latents, next_latents], dim=1))
-        expected = self.forward_model(th.cat([latents.detach(), batch.actions], dim=1))
-        with full_precision(latents):
-            error = (expected - next_latents.detach()).square().mean(dim=1)
-            return (told - batch.actions).square().mean() + error.mean(), error.detach()
+        batch = inputs.batch
+        if self.encoder is None:
+            features, next_features = inputs.latents, inputs.next_latents
+        else:
+            features, next_features = self._encode(batch.observations), self._encode(batch.next_observations)
+        actions = self.inverse_model(th.cat([features, next_features], dim=1))
+        predicted = self.forward_model(th.cat([features.detach(), batch.actions], dim=1))
+        error = (predicted - next_features.detach()).square().mean(dim=1)
+        return (actions - batch.actions).square().mean() + error.mean(), error.detach()
 
     def _encode(self, observations: th.Tensor) -> th.Tensor:
-        features = self.encoder(scaled(observations, self.observation_space))  # type: ignore[misc]
-        with full_precision(features):
-            return self.norm(features)  # type: ignore[no-any-return]
-
-
-class OwnEncoder(ICM):
-    """With an encoder of the reward's own there is one for each image, and the agent's is left alone."""
-
-    per_image = True
-    trains_encoder = False
+        assert self.encoder is not None
+        return self.norm(self.encoder(scaled(observations, self.observation_space)))  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Intrinsic rewards by name: each has a line here."""
+"""Names of the intrinsic rewards, one line each."""
 
 from sb3_cure.intrinsic.base import IntrinsicReward
 from sb3_cure.intrinsic.disagreement import Disagreement
@@ -21,7 +21,8 @@ INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
 
 
 def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[IntrinsicReward]:
-    """
+    """Return the class of an intrinsic reward.
+
     :param intrinsic: Name of a built-in reward, or a subclass of ``IntrinsicReward``
     :return: The class
     :raises ValueError: if it is neither

@@ -1,4 +1,4 @@
-"""What intrinsic rewards are made of: how they see observations, and their networks."""
+"""Networks of intrinsic rewards, and how they see observations."""
 
 import itertools
 import math
@@ -9,15 +9,16 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from torch import nn
 
-from sb3_cure.networks.layers import FlattenImage, FullPrecision, preprocess
+from sb3_cure.networks.layers import FlattenImage, preprocess
 
-#: Variance of uniform noise within a step of 1/32, the dither of 5-bit images (SAC-AE), where pixels are in [0, 1]: how
-#: little a pixel must vary to count as constant
+#: Variance of uniform noise within a step of 1/32, the dither of 5-bit images (SAC-AE), for pixels in [0, 1]: pixels
+#: that vary less count as constant
 DITHER = 8.1e-5
 
 
 def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
-    """
+    """Scale stored observations for a network of ``make_network``.
+
     :param observations: As stored, [B, *shape]
     :param space: Their space
     :return: Images in [-0.5, 0.5] in NHWC memory order, [B, C, H, W]; anything else as a vector, [B, n]
@@ -27,8 +28,25 @@ def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
     return preprocess(observations, space).flatten(1)
 
 
-class MLP(FullPrecision):
-    """Linear maps with ReLUs in between, in fp32, whatever convolutions before them compute in.
+class Convolution(nn.Conv2d):
+    """torch's convolution, which casts its inputs and weights to ``compute_dtype``."""
+
+    #: Number format of the convolution, float32 or bfloat16; weights stay float32
+    compute_dtype: th.dtype = th.float32
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """Convolve images.
+
+        :param images: [B, in_channels, H, W]
+        :return: [B, out_channels, H', W']
+        """
+        assert self.bias is not None
+        images, weight, bias = (each.to(self.compute_dtype) for each in (images, self.weight, self.bias))
+        return self._conv_forward(images, weight, bias)
+
+
+class MLP(nn.Sequential):
+    """Linear maps with ReLUs in between, in fp32.
 
     :param sizes: Of the input, the hidden layers and the output
     """
@@ -39,7 +57,8 @@ class MLP(FullPrecision):
         init(self)
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
+        """Run the layers.
+
         :param inputs: [B, n]
         :return: fp32, [B, m]
         """
@@ -47,12 +66,12 @@ class MLP(FullPrecision):
 
 
 def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16, n_layers: int = 3) -> nn.Sequential:
-    """A network of what ``scaled`` returns: convolutions of stride 2 if these are images, then ``MLP``.
+    """Make a network for inputs as ``scaled`` returns them: convolutions of stride 2 (images), then an ``MLP``.
 
     :param space: Space of the observations
     :param sizes: Of the hidden layers and the output
     :param n_filters: Channels of the convolutions
-    :param n_layers: How many there are
+    :param n_layers: Number of convolutions
     :return: The network
     """
     if not is_image_space(space, check_channels=False):
@@ -60,7 +79,7 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16,
     channels, *size = space.shape  # type: ignore[misc]
     layers: list[nn.Module] = []
     for _ in range(n_layers):
-        layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
+        layers += [Convolution(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
         channels, size = n_filters, [(side + 1) // 2 for side in size]
     network = init(nn.Sequential(*layers, FlattenImage()))
     network.append(MLP([n_filters * math.prod(size), *sizes]))
@@ -68,10 +87,12 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16,
 
 
 def init(network: nn.Sequential) -> nn.Sequential:
-    """Orthogonal weights of gain sqrt(2), as in RND's code: all taps of a kernel count, unlike with ``init_weights``.
+    """Initialise layers in place: orthogonal weights of gain sqrt(2), as in RND's code, and biases of 0.
 
-    :param network: Its layers are initialised in place, biases become 0
-    :return: The same
+    Unlike with ``init_weights`` all taps of a kernel count.
+
+    :param network: Linear maps and convolutions
+    :return: The same network
     """
     for layer in network:
         if isinstance(layer, nn.Linear | nn.Conv2d):

@@ -32,7 +32,7 @@ def buffer_state(buffer: ReplayBuffer, frames: bool = True, leave_out: tuple[str
     """
     n_rows = buffer.buffer_size if buffer.full else buffer.pos
     state = {"class": type(buffer).__name__, "size": buffer.buffer_size, "n_envs": buffer.n_envs}
-    counters = {"pos": int(buffer.pos), "full": bool(buffer.full)}
+    counters = {"pos": int(buffer.pos), "full": bool(buffer.full), "n_added": int(getattr(buffer, "n_added", 0))}
     if isinstance(buffer, FrameStackReplayBuffer):
         rows = [name for name in buffer._ROW_ARRAYS if name not in leave_out]
         arrays = {name: getattr(buffer, name)[:n_rows] for name in rows} | {"_tails": buffer._tails}
@@ -93,7 +93,8 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
 def _restore(buffer: Any, state: dict[str, Any], name: str, leave_out: tuple[str, ...] = ()) -> None:
     """Put counters and arrays into a new buffer, and into those that it is made of."""
     counters, images, given_images = state["counters"], getattr(buffer, "images", {}), state.get("images", {})
-    vars(buffer).update({key: type(vars(buffer)[key])(value) for key, value in counters.items()})
+    kinds = {"n_added": int, **{key: type(value) for key, value in vars(buffer).items()}}
+    vars(buffer).update({key: kinds[key](value) for key, value in counters.items()})
     if images.keys() != given_images.keys():
         raise ArchiveError(f"{name} has other images than this model: load the replay buffer of the same environment.")
     for key, image in images.items():

@@ -25,7 +25,8 @@ SRL_HEADS: dict[str, type[SRLHead]] = {
 
 
 def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
-    """
+    """Return the class of an SRL head.
+
     :param srl: Name of a built-in head, or a subclass of ``SRLHead``
     :return: The class
     :raises ValueError: if it is neither
@@ -34,7 +35,7 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
         return SRL_HEADS[srl]
     if inspect.isclass(srl) and issubclass(srl, SRLHead):
         return srl
-    # A module's own description takes many lines.
+    # A module's own repr takes many lines.
     given = f"an instance of {type(srl).__name__}" if isinstance(srl, SRLHead) else repr(srl)
     raise ValueError(
         f"srl is {given}, but it must be one of {', '.join(map(repr, SRL_HEADS))}, None, or a subclass of "

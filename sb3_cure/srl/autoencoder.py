@@ -17,20 +17,19 @@ from sb3_cure.srl.base import SRLHead, SRLOutput
 class RAE(SRLHead):
     """Regularised autoencoder: squared reconstruction error + latent penalty + weight decay of the decoder.
 
-    The paper's eq. 2 gives the log-likelihood a plus sign; what is meant, and done here, is to *minimise*
-    the squared error. Images are reduced to 5 bits and dithered with uniform noise, as in SAC-AE (after Glow).
+    The paper's eq. 2 gives the log-likelihood a plus sign; here the squared error is *minimised*. Images are reduced to
+    5 bits and dithered with uniform noise, as in SAC-AE (after Glow).
 
-    Of shifted or cropped views the decoder draws the centred one, so that latents need not hold the shift.
+    The decoder draws the centred view, so that latents need not hold the shift or the crop.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images, or anything that SB3 can flatten
     :param latent_penalty: lambda_z, on half the squared norm of the latents
     :param decoder_weight_decay: lambda_theta, applied by the decoder's optimiser
-    :param bits: Bits that are left of each pixel's 8
+    :param bits: Bits that are kept of each pixel's 8
     """
 
     warmup_updates = 1000
-    mixed_precision = True
 
     def __init__(
         self,
@@ -52,7 +51,7 @@ class RAE(SRLHead):
             self.decoder = PixelDecoder(
                 encoder.features_dim,
                 encoder.view_space.shape,  # type: ignore[arg-type]
-                # Not every features extractor has these; SAC-AE's own sizes otherwise.
+                # SAC-AE's sizes for features extractors that do not have these
                 getattr(encoder, "n_filters", 32),
                 getattr(encoder, "n_layers", 4),
             )
@@ -60,7 +59,7 @@ class RAE(SRLHead):
             self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(encoder.view_space))
 
     def target(self, views: th.Tensor, dither: bool) -> th.Tensor:
-        """What the decoder is to draw.
+        """Compute the decoder's target.
 
         :param views: Centred views, [B, *view shape], images in 0-255
         :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
@@ -79,7 +78,7 @@ class RAE(SRLHead):
         return levels.float().add_(middle).div_(256 * 2**self.bits)
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """Eq. 2 of the paper; the weight decay of the decoder is applied by its optimiser.
+        """Compute eq. 2 of the paper; the optimizer applies the decoder's weight decay.
 
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
@@ -91,7 +90,7 @@ class RAE(SRLHead):
         return SRLOutput(error.mean() + self.latent_penalty * penalty, error.detach())
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """Mean squared error per observation against the target without noise.
+        """Compute the mean squared error of each observation, against the target without noise.
 
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
@@ -104,7 +103,8 @@ class RAE(SRLHead):
         return squared_error(self.decoder, latents, centred, partial(self.target, dither=dither))
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
-        """
+        """Draw views from latents.
+
         :param latents: [B, features_dim]
         :return: Images in 0-255 (uint8), [B, C, H, W]; vectors as decoded, [B, out_dim]
         """

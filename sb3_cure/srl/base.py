@@ -13,10 +13,10 @@ from sb3_cure.networks.layers import preprocess
 
 
 class SRLOutput(NamedTuple):
-    """What a head says of a batch.
+    """Loss and errors of a batch.
 
     :param loss: Scalar to minimise; its gradient reaches the head and, through the latents, the encoder
-    :param error: SRL error of each sample, [B], detached, finite, >= 0: the raw material of the paper's curious reward
+    :param error: SRL error of each sample, [B], detached, finite, >= 0: the paper's curious reward
     """
 
     loss: th.Tensor
@@ -26,10 +26,10 @@ class SRLOutput(NamedTuple):
 class SRLHead(nn.Module):
     """Base class of SRL heads. Subclass it, implement ``loss``, and pass the class: ``CuReSAC(..., srl=MyHead)``.
 
-    A head owns its parameters (trained by its loss alone) but not the encoder, whose latents it is given.
+    A head owns its parameters (trained by its loss alone) but not the encoder, whose latents it gets.
 
     :param encoder: The shared encoder; read ``encoder.features_dim`` and ``encoder.view_space``. Only the latents that
-        ``loss`` is given carry its gradient to the encoder; what else is encoded with it counts as constant
+        ``loss`` gets carry its gradient to the encoder; anything else encoded with it counts as constant
     :param observation_space: Space of the stored observations
     """
 
@@ -37,28 +37,25 @@ class SRLHead(nn.Module):
     warmup_updates: ClassVar[int] = 0
     #: Whether ``loss`` gets the latents of the next observations, with their gradient, as a third argument
     needs_next_latents: ClassVar[bool] = False
-    #: Whether the error is one of the transition (s, a, s'), whatever ``curiosity_target`` says. Such a head's
-    #: constructor gets the action space, too, as ``action_space=``
+    #: Whether the error is one of the transition (s, a, s'), whatever ``curiosity_target`` is. The constructor gets the
+    #: action space, too, as ``action_space=``
     models_transitions: ClassVar[bool] = False
-    #: Whether ``loss`` runs under autocast where the agent computes in bf16. A head that says so computes its error in
-    #: fp32 (``layers.full_precision``): of bf16's eight bits little would be left once it is standardised
-    mixed_precision: ClassVar[bool] = False
-    #: Optimiser of the head's own parameters, set by the policy; None if it has none
+    #: Optimizer of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
-    #: Extra arguments (but the learning rate) of the optimiser of the head's own parameters, e.g. weight decay
+    #: Extra arguments (but the learning rate) of the optimizer of the head's own parameters, e.g. weight decay
     optimizer_kwargs: dict[str, Any]
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space):
         super().__init__()
         self.observation_space = observation_space
         self.optimizer_kwargs = {}
-        # In tuples, so that the encoders are not registered as parts of the head: it does not train or save them.
+        # In tuples, so that the encoders are not registered as submodules: the head does not train or save them.
         self._encoder = (encoder,)
         self.bind(encoder, Augmentation(observation_space))
 
     @classmethod
     def choose_augmentation(cls, observation_space: spaces.Space) -> str | None:
-        """What ``augmentation="auto"`` means with this head.
+        """Choose the augmentation for ``augmentation="auto"``.
 
         :param observation_space: Space of the stored observations
         :return: ``"shift"``, ``"crop"`` or None
@@ -67,11 +64,11 @@ class SRLHead(nn.Module):
 
     @classmethod
     def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
-        """What this head wants of the encoder, asked before the encoder exists.
+        """Return the encoder's default arguments with this head.
 
-        :param augmentation: What the encoder will see
+        :param augmentation: Makes the views that the encoder will see
         :param srl_kwargs: The head's arguments
-        :return: Default arguments of ``PixelEncoder`` or ``VectorEncoder``
+        :return: Arguments of ``PixelEncoder`` or ``VectorEncoder``
         """
         return {}
 
@@ -86,7 +83,7 @@ class SRLHead(nn.Module):
         return self._target_encoder[0]
 
     def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:
-        """Called once by the policy.
+        """Set target encoder and augmentation; called once by the policy.
 
         :param target_encoder: The moving average of the encoder
         :param augmentation: The policy's
@@ -96,17 +93,18 @@ class SRLHead(nn.Module):
         self.augment = augmentation
 
     def preprocess(self, views: th.Tensor) -> th.Tensor:
-        """
+        """Scale views as the encoder's input.
+
         :param views: Views of observations, [B, *view shape], images in 0-255
         :return: The encoder's input: images in [0, 1]
         """
         return preprocess(views, self.encoder.view_space)
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """The training loss. It may be noisy and may use the other samples of the batch.
+        """Compute the training loss, which may be noisy and may use the other samples of the batch.
 
-        Where the head does not learn (in phases of RL, or frozen) its error alone is asked for, without gradients:
-        statistics move only ``if th.is_grad_enabled()``.
+        Without gradients, only the error is needed (in phases of RL, for a frozen head, for the next observations):
+        update statistics only ``if th.is_grad_enabled()``.
 
         :param batch: Samples of the replay buffer; ``batch.views`` is what the encoder saw
         :param latents: The encoder's output for ``batch.views``, fp32, [B, encoder.features_dim]
@@ -116,10 +114,10 @@ class SRLHead(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} must implement loss(batch, latents) -> SRLOutput")
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """The noise-free error, for measuring and plotting; by default that of ``loss``, of centred views.
+        """Compute the noise-free error, for measuring and plotting; by default that of ``loss``.
 
-        Policies are measured in batches of any size: a loss that reads other samples of its batch needs an error of
-        its own, which does not, or measures them by how the batch was cut.
+        Policies are measured in batches of any size: a loss that reads other samples of its batch needs an ``error``
+        that does not.
 
         :param batch: Samples of the replay buffer; ``batch.views`` are the centred ones
         :param latents: The encoder's output for ``batch.views``, [B, encoder.features_dim]
@@ -128,14 +126,15 @@ class SRLHead(nn.Module):
         if not self.needs_next_latents:
             return self.loss(batch, latents).error
         next_views = self.augment.center(batch.next_observations)
-        return self.loss(batch, latents, self.encoder(self.preprocess(next_views)).float()).error
+        return self.loss(batch, latents, self.encoder(self.preprocess(next_views))).error
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
-        """
+        """Draw views from latents.
+
         :param latents: [B, encoder.features_dim]
         :return: Views [B, *view shape] (images in 0-255), or None if the head does not decode
         """
         return None
 
     def after_step(self) -> None:
-        """Called after each update in which the head learned: the place of moving averages of its own."""
+        """Update moving averages; called after each step of the head."""

@@ -11,30 +11,27 @@ from torch.nn import functional as F
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
-#: Side of CURL's crops, pixels, which decides whether ``augmentation="auto"`` crops or shifts
-CROP_SIZE = 84
+#: Largest image, in pixels, that ``augmentation="auto"`` shifts; larger ones are cropped
+LARGEST_SHIFTED = 84
 
 
 class CURL(SRLHead):
     """InfoNCE: two augmentations of one observation attract each other, those of the rest of the batch repel.
 
     The similarity is bilinear, q^T W k; keys come from the momentum encoder. (In the paper's eq. 3 the negatives
-    lack an exp and the sign is that of a likelihood; what is meant, and done here, is cross-entropy on the diagonal.)
-    With ``augmentation="auto"`` observations larger than 84 pixels are cropped, as in CURL, and latents have no tanh;
-    others are shifted, as in DrQ.
+    lack an exp and the sign is that of a likelihood; here it is cross-entropy on the diagonal.)
+    With ``augmentation="auto"`` images of more than 84 pixels per side are cropped in CURL's proportion (84 of 100),
+    and latents have no tanh; others are shifted, as in DrQ.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images
     :param bank_size: How many stored observations serve as fixed negatives in ``error``
-    :param error: What the SRL error is: ``"infonce"``, the loss of each anchor, which is high where others of the batch
-        look alike; ``"positive"``, the mean squared difference between the latents of the two views alone
-    :raises ValueError: if observations are no images, or for another error
+    :param error: The SRL error: ``"infonce"``, the loss of each anchor, which is high where others of the batch look
+        alike; ``"positive"``, the mean squared difference between the latents of the two views alone
+    :raises ValueError: for another error
     """
-
-    mixed_precision = True
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64, error: str = "infonce"):
         super().__init__(encoder, observation_space)
@@ -43,11 +40,11 @@ class CURL(SRLHead):
         self.positive = error == "positive"
         # CURL starts W uniform in [0, 1).
         self.W = nn.Parameter(th.rand(encoder.features_dim, encoder.features_dim))
-        # The first observations of training, kept as the negatives of `error`: within a batch they would change with
-        # the batch, and a batch of one has none.
+        # Negatives of `error`, the first observations of training: negatives from the batch would change with it, and a
+        # batch of one has none.
         self.register_buffer("bank", th.zeros((bank_size, *observation_space.shape), dtype=th.uint8))  # type: ignore[misc]
         self.register_buffer("bank_filled", th.zeros((), dtype=th.long))
-        # The fill level as a Python number, which needs no device synchronisation; None: read it from the buffer.
+        # The fill level as a Python number, which needs no device synchronisation; None: read the buffer
         self._n_banked: int | None = None
         self.register_load_state_dict_post_hook(self._forget_fill_level)
 
@@ -57,22 +54,24 @@ class CURL(SRLHead):
 
     @classmethod
     def choose_augmentation(cls, observation_space: spaces.Space) -> str:
-        """
+        """Choose crops for large images and shifts for small ones.
+
         :param observation_space: Space of the stored observations
-        :return: ``"crop"`` for images of more than 84 pixels, else ``"shift"``
-        :raises ValueError: if observations are no images, of which there are no two views
+        :return: ``"crop"`` for images of more than 84 pixels per side, else ``"shift"``
+        :raises ValueError: if observations are not images
         """
         if not is_image_space(observation_space):
             raise ValueError(
                 f"srl='curl' compares two views of one image, but observations are {observation_space}: use srl='rae', "
                 "or a head of your own."
             )
-        return "crop" if min(observation_space.shape[1:]) > CROP_SIZE else "shift"  # type: ignore[index]
+        return "crop" if min(observation_space.shape[1:]) > LARGEST_SHIFTED else "shift"  # type: ignore[index]
 
     @classmethod
     def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
-        """
-        :param augmentation: What the encoder will see
+        """Leave tanh out with crops.
+
+        :param augmentation: Makes the views that the encoder will see
         :param srl_kwargs: The head's arguments
         :return: Latents of crops without tanh, as in CURL's code
         :raises ValueError: if there is no augmentation
@@ -82,57 +81,54 @@ class CURL(SRLHead):
         return {"tanh": False} if isinstance(augmentation, RandomCrop) else {}
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """Eq. 3: cross-entropy of finding each anchor's own key among the keys of the batch.
+        """Compute eq. 3: cross-entropy of each anchor's own key among the keys of the batch.
 
         :param batch: Samples of the replay buffer
         :param latents: Anchors q, [B, features_dim]
         :param next_latents: Unused
         :return: Loss, and the cross-entropy (or the distance of the two views) of each anchor, [B]
         """
-        if th.is_grad_enabled():  # where it learns
+        if th.is_grad_enabled():  # the head learns
             self._fill_bank(batch.observations)
         keys = self._keys(self.augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
-        with full_precision(keys):
-            # Row maxima are subtracted inside cross_entropy.
-            error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
-            loss = error.mean()
-            if self.positive:
-                error = _distance(latents, keys)
+        # Row maxima are subtracted inside cross_entropy.
+        error = F.cross_entropy(latents @ self.W @ keys.T, labels, reduction="none")
+        loss = error.mean()
+        if self.positive:
+            error = _distance(latents, keys)
         return SRLOutput(loss, error.detach())
 
     @th.no_grad()
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """Cross-entropy of each anchor against its own key and the fixed bank, or its distance from its own key; crops
-        from a fixed seed.
+        """Compute each anchor's cross-entropy against its own key and the fixed bank, or its distance from its own key.
 
-        Does not depend on the other samples of the batch. A head that has not been trained has an empty bank: the
-        error is then 0.
+        Views come from a fixed seed, and other samples of the batch do not matter. A head that has not been trained has
+        an empty bank: its error is 0.
 
         :param batch: Samples of the replay buffer
         :param latents: Anchors q, [B, features_dim]
         :return: [B]
         """
-        # The same offset for all, drawn for them as one image of many channels: neither batch size nor order matters.
+        # The same offset for all, drawn as for one image of many channels: neither batch size nor order matters.
         views = self.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
         if self.positive:
             return _distance(latents, own)
         negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
-        with full_precision(own):
-            weighted = latents.float() @ self.W
-            logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
-            first = th.zeros(len(logits), dtype=th.long, device=logits.device)
-            # Rounding can leave less than 0, or a -0.0.
-            return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
+        weighted = latents @ self.W
+        logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
+        first = th.zeros(len(logits), dtype=th.long, device=logits.device)
+        # Rounding can leave less than 0, or a -0.0.
+        return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
 
     @th.no_grad()
     def set_bank(self, observations: th.Tensor) -> None:
-        """Choose the negatives of ``error``, which otherwise are the first observations of training.
+        """Set the negatives of ``error``, which otherwise are the first observations of training.
 
-        What the error says depends on them: observations score high that look like many of the bank. To compare
-        policies, take an even mix of what they see (``sb3_cure.evaluation.rollouts.even_negatives``).
+        Observations that look like many of the bank have a high error. To compare policies, take an even mix of what
+        they see (``sb3_cure.evaluation.rollouts.even_negatives``).
 
         :param observations: 1 to ``bank_size`` observations as stored, [n, *shape], 0-255
         :raises ValueError: if there are none, too many, or of another shape
@@ -147,7 +143,7 @@ class CURL(SRLHead):
 
     @th.no_grad()
     def _keys(self, views: th.Tensor) -> th.Tensor:
-        return self.target_encoder(self.preprocess(views)).float()
+        return self.target_encoder(self.preprocess(views))
 
     @th.no_grad()
     def _fill_bank(self, observations: th.Tensor) -> None:
@@ -159,11 +155,11 @@ class CURL(SRLHead):
             self._write_bank(self._n_banked, observations[:room])
 
     def _write_bank(self, start: int, observations: th.Tensor) -> None:
-        """Store observations from this place on, and forget what lies behind them."""
+        """Store observations from this place on, and drop those behind them."""
         self._n_banked = start + len(observations)
         self.bank[start : self._n_banked] = observations  # type: ignore[index, operator]
         self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
 
 
 def _distance(latents: th.Tensor, keys: th.Tensor) -> th.Tensor:
-    return (latents.float() - keys).square().mean(dim=1)
+    return (latents - keys).square().mean(dim=1)

@@ -16,7 +16,7 @@ from sb3_cure.srl.base import SRLHead, SRLOutput
 class DictHead(SRLHead):
     """A head of one class for each image of a dictionary, each on the latents of its own image.
 
-    Losses are added up: each encoder is trained as if its image were alone. The error is the mean over images, each
+    The loss is the sum: each encoder is trained as if its image were alone. The error is the mean over images, each
     divided by its running deviation.
 
     :param head_class: Class of the heads
@@ -26,14 +26,14 @@ class DictHead(SRLHead):
     :raises ValueError: if the encoder does not keep the images apart
     """
 
-    #: Of the images whose heads there are
+    #: Keys of the images
     keys: tuple[str, ...] = ()
 
     def __init__(self, head_class: type[SRLHead], encoder: Encoder, observation_space: spaces.Dict, **kwargs: Any):
         if not isinstance(encoder, DictEncoder):
             raise ValueError(
-                f"srl={head_class.__name__} learns from each image of a dictionary by itself, but the "
-                "features_extractor_class makes one vector of all: use DictEncoder, or srl=None."
+                f"srl={head_class.__name__} needs the latents of each image of a dictionary, but the "
+                "features_extractor_class joins them: use DictEncoder, or srl=None."
             )
         super().__init__(encoder, observation_space)
         self.heads = nn.ModuleList(
@@ -42,11 +42,11 @@ class DictHead(SRLHead):
         self.keys, self.slices = tuple(encoder.images), tuple(encoder.slices.values())
         self.mean_error = MeanError(len(self.keys))
         self.optimizer_kwargs = self.heads[0].optimizer_kwargs  # type: ignore[assignment]
-        for name in ("warmup_updates", "mixed_precision"):
-            setattr(self, name, getattr(head_class, name))
+        self.warmup_updates = head_class.warmup_updates  # type: ignore[misc]
 
     def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:
-        """
+        """Set target encoder and augmentation of each head.
+
         :param target_encoder: The moving average of the encoder
         :param augmentation: The policy's
         """
@@ -56,41 +56,45 @@ class DictHead(SRLHead):
             head.bind(images[key], augmentation.of(key))
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """
+        """Add the heads' losses up.
+
         :param batch: Samples of the replay buffer, observations by key
-        :param latents: Joined latents, [B, features_dim]
+        :param latents: Joint latents, [B, features_dim]
         :param next_latents: Unused
         :return: Sum of the losses, and the mean error of each sample, [B]
         """
         outputs = [head.loss(batch.of(key), part) for key, head, part in self.parts(latents)]
         error = self.mean_error([output.error for output in outputs], learns=th.is_grad_enabled())
-        return SRLOutput(th.stack([output.loss.float() for output in outputs]).sum(), error)
+        return SRLOutput(th.stack([output.loss for output in outputs]).sum(), error)
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """
+        """Average the heads' noise-free errors.
+
         :param batch: Samples of the replay buffer, observations by key
-        :param latents: Joined latents, [B, features_dim]
+        :param latents: Joint latents, [B, features_dim]
         :return: Mean of the noise-free errors, [B]
         """
         errors = [head.error(batch.of(key), part) for key, head, part in self.parts(latents)]
         return self.mean_error(errors, learns=False)
 
     def reconstruct(self, latents: th.Tensor) -> dict[str, th.Tensor] | None:  # type: ignore[override]
-        """
-        :param latents: Joined latents, [B, features_dim]
+        """Draw the views of each image.
+
+        :param latents: Joint latents, [B, features_dim]
         :return: Views by key, or None if the heads do not decode
         """
         drawn = {key: head.reconstruct(part) for key, head, part in self.parts(latents)}
         return None if None in drawn.values() else drawn
 
     def after_step(self) -> None:
-        """Called after each update in which the heads learned."""
+        """Update the moving averages of each head."""
         for head in heads_by_key(self).values():
             head.after_step()
 
     def parts(self, latents: th.Tensor) -> list[tuple[str, Any, th.Tensor]]:
-        """
-        :param latents: Joined latents, [B, features_dim]
+        """Split joint latents.
+
+        :param latents: Joint latents, [B, features_dim]
         :return: Key, head and latents of each image
         """
         parts = zip(self.keys, self.heads, self.slices, strict=True)
@@ -98,9 +102,10 @@ class DictHead(SRLHead):
 
 
 def heads_by_key(head: SRLHead | None) -> dict[str, Any]:
-    """
-    :param head: A policy's head
-    :return: What it is made of: the head of each image of a dictionary, or itself under the key ``""``
+    """Return a policy's heads.
+
+    :param head: A policy's head, or None
+    :return: The head of each image of a dictionary by key, or the head itself under the key ``""``
     """
     if isinstance(head, DictHead):
         return {key: head.heads[i] for i, key in enumerate(head.keys)}

@@ -7,52 +7,53 @@ from torch import nn
 
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision, init_weights
+from sb3_cure.networks.layers import init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
 class NextLatents(SRLHead):
-    """Base class of heads that predict the next latents, as the momentum encoder has them, from latents and action.
+    """Base class of heads that predict the momentum encoder's next latents from latents and action.
 
     Latents that are all alike would be the easiest to predict. Two things keep the encoder from this collapse: the
-    target has no gradient (Tang et al., 2023, say why that helps), and each of its numbers is standardised by mean and
-    variance of the batch, as by BYOL's batch normalisation. To guess the mean is then as bad for small latents as for
-    large ones. A subclass implements ``distance``, and may ``project`` the target, both in fp32.
+    target has no gradient (Tang et al., 2023, explain why that helps), and each of its entries is standardised by mean
+    and variance of the batch, as by BYOL's batch normalisation. Predicting the mean is then as bad for small latents as
+    for large ones. A subclass implements ``distance``, and may ``project`` the target.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations
     :param action_space: Action space
     """
 
-    mixed_precision = True
     models_transitions = True
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box):
         super().__init__(encoder, observation_space)
         #: Size of latents and action together
         self.n_inputs = encoder.features_dim + get_action_dim(action_space)
-        # Running statistics of the target, by which `error` standardises it: within a batch they would change with the
-        # batch.
+        # Running statistics of the target, for `error`: those of a batch would change with it
         self.register_buffer("mean", th.zeros(encoder.features_dim))
         self.register_buffer("variance", th.ones(encoder.features_dim))
 
     def project(self, latents: th.Tensor) -> th.Tensor:
-        """
+        """Compute the target of the prediction.
+
         :param latents: Of the next observations, by the momentum encoder, [B, features_dim]
-        :return: What of them is to be predicted, [B, features_dim]
+        :return: Target before it is standardised, [B, features_dim]; by default the latents
         """
         return latents
 
     def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
+        """Compute the error of each prediction.
+
         :param inputs: Latents and action, [B, n_inputs]
-        :param target: What is to be predicted, standardised, [B, features_dim]
+        :param target: Standardised target, [B, features_dim]
         :return: Error of each prediction, >= 0, [B]
         """
         raise NotImplementedError(f"{type(self).__name__} must implement distance(inputs, target)")
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """
+        """Predict the target of another view of the next observations.
+
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
         :param next_latents: Unused
@@ -63,7 +64,7 @@ class NextLatents(SRLHead):
 
     @th.no_grad()
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """The same of centred views, with the running statistics of the target.
+        """Compute the error for centred views, with the running statistics of the target.
 
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
@@ -73,14 +74,11 @@ class NextLatents(SRLHead):
 
     def _error(self, batch: Samples, latents: th.Tensor, next_views: th.Tensor, learns: bool) -> th.Tensor:
         with th.no_grad():
-            following = self.target_encoder(self.preprocess(next_views)).float()
-        with full_precision(latents):
-            with th.no_grad():
-                target = self._standardise(self.project(following), learns)
-            return self.distance(th.cat([latents, batch.actions], dim=1), target)
+            target = self._standardise(self.project(self.target_encoder(self.preprocess(next_views))), learns)
+        return self.distance(th.cat([latents, batch.actions], dim=1), target)
 
     def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:
-        """By the batch's statistics, which the running ones follow; or else by these."""
+        """Standardise by the batch's statistics, which update the running ones; or else by the running ones."""
         mean: th.Tensor = self.mean  # type: ignore[assignment]
         variance: th.Tensor = self.variance  # type: ignore[assignment]
         if learns:
@@ -107,16 +105,17 @@ class Forward(NextLatents):
         self.model = _mlp(self.n_inputs, hidden_dim, encoder.features_dim)
 
     def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
+        """Compute the mean squared error of each prediction.
+
         :param inputs: Latents and action, [B, n_inputs]
         :param target: The next latents, standardised, [B, features_dim]
-        :return: Mean squared error of each prediction: 1 is that of guessing the mean, [B]
+        :return: Errors; predicting the mean has 1, [B]
         """
         return (self.model(inputs) - target).square().mean(dim=1)
 
 
 class Inverse(SRLHead):
-    """Inverse model: predicts the executed action from the latents before and after it, both of which it trains.
+    """Inverse model: predicts the executed action from the latents before and after it, and trains both.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations
@@ -134,7 +133,8 @@ class Inverse(SRLHead):
         self.model = _mlp(2 * encoder.features_dim, hidden_dim, get_action_dim(action_space))
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """
+        """Predict the executed action.
+
         :param batch: Samples of the replay buffer
         :param latents: [B, features_dim]
         :param next_latents: Those of the next observations, [B, features_dim]
@@ -146,5 +146,5 @@ class Inverse(SRLHead):
 
 
 def _mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Module:
-    """One hidden layer."""
+    """Make an MLP with one hidden layer."""
     return init_weights(nn.Sequential(nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, n_outputs)))

@@ -14,13 +14,13 @@ from sb3_cure.srl.dynamics import NextLatents
 
 
 class SPR(NextLatents):
-    """Predicts a projection of the next latents by the momentum encoder, with cosine similarity.
+    """Predicts a projection of the momentum encoder's next latents, with cosine similarity.
 
     As in the paper, prediction and target are compared after a projection, and the prediction goes through a predictor
     after it; the target's projection is a moving average. There are three differences. K = 1, as the replay buffer
     gives single transitions (their Atari agents predict 5 steps). The transition model is an MLP, as latents are
-    vectors. The target is standardised (see ``NextLatents``), because where no critic kept them apart, all latents
-    became one vector within 100 updates. With ``augmentation="auto"`` images are shifted.
+    vectors. The target is standardised (see ``NextLatents``), because without critics all latents became one vector
+    within 100 updates. With ``augmentation="auto"`` images are shifted.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations
@@ -48,21 +48,23 @@ class SPR(NextLatents):
 
     @classmethod
     def choose_augmentation(cls, observation_space: spaces.Space) -> str | None:
-        """
+        """Choose shifts for images.
+
         :param observation_space: Space of the stored observations
         :return: ``"shift"`` for images, None for vectors
         """
         return "shift" if is_image_space(observation_space) else None
 
     def project(self, latents: th.Tensor) -> th.Tensor:
-        """
+        """Project latents by the moving average of the projection.
+
         :param latents: Of the next observations, by the momentum encoder, [B, features_dim]
-        :return: Their projection, by the moving average, [B, features_dim]
+        :return: Their projection, [B, features_dim]
         """
         return self.target_projection(latents)
 
     def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """Eq. 2 of the paper with K = 1, plus one.
+        """Compute eq. 2 of the paper with K = 1, plus one.
 
         :param inputs: Latents and action, [B, n_inputs]
         :param target: Projection of the next latents, standardised, [B, features_dim]
@@ -74,6 +76,6 @@ class SPR(NextLatents):
 
     @th.no_grad()
     def after_step(self) -> None:
-        """The target's projection follows the projection."""
+        """Update the moving average of the projection."""
         for target, online in zip(self.target_projection.parameters(), self.projection.parameters(), strict=True):
             target.lerp_(online, self.tau)

@@ -8,13 +8,12 @@ from torch import nn
 
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLOutput
 
 
 class VAE(RAE):
-    """The autoencoder of ``RAE``, drawing from noisy latents, which a Kullback-Leibler divergence keeps near N(0, 1).
+    """``RAE`` with noisy latents, which a Kullback-Leibler divergence keeps near N(0, 1).
 
     The posterior is N(z, diag(sigma(z)^2)): its mean is the encoder's latents, which actors and critics read without
     noise, and sigma is a linear map of them that the head owns. Loss: mean squared error per pixel + ``beta`` KL. The
@@ -31,21 +30,20 @@ class VAE(RAE):
         super().__init__(encoder, observation_space, latent_penalty=0.0, **kwargs)
         self.beta = beta
         self.log_variance = nn.Linear(encoder.features_dim, encoder.features_dim)
-        # Begins as a constant. With N(0, 1)'s own variance latents of (-1, 1) would drown in the noise at first.
+        # Constant at first; with the variance of N(0, 1), latents in (-1, 1) would drown in noise.
         nn.init.zeros_(self.log_variance.weight)
         nn.init.constant_(self.log_variance.bias, -2.0)
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        """Negative evidence bound (Kingma and Welling, eq. 7 and appendix B), its terms weighed by ``beta``.
+        """Compute the negative evidence bound (Kingma and Welling, eq. 7 and appendix B) with weight ``beta``.
 
         :param batch: Samples of the replay buffer
         :param latents: Means of the posterior, [B, features_dim]
         :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, drawn from its noisy latents, [B]
         """
-        with full_precision(latents):
-            log_variance = self.log_variance(latents)
-            divergence = 0.5 * (latents.square() + log_variance.exp() - log_variance - 1).sum(dim=1)
-            sampled = latents + (0.5 * log_variance).exp() * th.randn_like(latents)
+        log_variance = self.log_variance(latents)
+        divergence = 0.5 * (latents.square() + log_variance.exp() - log_variance - 1).sum(dim=1)
+        sampled = latents + (0.5 * log_variance).exp() * th.randn_like(latents)
         drawn = super().loss(batch, sampled)
         return SRLOutput(drawn.loss + self.beta * divergence.mean(), drawn.error)
