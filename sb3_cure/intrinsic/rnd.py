@@ -8,7 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
-from sb3_cure.data.buffers import unmarked
+from sb3_cure.data.buffers import stored_places
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import DITHER, make_network, scaled
 
@@ -82,7 +82,7 @@ class RND(IntrinsicReward):
             self._is_measured = bool(self.measured)
         if self._is_measured:
             return
-        rows, env_inds, _ = unmarked(inputs.replay_buffer)
+        rows, env_inds, _ = stored_places(inputs.replay_buffer)
         chosen = np.linspace(0, len(rows) - 1, min(len(rows), OBSERVATIONS)).astype(int)
         total = squares = th.zeros_like(self.mean, dtype=th.float64)
         for part in np.split(chosen, range(CHUNK, len(chosen), CHUNK)):

@@ -16,7 +16,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import why_not_restorable
 from sb3_cure.persistence.files import flush_to_disk
@@ -25,8 +25,6 @@ from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state,
 from sb3_cure.persistence.resume import Run, log_files, training_state
 
 MODEL, STATE, BUFFER = "model.zip", "state.safetensors", "replay_buffer.safetensors"
-#: Bytes of frames that are written at once
-CHUNK = 2**22
 
 
 class CheckpointWriter:
@@ -39,8 +37,8 @@ class CheckpointWriter:
         self.generations = Generations(path)
         # Of each ring of frames, its files: name, numbers of the first frame and after the last one, and checksum
         self._segments: dict[str, list[tuple[str, int, int, str]]] = {}
-        # Whose frames they hold
-        self._frame_numbers: dict[str, object] = {}
+        # The rings that they hold the frames of
+        self._rings: dict[str, FrameRing] = {}
 
     def continue_from(self, generation: Generation, state: dict[str, Any], buffer: ReplayBuffer | None) -> None:
         """
@@ -49,9 +47,9 @@ class CheckpointWriter:
         :param buffer: The model's replay buffer
         """
         for key, ring in rings_of(buffer).items():
-            segments = _ring_state(state["buffer"], key)["segments"]
+            segments = state["segments"][key]
             self._segments[key] = [(*segment, generation.sums[f"../segments/{segment[0]}"]) for segment in segments]
-            self._frame_numbers[key] = ring.frame_numbers
+            self._rings[key] = ring
 
     def write(
         self, model: OffPolicyAlgorithm, run: Run, keep: int, environments_may_be_gone: bool = False
@@ -74,8 +72,8 @@ class CheckpointWriter:
             if rings:
                 state["buffer"] = buffer_state(buffer, frames=False)
                 for place, (key, ring) in enumerate(rings.items()):
-                    segments[key] = self._write_frames(ring, number, key, place)
-                    _ring_state(state["buffer"], key)["segments"] = [list(segment[:3]) for segment in segments[key]]
+                    segments[key] = self._write_frames(ring, buffer.counts[key], number, key, place)
+                state["segments"] = {key: [list(segment[:3]) for segment in each] for key, each in segments.items()}
             else:
                 model.save_replay_buffer(folder / BUFFER)
             for i, output in enumerate(log_files(model.logger)):
@@ -85,15 +83,15 @@ class CheckpointWriter:
 
         generation = self.generations.write(fill, keep)
         self._segments = segments
-        self._frame_numbers = {key: ring.frame_numbers for key, ring in rings.items()}
+        self._rings = rings
         return generation
 
     def _write_frames(
-        self, buffer: FrameStackReplayBuffer, number: int, key: str, place: int
+        self, ring: FrameRing, last: int, number: int, key: str, place: int
     ) -> list[tuple[str, int, int, str]]:
         """Only those frames that no segment has; segments that the ring has overwritten are left out."""
-        oldest, last = max(buffer._n_frames - buffer.frame_capacity, 0), buffer._n_frames
-        known = self._segments[key] if self._frame_numbers.get(key) is buffer.frame_numbers else []
+        oldest = max(last - ring.capacity, 0)
+        known = self._segments[key] if self._rings.get(key) is ring else []
         segments = [segment for segment in known if segment[2] > oldest]
         first = max(segments[-1][2] if segments else 0, oldest)
         if first < last:
@@ -101,36 +99,20 @@ class CheckpointWriter:
             path = self.generations.segments / f"frames-{which}{first}-{last}-{number:06d}.bin"
             digest = hashlib.sha256()
             with path.open("wb") as file:
-                for run in _runs_of_frames(buffer, first, last):
-                    digest.update(run)
-                    file.write(run)
+                for piece in ring.pieces(first, last):
+                    digest.update(piece)
+                    file.write(piece)
             flush_to_disk(path)
             segments.append((path.name, first, last, digest.hexdigest()))
         return segments
 
 
-def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameStackReplayBuffer]:
+def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameRing]:
     """
     :param buffer: A replay buffer
-    :return: The rings of frames in it, by the key of their image, or the buffer itself as ``""``
+    :return: The rings of frames in it, by the key of their image
     """
-    if isinstance(buffer, FrameStackReplayBuffer):
-        return {"": buffer}
-    return buffer.images if isinstance(buffer, DictFrameStackReplayBuffer) else {}
-
-
-def _ring_state(state: dict[str, Any], key: str) -> dict[str, Any]:
-    return state["images"][key] if "images" in state else state
-
-
-def _runs_of_frames(buffer: FrameStackReplayBuffer, first: int, last: int) -> Iterator[memoryview]:
-    """Memory of the frames ``first`` to ``last`` in the ring, in pieces."""
-    at_once = max(CHUNK // int(np.prod(buffer.frame_shape)), 1)
-    while first < last:
-        start = first % buffer.frame_capacity
-        count = min(last - first, buffer.frame_capacity - start, at_once)
-        yield buffer.frames[start : start + count].reshape(-1).data
-        first += count
+    return buffer.rings if isinstance(buffer, FrameStackReplayBuffer) else {}
 
 
 def load_checkpoint(model: Any, generation: Generation, lost: list[Path]) -> dict[str, Any]:
@@ -152,39 +134,41 @@ def load_checkpoint(model: Any, generation: Generation, lost: list[Path]) -> dic
     if "buffer" not in state:
         model.load_replay_buffer(folder / BUFFER, truncate_last_traj=False)
         return state
-    if model.replay_buffer_class not in (FrameStackReplayBuffer, DictFrameStackReplayBuffer):
+    if model.replay_buffer_class is not FrameStackReplayBuffer:
         raise CheckpointError(
             f"the checkpoint {folder} has single frames, but this model's replay buffer is a "
             f"{type(model.replay_buffer).__name__}: resume with environments that tell the same frame_stack."
         )
-    model.replay_buffer = buffer = buffer_from_state(model, state["buffer"], str(folder))
+    buffer: Any = buffer_from_state(model, state["buffer"], str(folder))
+    model.replay_buffer = buffer
     lost_names = {path.name for path in lost}
     for key, ring in rings_of(buffer).items():
-        for name, first, last in _ring_state(state["buffer"], key)["segments"]:
+        for name, first, last in state["segments"][key]:
             if name in lost_names:
-                _forget_frames_before(ring, last)
+                _forget_frames_before(buffer, key, last)
                 continue
             if f"../segments/{name}" not in generation.sums:
                 raise CheckpointError(f"{folder} lacks the checksum of {name}")
-            kept = max(first, ring._n_frames - ring.frame_capacity)
+            kept = max(first, buffer.counts[key] - ring.capacity)
             with (folder.parent / "segments" / name).open("rb") as file:
                 file.seek((kept - first) * int(np.prod(ring.frame_shape)))
-                for run in _runs_of_frames(ring, kept, last):
-                    file.readinto(run)
+                for piece in ring.pieces(kept, last):
+                    file.readinto(piece)
     return state
 
 
-def _forget_frames_before(buffer: FrameStackReplayBuffer, number: int) -> None:
+def _forget_frames_before(buffer: FrameStackReplayBuffer, key: str, number: int) -> None:
     """Give up the rows that need older frames; frame numbers never fall from row to row."""
     newest_first = (buffer.pos - 1 - np.arange(buffer._n_valid)) % buffer.buffer_size
-    kept = int((buffer.oldest_frame[newest_first] >= number).sum())
+    ring, count = buffer.rings[key], buffer.counts[key]
+    oldest = count - 1 - (count - 1 - buffer.rows[f"slots/{key}"][newest_first, :, 0, 0]) % ring.capacity
+    kept = int((oldest.min(axis=1) >= number).sum())
     warnings.warn(
         f"{buffer._n_valid - kept} of {buffer._n_valid} rows of the replay buffer are lost with their frames: training "
         "goes on without them, and no longer exactly as without the interruption.",
         stacklevel=5,
     )
     buffer._n_valid = kept
-    buffer._tails[buffer._tails.min(axis=1) < number] = -buffer.frame_capacity
 
 
 def newest_usable(path: str | Path) -> tuple[Generation, list[Path]]:
