@@ -6,7 +6,7 @@ from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.data.buffers import frame_stack_of
+from sb3_cure.data.buffers import infer_frame_stack
 from sb3_cure.data.observations import by_key, image_spaces, rows_of
 from sb3_cure.data.samples import Samples
 
@@ -43,7 +43,7 @@ def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: in
     """
     keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
     if keeps and (model._n_updates - 1) % RECONSTRUCTION_INTERVAL < n_updates:
-        strips = reconstruction_strips(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
+        strips = reconstruction_strips(model.policy, batch, infer_frame_stack(model.get_env()))  # type: ignore[arg-type]
         for key, strip in strips.items():
             name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
             model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))
