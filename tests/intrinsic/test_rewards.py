@@ -11,7 +11,7 @@ import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
 from envs_for_tests import PixelBox, VectorBox, differences, samples_of, state_of, tiny_model
-from srl_for_tests import randomise
+from srl_for_tests import noise_images, randomise
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -452,13 +452,14 @@ def test_dictionary_rewards_read_their_own_image() -> None:
     model = sensor_model(intrinsic_kwargs=dict(per_pixel=True), learning_starts=100).learn(20)
     policy: Any = model.policy
     randomise(policy)
-    batch = policy.samples(model.replay_buffer.sample(8), random=False)  # type: ignore[union-attr]
+    sampled = policy.samples(model.replay_buffer.sample(8), random=False)  # type: ignore[union-attr]
+    images = {key: noise_images(model.observation_space[key]) for key in policy.srl.keys}  # type: ignore[index]
+    batch, latents = sampled._replace(observations={**sampled.observations, **images}), th.randn(8, 18)
     with th.no_grad():
-        latents = policy.encode(batch.observations)
         _, reward = reward_of(model).loss(inputs_of(model, batch, latents, latents))
         expected = []
         for key, head, part in policy.srl.parts(latents):
-            seen, drawn = batch.observations[key].float() / 255, head.reconstruct(part).float() / 255
+            seen, drawn = images[key].float() / 255, head.reconstruct(part).float() / 255
             error = ((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1)
             expected.append(error / error.std(correction=0))
     th.testing.assert_close(reward, sum(expected) / 2, rtol=1e-3, atol=1e-4)
