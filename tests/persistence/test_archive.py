@@ -40,7 +40,6 @@ from benchmarks.fuzz import (
 )
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.buffers import SkippingReplayBuffer
-from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, RewardInputs
 from sb3_cure.networks.encoders import VectorEncoder
 from sb3_cure.persistence import ArchiveError, Persistence
