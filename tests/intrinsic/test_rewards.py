@@ -316,8 +316,11 @@ def nearest_mean(own: th.Tensor, others: list[th.Tensor], k: int) -> float:
 @pytest.mark.parametrize("space", ["random", "latents"])
 @pytest.mark.parametrize("n_envs, size", [(1, 20), (2, 20), (2, 5)], ids=str)
 def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_envs: int, size: int) -> None:
-    """Over batch and memory (also one smaller than a batch), while the replay buffer overwrites its oldest rows, once
-    all of them between two updates, and where the stream breaks without an end, as in another ``learn()``."""
+    """Over batch and memory, also one smaller than a batch.
+
+    The replay buffer overwrites its oldest rows, once all of them between two updates, and its stream breaks without an
+    end, as in another ``learn()``.
+    """
     env = DummyVecEnv([lambda: VectorBox(episode_length=4)] * n_envs)
     kwargs = dict(space=space, n_neighbours=3, memory=size)
     arguments: dict[str, Any] = dict(intrinsic="particle", intrinsic_kwargs=kwargs, buffer_size=24 * n_envs)
