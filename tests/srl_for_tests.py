@@ -10,6 +10,7 @@ from gymnasium import spaces
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import Encoder, PixelEncoder
+from sb3_cure.networks.layers import preprocess
 from sb3_cure.srl import SRLHead
 
 
@@ -29,6 +30,11 @@ def batch_of(observations: th.Tensor, views: th.Tensor | None = None) -> Samples
     """A batch of which a head may read observations and views only."""
     rest: Any = None
     return Samples(observations, rest, rest, rest, rest, views=observations if views is None else views)
+
+
+def encode(encoder: Encoder, views: th.Tensor) -> th.Tensor:
+    """Latents of views, images in 0-255."""
+    return encoder(preprocess(views, encoder.view_space))
 
 
 def randomise(module: th.nn.Module, seed: int = 0) -> None:

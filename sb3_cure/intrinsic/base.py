@@ -17,7 +17,7 @@ class RewardInputs:
     """What an intrinsic reward may read in one update; latents are computed when they are first read.
 
     :param batch: The true transitions
-    :param srl_error: SRL error of each sample, before the head's step, detached, [B]; None without SRL
+    :param srl_error: SRL error of each sample, before the head's step, detached, [B]; None unless ``needs_srl``
     :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
     :param replay_buffer: The replay buffer, which has just drawn the batch
     :param look_up: Returns stored transitions by rows and environments, [n] each

@@ -60,8 +60,8 @@ def test_bad_value_is_named(name: str, value: Any) -> None:
 class FromNothing(IntrinsicReward):
     """Needs no SRL."""
 
-    def loss(self, batch: Any, latents: Any, next_latents: Any, srl_error: Any) -> Any:
-        return None, batch.rewards[:, 0].square()
+    def loss(self, inputs: Any) -> Any:
+        return None, inputs.batch.rewards[:, 0].square()
 
 
 @pytest.mark.parametrize(

@@ -35,9 +35,8 @@ PRODUCT = list(itertools.product(*FACTORS))
 def refusal(head: str | None, reward: str, sensors: str) -> str | None:
     """What the parts declare: a word of the sentence with which a cell is refused; None: it is legal."""
     intrinsic, arguments = REWARDS[reward]
-    if head is None:
-        needs = get_intrinsic_class(intrinsic).configured(**arguments).needs_srl
-        return "srl is None" if needs else None
+    if head is None:  # "shuffled" wraps the SRL error by default
+        return "srl is None" if intrinsic == "shuffled" or get_intrinsic_class(intrinsic).needs_srl else None
     head_class = get_srl_class(head)
     if head == "curl" and sensors == "vector":
         return "two views of one image"

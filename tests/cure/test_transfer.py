@@ -35,8 +35,8 @@ class Norms(RAE):
 class Constant(IntrinsicReward):
     """A reward without tensors."""
 
-    def loss(self, batch: Any, *_: Any) -> Any:
-        return None, th.ones(len(batch.actions))
+    def loss(self, inputs: Any) -> Any:
+        return None, th.ones(len(inputs.batch.actions))
 
 
 both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))

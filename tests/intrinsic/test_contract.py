@@ -1,32 +1,31 @@
-"""What a user's own intrinsic reward is given, and what is done with what it returns."""
+"""What an intrinsic reward may read, what is done with its results, and how rewards are built."""
 
 from typing import Any
 
 import pytest
 import torch as th
+from dictionaries_for_tests import sensor_model
 from envs_for_tests import VectorBox, tiny_model
-from stable_baselines3.common.torch_layers import NatureCNN
 from torch import nn
-from updates_for_tests import equal, filled_model, groups, moved, train_once
+from updates_for_tests import filled_model, groups, moved, train_once
 
-from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic import IntrinsicReward
-from sb3_cure.networks.encoders import Encoder
+from sb3_cure.intrinsic import IntrinsicReward, OwnGenerator, RewardInputs
+from sb3_cure.srl import RAE, SRLOutput
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
-Latents = th.Tensor | None
 
 
 class Forward(IntrinsicReward):
     """Prediction error of a model of the next observation: a reward with parameters of its own."""
 
-    def __init__(self, observation_space: Any, action_space: Any, features_dim: int):
-        super().__init__(observation_space, action_space, features_dim)
-        size = observation_space.shape[0]
-        self.model = nn.Linear(size + action_space.shape[0], size)
+    def __init__(self, *args: Any):
+        super().__init__(*args)
+        size = self.observation_space.shape[0]
+        self.model = nn.Linear(size + self.action_space.shape[0], size)
         self.rewards: list[th.Tensor] = []
 
-    def loss(self, batch: Samples, latents: Latents, next_latents: Latents, srl_error: Latents) -> Any:
+    def loss(self, inputs: RewardInputs) -> Any:
+        batch = inputs.batch
         drawn = self.model(th.cat([batch.observations, batch.actions], dim=1))
         error = (drawn - batch.next_observations).square().mean(dim=1)
         self.rewards.append(error.detach())
@@ -34,18 +33,15 @@ class Forward(IntrinsicReward):
 
 
 class LatentStep(IntrinsicReward):
-    """How far a step leads in the latents; keeps what it was given."""
+    """How far a step leads in the latents; keeps what it got."""
 
-    reads = ("latents", "next_latents")
+    def __init__(self, *args: Any):
+        super().__init__(*args)
+        self.given: list[RewardInputs] = []
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.given: list[tuple[Samples, th.Tensor, th.Tensor, Latents]] = []
-
-    def loss(self, batch: Samples, latents: Latents, next_latents: Latents, srl_error: Latents) -> Any:
-        assert latents is not None and next_latents is not None
-        self.given.append((batch, latents, next_latents, srl_error))
-        error = (latents - next_latents).square().sum(dim=1)
+    def loss(self, inputs: RewardInputs) -> Any:
+        self.given.append(inputs)
+        error = (inputs.latents - inputs.next_latents).square().sum(dim=1)
         return (error.mean() if self.trains_encoder else None), error.detach()
 
 
@@ -55,156 +51,199 @@ class SlowLatents(LatentStep):
 
 @UPDATES
 @pytest.mark.parametrize("curiosity", ["separate", "bonus"])
-@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
-def test_reward_with_parameters_learns_them(algorithm: str, curiosity: str, update: str) -> None:
-    """By its own loss and optimiser; the agent gets the reward as it was before that step."""
-    model = filled_model(algorithm, srl=None, intrinsic=Forward, curiosity=curiosity, update=update)
+def test_reward_with_parameters_learns_them(curiosity: str, update: str) -> None:
+    """By its own loss and optimizer; the agent gets the reward as it was before that step."""
+    model = filled_model(srl=None, intrinsic=Forward, curiosity=curiosity, update=update)
     reward: Any = model.policy.intrinsic
-    assert reward.optimizer is not None and isinstance(reward.optimizer, th.optim.SGD)
     paid: list[th.Tensor] = []
-    scale = model.policy.scale
-    scale.register_forward_hook(lambda module, args, out: paid.append(args[0].clone()))
+    model.policy.scale.register_forward_pre_hook(lambda module, args: paid.append(args[0].clone()))
     before = groups(model)
+    train_once(model, rl=False)
+    assert not moved(before, groups(model))
     logged = train_once(model)
     assert "reward" in moved(before, groups(model))
     assert th.equal(paid[0], reward.rewards[0])
     assert logged["curious_reward_raw_mean"] == float(paid[0].mean())
-    weight, bias = before["reward"]
-    batch_loss = float(paid[0].mean())
     train_once(model)  # the same batch
-    assert float(reward.rewards[1].mean()) < batch_loss
-    assert not th.equal(weight, reward.model.weight) and not th.equal(bias, reward.model.bias)
-
-
-def test_reward_learns_from_its_own_loss_alone() -> None:
-    """A step of its own optimiser along the gradient of the mean error, whatever the agents do."""
-    model = filled_model(srl=None, intrinsic=Forward)
-    (weight, bias) = groups(model)["reward"]
-    train_once(model)
-    reward: Any = model.policy.intrinsic
-    again = filled_model(srl=None, intrinsic=Forward, learning_rate=0.0)
-    twin: Any = again.policy.intrinsic
-    train_once(again)
-    gradients = [parameter.grad for parameter in twin.model.parameters()]
-    for parameter, old, gradient in zip(reward.model.parameters(), (weight, bias), gradients, strict=True):
-        th.testing.assert_close(parameter.detach(), old - 0.1 * gradient)
-    assert equal([weight, bias], groups(again)["reward"])
-
-
-def test_reward_learns_in_rl_updates_only() -> None:
-    model = filled_model(intrinsic=Forward)
-    before = groups(model)
-    train_once(model, rl=False)
-    assert "reward" not in moved(before, groups(model))
+    assert float(reward.rewards[1].mean()) < float(paid[0].mean())
 
 
 @UPDATES
-@pytest.mark.parametrize("precision, extractor", [("fp32", None), ("bf16", None), ("bf16", NatureCNN)])
 @pytest.mark.parametrize("augmentation", [None, "shift"])
-def test_latents_are_of_centred_views_in_fp32(
-    augmentation: str | None, precision: str, extractor: Any, update: str
-) -> None:
-    """The online encoder's, as it is by then, of both observations; without a gradient to the encoder."""
-    arguments: dict[str, Any] = dict(augmentation=augmentation, precision=precision, update=update)
-    if extractor is not None:
-        kwargs = {"features_extractor_class": extractor, "features_extractor_kwargs": {"features_dim": 8}}
-        arguments["policy_kwargs"] = kwargs
-    model = filled_model(pixels=True, intrinsic=LatentStep, learning_rate=0.0, **arguments)
-    train_once(model)
-    reward: Any = model.policy.intrinsic
-    ((batch, latents, next_latents, srl_error),) = reward.given
-    assert latents.dtype == next_latents.dtype == srl_error.dtype == th.float32
-    assert not latents.requires_grad and not next_latents.requires_grad
-    assert srl_error.shape == (8,) and not srl_error.requires_grad
-    with th.no_grad(), model._autocast():
-        for found, observations in ((latents, batch.observations), (next_latents, batch.next_observations)):
-            th.testing.assert_close(found, model.policy.encode(observations).float(), rtol=1e-5, atol=1e-5)
-    assert not th.equal(latents, next_latents)
-
-
-def test_latents_are_computed_only_where_they_are_read() -> None:
-    """By default a reward gets none, and the encoder does not run for them; of no head there is no error."""
-    seen: list[Any] = []
-
-    class Looks(Forward):
-        def loss(self, batch: Samples, *rest: Latents) -> Any:  # type: ignore[override]
-            seen.append(rest)
-            return super().loss(batch, *rest)
-
-    train_once(filled_model(srl=None, intrinsic=Looks))
-    assert seen == [(None, None, None)]
-
-
-def test_latents_of_a_sequential_update_are_of_the_stepped_encoder() -> None:
-    """The head has moved the encoder by then."""
-    model = filled_model(intrinsic=LatentStep, update="sequential", learning_rate=1.0)
-    encoder: Encoder = model.policy.encoder
-    before = [parameter.detach().clone() for parameter in encoder.parameters()]
-    train_once(model)
-    reward: Any = model.policy.intrinsic
-    batch, latents, *_ = reward.given[0]
+def test_latents_are_of_centred_views(augmentation: str | None, update: str) -> None:
+    """The online encoder's, of both observations, in fp32, without a gradient to the encoder."""
+    arguments: dict[str, Any] = dict(augmentation=augmentation, update=update, learning_rate=0.0)
+    model = filled_model(pixels=True, intrinsic=LatentStep, **arguments)
     with th.no_grad():
-        for parameter, old in zip(encoder.parameters(), before, strict=True):
-            parameter.copy_(old)
-        assert not th.equal(model.policy.encode(batch.observations), latents)
+        for parameter in model.policy.encoder_target.parameters():
+            parameter.mul_(1.1)
+    train_once(model)
+    reward: Any = model.policy.intrinsic
+    (inputs,) = reward.given
+    found = {name: getattr(inputs, name) for name in ("latents", "next_latents")}
+    for name, observations in zip(found, (inputs.batch.observations, inputs.batch.next_observations), strict=True):
+        assert found[name].dtype == th.float32 and not found[name].requires_grad
+        th.testing.assert_close(found[name], model.policy.encode(observations).detach(), rtol=1e-5, atol=1e-5)
+    assert not th.equal(*found.values())
+    assert inputs.srl_error is None  # it is not computed from the head
+
+
+def test_latents_are_computed_once_when_read() -> None:
+    read: list[str] = []
+    rest: Any = [None] * 3
+    inputs = RewardInputs(rest, None, lambda name: th.ones(2, 4) * (read.append(name) or len(read)), *rest)
+    assert read == []
+    with th.no_grad():
+        first = inputs.next_latents
+    assert inputs.next_latents is first and read == ["next_observations"]
+    assert float(inputs.latents.mean()) == 2 and read == ["next_observations", "observations"]
+
+
+@UPDATES
+def test_reading_without_gradients_leaves_the_shared_graph(update: str) -> None:
+    """Critics that share the encoder's pass still train the encoder."""
+
+    class Careful(LatentStep):
+        @th.no_grad()
+        def loss(self, inputs: RewardInputs) -> Any:
+            return super().loss(inputs)
+
+    model = filled_model(srl=None, intrinsic=Careful, update=update)
+    before = groups(model)
+    train_once(model)
+    assert {"trunk", "projection"} <= moved(before, groups(model))
 
 
 @UPDATES
 @pytest.mark.parametrize("augmentation", [None, "shift"])
 def test_reward_that_trains_the_encoder_moves_it(augmentation: str | None, update: str) -> None:
-    """Alone among the losses, through both latents; its norm is logged beside those of the others."""
-    arguments: dict[str, Any] = dict(augmentation=augmentation, update=update, pixels=True)
+    """Through both latents; another reward does not."""
     alone = dict(srl=None, task=False, curiosity_encoder_grad=False)
-    model = filled_model(intrinsic=SlowLatents, **arguments, **alone)
-    before = groups(model)
-    logged = train_once(model, actors=False)
-    assert moved(before, groups(model)) == {"trunk", "projection", "curious critic"}
-    assert logged["encoder_share_intrinsic"] == 1
-    reward: Any = model.policy.intrinsic
-    assert all(latents.requires_grad for latents in reward.given[0][1:3])
-    assert all(latents.grad.any() for latents in reward.given[0][1:3])
-    still = filled_model(intrinsic=LatentStep, **arguments, **alone)
-    train_once(still, actors=False)
-    assert {"trunk", "projection"}.isdisjoint(moved(before, groups(still)))
-    shared = train_once(filled_model(intrinsic=SlowLatents, **arguments))
-    assert {f"encoder_share_{name}" for name in ("srl", "task", "curious", "intrinsic")} <= shared.keys()
+    for kind, trained in ((SlowLatents, {"trunk", "projection"}), (LatentStep, set())):
+        model = filled_model(pixels=True, augmentation=augmentation, update=update, intrinsic=kind, **alone)
+        before = groups(model)
+        train_once(model, actors=False)
+        assert moved(before, groups(model)) == trained | {"curious critic"}
+        reward: Any = model.policy.intrinsic
+        assert all((each.grad is not None) == bool(trained) for each in (reward.given[0].latents,))
+        assert ("intrinsic" in model.policy.encoder_update.weights) == bool(trained)
 
 
 @pytest.mark.parametrize("curiosity", [None, "bonus", "separate"])
 @pytest.mark.parametrize("reward", [Forward, SlowLatents])
 def test_rewards_survive_pretraining(reward: type[IntrinsicReward], curiosity: str | None) -> None:
-    """The pretraining's curious agent is paid by them; a bonus is still paid afterwards."""
+    """The pretraining's curious agent gets them; a bonus is still added afterwards."""
     model = tiny_model("MlpPolicy", VectorBox(), intrinsic=reward, curiosity=curiosity)
     sources = set(model.policy.encoder_update.weights)
     model.pretrain(14).learn(14)
     assert set(model.policy.encoder_update.weights) == sources
     assert (model.policy.intrinsic is None) == (curiosity is None)
-    assert (model.policy.curious is None) == (curiosity != "separate")
 
 
-def test_networks_begin_alike_under_every_reward() -> None:
-    """Whatever a reward draws, the others' weights are the seed's, so that arms of one seed are paired."""
+class Judges(IntrinsicReward):
+    """Keeps the head's weights as they are when it is computed, and its settings."""
+
+    needs_srl = True
+
+    def __init__(self, *args: Any, srl: Any, curiosity_target: str, frame_stack: int, width: int = 3):
+        super().__init__(*args)
+        self.parts, self.settings = (srl,), (curiosity_target, frame_stack, width)
+        self.seen: list[th.Tensor] = []
+        self.errors: list[th.Tensor] = []
+
+    @classmethod
+    def is_per_image(cls, **kwargs: Any) -> bool:
+        return True
+
+    def loss(self, inputs: RewardInputs) -> Any:
+        self.seen.append(next(self.parts[0].parameters()).detach().clone())
+        self.errors.append(inputs.srl_error)
+        return None, inputs.srl_error
+
+
+def test_constructor_gets_the_settings_that_it_names() -> None:
+    """The user's arguments override them; of dictionaries each image has its own."""
+    model = tiny_model("MlpPolicy", VectorBox(), intrinsic=Judges, curiosity_target="next_observation")
+    reward: Any = model.policy.intrinsic
+    assert reward.parts == (model.policy.srl,) and reward.settings == ("next_observation", 1, 3)
+    assert not any("srl" in name or "parts" in name for name in reward.state_dict())
+    model = sensor_model(intrinsic=Judges, intrinsic_kwargs=dict(width=4), replay_buffer_kwargs=dict(frame_stack=2))
+    policy: Any = model.policy
+    assert [part.settings for part in policy.intrinsic.rewards] == [("observation", 2, 4)] * 2
+    assert [part.parts[0] for part in policy.intrinsic.rewards] == list(policy.srl.heads)
+    with pytest.raises(ValueError, match="srl is None"):
+        tiny_model("MlpPolicy", VectorBox(), srl=None, intrinsic=Judges)
+
+
+@UPDATES
+@pytest.mark.parametrize("target", ["observation", "next_observation"])
+def test_srl_error_is_of_the_head_before_its_step(target: str, update: str) -> None:
+    """Views of the target, seen by the online encoder; nothing but the head's own step follows."""
+    judged: list[Any] = []
+
+    class Spy(RAE):
+        def loss(self, batch: Any, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            output = super().loss(batch, latents)
+            judged.append((batch, latents.detach(), next(self.parameters()).detach().clone(), output.error))
+            return output
+
+    model = filled_model(
+        pixels=True, srl=Spy, intrinsic=Judges, augmentation="shift", curiosity_target=target, update=update
+    )
+    policy: Any = model.policy
+    with th.no_grad():
+        for parameter in policy.encoder_target.parameters():
+            parameter.mul_(1.5)
+    start = next(policy.srl.parameters()).detach().clone()
+    encoder = [parameter.detach().clone() for parameter in policy.encoder.parameters()]
+    train_once(model)
+    assert not th.equal(start, next(policy.srl.parameters()))
+    batch, latents, weights, error = judged[-1]
+    assert len(judged) == (1 if target == "observation" else 2)
+    assert th.equal(weights, start) and th.equal(policy.intrinsic.seen[0], start)
+    assert th.equal(policy.intrinsic.errors[0], error)
+    if target == "next_observation":
+        assert th.equal(batch.observations, judged[0][0].next_observations) and batch.actions is None
+        assert not th.equal(batch.views, batch.observations)
+    with th.no_grad():
+        for parameter, old in zip(policy.encoder.parameters(), encoder, strict=True):
+            parameter.copy_(old)
+    th.testing.assert_close(latents, policy.encoder(batch.views.float() / 255).detach())
+
+
+def test_rewards_draw_from_generators_of_their_own() -> None:
+    """Whatever a reward draws, networks begin alike and torch's stream goes on alike; two rewards draw apart."""
 
     class Greedy(Forward):
         def __init__(self, *args: Any):
             super().__init__(*args)
             th.rand(1000)
+            self.random = OwnGenerator()
 
-    rewards: list[Any] = ["srl_error", Forward, Greedy]
-    states = [tiny_model("MlpPolicy", VectorBox(), intrinsic=each).policy.state_dict() for each in rewards]
-    for state in states[1:]:
-        assert all(th.equal(value, state[name]) for name, value in states[0].items())
+    states, streams = [], []
+    for intrinsic, kwargs in (("srl_error", {}), (Greedy, {}), ("shuffled", dict(of=Greedy))):
+        model = tiny_model("MlpPolicy", VectorBox(), intrinsic=intrinsic, intrinsic_kwargs=kwargs)
+        states.append({k: v.clone() for k, v in model.policy.state_dict().items() if not k.startswith("intrinsic")})
+        model.learn(14)
+        streams.append(th.get_rng_state())
+    for state, stream in zip(states, streams, strict=True):
+        assert all(th.equal(value, states[0][name]) for name, value in state.items()) and th.equal(stream, streams[0])
+    reward: Any = model.policy.intrinsic
+    assert not th.equal(*(th.rand(4, generator=part.random.generator) for part in (reward, reward.of)))
 
 
 @pytest.mark.parametrize(
-    "intrinsic", ["novelty", nn.Linear, Forward(VectorBox().observation_space, VectorBox().action_space, 8)]
+    "arguments, sentence",
+    [
+        (dict(intrinsic="novelty"), "intrinsic is"),
+        (dict(intrinsic=nn.Linear), "intrinsic"),
+        (dict(srl=None, intrinsic="shuffled"), "srl is None"),
+        (dict(srl="inverse", intrinsic_kwargs=dict(per_pixel=True)), "Inverse does not draw"),
+        (dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="novelty")), "choose one of"),
+        (dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="mine")), "encoder is 'mine'"),
+        (dict(intrinsic="particle", intrinsic_kwargs=dict(space="pixels")), "space is 'pixels'"),
+    ],
 )
-def test_unknown_reward_is_refused(intrinsic: Any) -> None:
-    with pytest.raises(ValueError, match="intrinsic"):
-        tiny_model("MlpPolicy", VectorBox(), intrinsic=intrinsic)
-
-
-@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
-def test_reward_made_of_the_srl_error_needs_a_head(curiosity: str) -> None:
-    with pytest.raises(ValueError, match="srl is None"):
-        tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=curiosity)
+def test_impossible_rewards_are_refused(arguments: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        tiny_model("MlpPolicy", VectorBox(), **arguments)

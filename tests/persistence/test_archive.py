@@ -40,8 +40,7 @@ from benchmarks.fuzz import (
 )
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.buffers import SkippingReplayBuffer
-from sb3_cure.data.samples import Samples
-from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure.intrinsic import IntrinsicReward, RewardInputs
 from sb3_cure.networks.encoders import VectorEncoder
 from sb3_cure.persistence import ArchiveError, Persistence
 
@@ -304,8 +303,8 @@ class Seen(IntrinsicReward):
         super().__init__(*args)
         self.conv = nn.Conv2d(6, 3, 3).to(memory_format=th.channels_last)
 
-    def loss(self, batch: Samples, latents: Any, next_latents: Any, srl_error: Any) -> tuple[th.Tensor, th.Tensor]:
-        error = self.conv(batch.observations.float() / 255).square().mean(dim=(1, 2, 3))
+    def loss(self, inputs: RewardInputs) -> tuple[th.Tensor, th.Tensor]:
+        error = self.conv(inputs.batch.observations.float() / 255).square().mean(dim=(1, 2, 3))
         return error.mean(), error.detach()
 
 

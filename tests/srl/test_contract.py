@@ -1,20 +1,18 @@
 """What a head is given, and what is done with what it returns."""
 
-import copy
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from dictionaries_for_tests import sensor_model
+from envs_for_tests import PixelBox, tiny_model
 from torch import nn
 from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_once
 
-from sb3_cure import CuReSAC
 from sb3_cure.data.samples import Samples
-from sb3_cure.evaluation.rollouts import srl_errors
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.srl import RAE, SRL_HEADS, SRLHead, SRLOutput, get_srl_class
+from sb3_cure.srl import RAE, SRL_HEADS, SRLHead, SRLOutput, get_srl_class, heads_by_key
 
 UPDATES = pytest.mark.parametrize("update", ["joint", "sequential"])
 ENCODER = {"trunk", "projection"}
@@ -116,16 +114,6 @@ def test_head_that_needs_next_latents_gets_them(precision: str, update: str) -> 
             th.testing.assert_close(parameter.detach(), old - 0.01 * gradient / size)
 
 
-def test_head_that_needs_next_latents_is_measured() -> None:
-    """By default with those of the centred views of what followed."""
-    model = filled_model(pixels=True, srl=Forward, augmentation="shift")
-    batch = model.policy.samples(model.replay_buffer.sample(BATCH), random=False)
-    expected = model.policy.encode(batch.observations), model.policy.encode(batch.next_observations)
-    srl_errors(model, batch)
-    for given, latents in zip(model.policy.srl.given[-1], expected, strict=True):
-        th.testing.assert_close(given, latents)
-
-
 @UPDATES
 def test_loss_that_moves_no_encoder_is_told(update: str) -> None:
     class Apart(Positions):
@@ -148,46 +136,7 @@ def test_transition_head_always_sees_the_true_transition(target: str) -> None:
     assert logged["curious_reward_raw_mean"] == logged["srl_error"]
 
 
-@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
-@pytest.mark.parametrize("pixels, augmentation", [(False, None), (True, "shift")])
-def test_reward_may_be_about_the_next_observation(pixels: bool, augmentation: str | None, curiosity: str) -> None:
-    """The head then judges views of it by the encoder as it is, in a second pass that trains nothing."""
-    seen: list[tuple[Samples, th.Tensor]] = []
-
-    class Spy(RAE):
-        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-            seen.append((batch, latents))
-            return super().loss(batch, latents)
-
-    arguments: dict[str, Any] = dict(curiosity=curiosity, augmentation=augmentation, learning_rate=0.0)
-    model = filled_model(pixels=pixels, srl=Spy, curiosity_target="next_observation", **arguments)
-    logged = train_once(model)
-    (shown, _), (following, latents) = seen
-    assert th.equal(following.observations, shown.next_observations)
-    assert following.views.shape == shown.views.shape and not latents.requires_grad
-    th.testing.assert_close(latents, model.policy.encoder(model.policy.preprocess(following.views)))
-    assert augmentation is not None or th.equal(following.views, shown.next_observations)
-    assert logged["curious_reward_raw_mean"] != logged["srl_error"]
-
-
 # ---------------------------------------------------------------- precision and what is returned
-
-
-@pytest.mark.parametrize("mixed", [False, True])
-def test_heads_run_in_fp32_unless_they_say_otherwise(mixed: bool) -> None:
-    """Its error would otherwise be left with bf16's eight bits without a word."""
-    formats: list[th.dtype] = []
-
-    class Mixed(Positions):
-        mixed_precision = mixed
-
-        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-            formats.append(self.decode[0](latents).dtype)
-            return super().loss(batch, latents)
-
-    for target in ("observation", "next_observation"):
-        train_once(filled_model(srl=Mixed, precision="bf16", curiosity_target=target))
-    assert formats == [th.bfloat16 if mixed else th.float32] * 3
 
 
 def returns(change: Any) -> type[SRLHead]:
@@ -213,11 +162,6 @@ def test_error_is_one_number_per_sample_detached(change: Any) -> None:
     assert not moved(before, groups(model))
 
 
-def test_error_may_have_double_precision() -> None:
-    logged = train_once(filled_model(srl=returns(lambda error: error.detach().double())))
-    assert np.isfinite(list(logged.values())).all()
-
-
 def test_error_of_few_digits_is_refused() -> None:
     with pytest.raises(ValueError, match=r"in torch\.bfloat16"):
         train_once(filled_model(srl=returns(lambda error: error.detach().to(th.bfloat16))))
@@ -240,6 +184,12 @@ def test_head_without_parameters_trains_the_encoder(update: str) -> None:
     assert moved(before, groups(model)) == ENCODER
 
 
+@pytest.mark.parametrize("srl", ["simsiam", nn.Module, 3])
+def test_unknown_head_is_refused(srl: Any) -> None:
+    with pytest.raises(ValueError, match="srl is"):
+        get_srl_class(srl)
+
+
 # ---------------------------------------------------------------- after each step
 
 
@@ -259,6 +209,29 @@ def test_after_step_follows_each_update_of_the_head(schedule: str, update: str) 
     assert len(weights) == 4
     assert all(not th.equal(a, b) for a, b in zip([start, *weights], weights, strict=False))
     assert th.equal(weights[-1], model.policy.srl.decode[0].weight)
+
+
+#: Height of the images of ``SensorBox``
+SIDES = {"front": 36, "wrist": 28}
+
+
+def test_dictionary_heads_are_each_images_own() -> None:
+    """Encoder, target encoder, augmentation and moving averages of each head are those of its image."""
+
+    class Counts(RAE):
+        n_steps = 0
+
+        def after_step(self) -> None:
+            self.n_steps += 1
+
+    model = sensor_model(srl=Counts, augmentation="shift").learn(13)
+    policy: Any = model.policy
+    assert policy.srl.keys == ("front", "wrist")
+    for key, head in heads_by_key(policy.srl).items():
+        assert head.n_steps == 3
+        assert head.augment is policy.augmentation.of(key) and head.augment.observation_space.shape[1] == SIDES[key]
+        assert head.encoder is policy.encoder.images[key]
+        assert head.target_encoder is policy.encoder_target.images[key]
 
 
 # ---------------------------------------------------------------- what belongs to whom
@@ -291,63 +264,3 @@ def test_head_that_holds_the_encoder_trains_it_no_more(update: str) -> None:
     assert equal(ours, theirs)
     held = {id(p) for group in models[1].policy.srl.optimizer.param_groups for p in group["params"]}
     assert held and held.isdisjoint(map(id, theirs))
-
-
-def test_target_encoder_is_the_moving_average() -> None:
-    """Of the encoder, at its own rate; never trained by gradients."""
-    model = filled_model(srl=Positions, encoder_tau=0.25)
-    policy = model.policy
-    old = [parameter.clone() for parameter in policy.encoder_target.parameters()]
-    train_once(model, rl=False)
-    for target, parameter, before in zip(
-        policy.srl.target_encoder.parameters(), policy.encoder.parameters(), old, strict=True
-    ):
-        th.testing.assert_close(target, 0.75 * before + 0.25 * parameter.detach())
-
-
-def test_networks_begin_alike_under_every_head() -> None:
-    """So that arms with different heads are paired: whatever a head draws, the others' weights are the seed's."""
-
-    class Greedy(RAE):
-        """Draws many random numbers."""
-
-        def __init__(self, *arguments: Any, **settings: Any):
-            super().__init__(*arguments, **settings)
-            th.rand(1000)
-
-    env, settings = PixelBox(size=36), dict(seed=3)
-    heads: list[Any] = ["rae", "curl", Greedy]
-    weights = [tiny_model("CnnPolicy", env, srl=head, **settings).policy.state_dict() for head in heads]
-    others = {name for name in weights[0] if not name.startswith("srl.")}
-    assert {name.split(".")[0] for name in others} >= {"encoder", "task", "curious"}
-    for policy in weights[1:]:
-        assert all(th.equal(weights[0][name], policy[name]) for name in others)
-    another = tiny_model("CnnPolicy", env, srl="rae", seed=4).policy.state_dict()
-    drawn = [name for name in weights[0] if name.startswith("srl.decoder") and name.endswith("weight")]
-    assert drawn and not any(th.equal(weights[0][name], another[name]) for name in drawn), "heads have a seed, too"
-
-
-def test_measuring_trains_nothing() -> None:
-    """``error`` and ``reconstruct`` change no state and need no gradient."""
-    model = tiny_model("CnnPolicy", PixelBox(), srl="rae").learn(12)
-    policy, before = model.policy, copy.deepcopy(model.policy.state_dict())
-    observations = th.as_tensor(model.replay_buffer.sample(4).observations)
-    latents = policy.encode(observations)
-    batch = Samples(*model.replay_buffer.sample(4), views=observations)
-    error = policy.srl.error(batch, latents)
-    assert error.shape == (4,) and not error.requires_grad
-    policy.srl.reconstruct(latents)
-    assert not differences(before, policy.state_dict())
-
-
-@pytest.mark.parametrize("srl", ["simsiam", Positions.__mro__[-1], 3])
-def test_unknown_head_is_refused(srl: Any) -> None:
-    with pytest.raises(ValueError, match="srl is"):
-        get_srl_class(srl)
-
-
-def test_head_instance_is_refused() -> None:
-    """It would be shared by models, with another model's encoder."""
-    policy = tiny_model("MlpPolicy", VectorBox()).policy
-    with pytest.raises(ValueError, match=r"srl is"):
-        CuReSAC("MlpPolicy", VectorBox(), srl=Norm(policy.encoder, policy.observation_space))  # type: ignore[arg-type]

@@ -7,10 +7,10 @@ import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
-from srl_for_tests import batch_of, image_space, make, noise_images, randomise, seeded
+from srl_for_tests import batch_of, encode, image_space, make, noise_images, randomise, seeded
 
-from sb3_cure.networks.augmentations import Augmentation
-from sb3_cure.networks.encoders import Encoder, PixelEncoder
+from sb3_cure.networks.augmentations import Augmentation, make_augmentation
+from sb3_cure.networks.encoders import Encoder
 from sb3_cure.srl import CURL
 
 # ---------------------------------------------------------------- the contrastive loss
@@ -24,7 +24,7 @@ def test_infonce_against_straight_line_code(size: int | None) -> None:
     with th.no_grad():
         head.W.normal_(generator=seeded(5))
     batch = batch_of(noise_images(space, 6))
-    latents = encoder(head.preprocess(head.augment(batch.observations)))
+    latents = encode(encoder, head.augment(batch.observations))
     th.manual_seed(4)
     loss, error = head.loss(batch, latents)
     th.manual_seed(4)
@@ -65,7 +65,7 @@ def test_infonce_of_a_perfect_and_of_a_constant_encoder(batch_size: int) -> None
         for scale in (1.0, 5.0, 50.0):
             with th.no_grad():
                 head.W.copy_(scale * th.eye(table.shape[1]))
-            latents = encoder(head.preprocess(observations))
+            latents = encode(encoder, observations)
             loss = float(head.loss(batch_of(observations), latents).loss.detach())
             assert expected <= loss + 1e-5 and loss <= previous + 1e-5
             previous = loss
@@ -78,7 +78,7 @@ def test_keys_come_from_the_momentum_encoder_without_gradient() -> None:
     encoder, head = make(CURL, space)
     target = head.target_encoder.requires_grad_(True)
     batch = batch_of(noise_images(space))
-    latents = encoder(head.preprocess(batch.observations)).detach().requires_grad_()
+    latents = encode(encoder, batch.observations).detach().requires_grad_()
     losses = []
     for seed in (1, 2):
         randomise(target, seed)
@@ -91,16 +91,6 @@ def test_keys_come_from_the_momentum_encoder_without_gradient() -> None:
     assert all(parameter.grad is None for parameter in [*encoder.parameters(), *target.parameters()])
 
 
-def test_w_starts_uniform() -> None:
-    """CURL's W is drawn uniformly from [0, 1)."""
-    th.manual_seed(0)
-    space = image_space()
-    w = CURL(PixelEncoder(space, n_filters=2), space).W.detach()
-    assert w.shape == (50, 50)
-    assert 0 <= float(w.min()) < 0.01 and 0.99 < float(w.max()) < 1
-    assert float(w.mean()) == pytest.approx(0.5, abs=5 / np.sqrt(12 * 2500))
-
-
 # ---------------------------------------------------------------- the contrastive error
 
 
@@ -111,32 +101,45 @@ def trained_curl(**kwargs: Any) -> tuple[Encoder, Any, spaces.Box]:
     encoder, head = make(CURL, space, **kwargs)
     for seed in (1, 2):
         batch = batch_of(noise_images(space, 6, seed))
-        head.loss(batch, encoder(head.preprocess(head.augment(batch.observations))))
+        head.loss(batch, encode(encoder, head.augment(batch.observations)))
     return encoder, head, space
 
 
 @pytest.mark.parametrize("size", [None, 28], ids=["shift", "crop"])
-def test_curl_error_of_one_observation(size: int | None) -> None:
-    """Positive for a batch of one, whose InfoNCE would be 0; independent of the rest of a batch; repeatable."""
-    encoder, head, space = trained_curl(size=size)
+@pytest.mark.parametrize("error", ["infonce", "positive"])
+def test_measured_error_is_of_one_observation(error: str, size: int | None) -> None:
+    """Positive for a batch of one, whose InfoNCE would be 0; independent of the rest of a batch; draws nothing."""
+    encoder, head, space = trained_curl(size=size, error=error)
     observations = noise_images(space, 5, seed=9)
-    latents = encoder(head.preprocess(head.augment.center(observations)))
+    latents = encode(encoder, head.augment.center(observations))
     before = th.get_rng_state()
     errors = head.error(batch_of(observations), latents)
-    assert th.equal(th.get_rng_state(), before)
-    assert errors.shape == (5,)
-    assert not errors.requires_grad
-    assert float(errors.min()) > 0
-    assert len(errors.unique()) == 5
-    th.manual_seed(123)
-    assert th.equal(errors, head.error(batch_of(observations), latents))
-    for i in range(5):
-        single = head.error(batch_of(observations[i : i + 1]), latents[i : i + 1])
-        th.testing.assert_close(single, errors[i : i + 1], rtol=1e-5, atol=1e-6)
-    order = th.tensor([3, 1, 4, 0, 2])
+    assert th.equal(th.get_rng_state(), before) and not errors.requires_grad
+    assert float(errors.min()) > 0 and len(errors.unique()) == 5
+    order = [3, 1]
     th.testing.assert_close(head.error(batch_of(observations[order]), latents[order]), errors[order])
-    single = batch_of(observations[:1])
-    assert float(head.loss(single, latents[:1]).error) == 0
+    if error == "positive":
+        same = head.augment(observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
+        keys = encode(head.target_encoder, same.unflatten(1, observations.shape[:2])[0])
+        th.testing.assert_close(errors, (latents - keys).square().mean(dim=1).detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_positive_error_leaves_the_loss_alone() -> None:
+    """What is learned is InfoNCE's; the error is the distance of the two views."""
+    space = image_space()
+    batch, outputs = batch_of(noise_images(space)), []
+    for error in ("infonce", "positive"):
+        th.manual_seed(0)
+        encoder, head = make(CURL, space, error=error)
+        latents = encode(encoder, batch.observations).detach()
+        th.manual_seed(5)
+        outputs.append(head.loss(batch, latents))
+    th.manual_seed(5)
+    keys = encode(head.target_encoder, head.augment(batch.observations))
+    assert th.equal(outputs[0].loss, outputs[1].loss)
+    th.testing.assert_close(outputs[1].error, (latents - keys).square().mean(dim=1).detach())
+    with pytest.raises(ValueError, match="error is 'negative'"):
+        make(CURL, space, error="negative")
 
 
 def test_curl_error_against_straight_line_code() -> None:
@@ -146,7 +149,7 @@ def test_curl_error_against_straight_line_code() -> None:
     encoder, head = make(CURL, space, bank_size=10)
     flat = th.arange(0, 250, 25, dtype=th.uint8).view(-1, 1, 1, 1).expand(-1, 1, 36, 36)
     batch = batch_of(flat)
-    latents = encoder(head.preprocess(flat)).detach()
+    latents = encode(encoder, flat).detach()
     # Fourteen are seen in training, but the bank holds ten.
     head.loss(batch_of(flat[:7]), latents[:7])
     head.loss(batch_of(flat[3:]), latents[3:])
@@ -163,23 +166,6 @@ def test_curl_error_against_straight_line_code() -> None:
     np.testing.assert_allclose(head.error(batch, latents).numpy(), expected, rtol=1e-3, atol=1e-4)
 
 
-def test_bank_is_filled_once_from_the_first_batches() -> None:
-    """In order, as stored (uint8, not augmented), up to its size; later batches do not change it."""
-    space = image_space()
-    encoder, head = make(CURL, space, bank_size=8)
-    seen = [noise_images(space, 3, seed) for seed in range(4)]
-    assert int(head.bank_filled) == 0
-    for n, observations in enumerate(seen):
-        head.loss(batch_of(observations), encoder(head.preprocess(observations)))
-        assert int(head.bank_filled) == min(3 * (n + 1), 8)
-        filled = int(head.bank_filled)
-        assert th.equal(head.bank[:filled], th.cat(seen)[:filled])
-    # Measuring does not fill it.
-    fresh_encoder, fresh = make(CURL, space)
-    fresh.error(batch_of(seen[0]), fresh_encoder(fresh.preprocess(seen[0])))
-    assert int(fresh.bank_filled) == 0
-
-
 def test_set_bank_chooses_the_negatives() -> None:
     """They replace those of training, none of the old ones counts any more; nonsense is one sentence."""
     encoder, head, space = trained_curl(bank_size=16)
@@ -189,7 +175,7 @@ def test_set_bank_chooses_the_negatives() -> None:
     _, fresh = make(CURL, space, bank_size=16)
     fresh.load_state_dict({**head.state_dict(), "bank": th.cat([chosen, th.zeros_like(head.bank[5:])])})
     observations = noise_images(space, 4, seed=9)
-    latents = encoder(head.preprocess(observations))
+    latents = encode(encoder, observations)
     assert th.equal(fresh.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
     for wrong in (noise_images(space, 17), chosen[:0], chosen[:, :1]):
         with pytest.raises(ValueError, match=r"set_bank got observations of shape .* the bank holds 1 to 16"):
@@ -204,96 +190,33 @@ def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
     _, other = make(CURL, space, bank_size=16)
     if trained_before:
         full = noise_images(space, 16, seed=5)
-        other.loss(batch_of(full), encoder(head.preprocess(full)))
+        other.loss(batch_of(full), encode(encoder, full))
     other.load_state_dict(head.state_dict())
     observations = noise_images(space, 4, seed=9)
-    latents = encoder(head.preprocess(observations))
+    latents = encode(encoder, observations)
     assert th.equal(other.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
     more = noise_images(space, 6, seed=7)
     for each in (head, other):
-        each.loss(batch_of(more), encoder(head.preprocess(more)))
+        each.loss(batch_of(more), encode(encoder, more))
     assert int(other.bank_filled) == 16
     assert th.equal(other.bank, head.bank)
     assert th.equal(other.bank[12:], more[:4])
 
 
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_logits_are_computed_in_fp32(precision: str) -> None:
-    """Also within autocast: of equal keys and anchors the error is that of fp32, to the last digits."""
-    space = image_space()
-    encoder, head = make(CURL, space)
-    with th.no_grad():
-        head.W.normal_(generator=seeded(5))
-    observations = noise_images(space, 16)
-    latents = encoder(head.preprocess(observations)).detach()
-    keys = encoder(head.preprocess(noise_images(space, 16, seed=1))).detach()
-    head._keys = lambda views: keys
-    with th.autocast("cpu", th.bfloat16, enabled=precision == "bf16"):
-        error = head.loss(batch_of(observations), latents).error
-    logits = latents.double() @ head.W.detach().double() @ keys.double().T
-    expected = logits.logsumexp(dim=1) - logits.diagonal()
-    assert error.dtype == th.float32
-    th.testing.assert_close(error.double(), expected, rtol=1e-4, atol=1e-5)
-
-
 # ---------------------------------------------------------------- what the encoder sees
 
 
-def test_positive_is_another_view_of_the_observation() -> None:
-    """Drawn by ``self.augment`` from the stored observations, whatever the anchor saw."""
-    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", augmentation_kwargs={"pad": 3})
-    head: Any = model.policy.srl
-    assert head.augment is model.policy.augmentation
-    drawn: list[th.Tensor] = []
-    seen: list[th.Tensor] = []
-    keys = head._keys
-
-    def spy(views: th.Tensor) -> th.Tensor:
-        drawn.append(views)
-        return keys(views)
-
-    head._keys = spy
-    loss = head.loss
-
-    def look(batch: Any, latents: th.Tensor) -> Any:
-        seen.extend([batch.observations, batch.views])
-        return loss(batch, latents)
-
-    head.loss = look
-    model.learn(11)
-    ((positives,), (observations, views)) = drawn, seen
-    inner = observations[:, :, 3:-3, 3:-3]
-    size = inner.shape[-1]
-
-    def offsets(images: th.Tensor) -> list[tuple[int, int]]:
-        found = []
-        for image, centre in zip(images, inner, strict=True):
-            places = [
-                (y, x) for y in range(7) for x in range(7) if th.equal(image[:, y : y + size, x : x + size], centre)
-            ]
-            assert places
-            found.append(places[0])
-        return found
-
-    assert offsets(positives) != offsets(views)
-
-
-def test_curl_on_100_pixels_crops() -> None:
-    """CURL's setting: random crops of 84 in training, the central one to act, and latents without tanh."""
-    env = PixelBox(size=100)
-    policy = tiny_model("CnnPolicy", env, srl="curl", buffer_size=40).policy
-    assert policy.augmentation.view_space.shape == policy.encoder.view_space.shape == (6, 84, 84)
-    assert policy.observation_space.shape == (6, 100, 100)
-    assert policy.encoder.projection.tanh is False
-    assert policy.actor.features_extractor.tanh is False
-    observation = env.reset(seed=0)[0]
-    # Acting sees the centre alone: what is painted around it does not matter, what is painted within does.
-    around, within = observation.copy(), observation.copy()
-    around[:, :8] = around[:, 92:] = around[:, :, :8] = around[:, :, 92:] = 77
-    within[:, 8:20, 8:92] = 77
-    actions = [policy.predict(image, deterministic=True)[0] for image in (observation, around, within)]
-    np.testing.assert_array_equal(actions[0], actions[1])
-    assert not np.array_equal(actions[0], actions[2])
+@pytest.mark.parametrize("height, width, seen", [(100, 100, (84, 84)), (240, 320, (202, 269))])
+def test_curl_crops_large_images_in_its_proportion(height: int, width: int, seen: tuple[int, int]) -> None:
+    """84 of 100 pixels per side, the centre to act, and latents without tanh."""
+    space = image_space(3, height, width)
+    assert CURL.choose_augmentation(space) == "crop"
+    augmentation = make_augmentation(CURL.choose_augmentation, space)
+    assert augmentation.view_space.shape == (3, *seen)
+    assert CURL.configure_encoder(augmentation) == {"tanh": False}
+    images = noise_images(space, 1)
+    top, left = (height - seen[0]) // 2, (width - seen[1]) // 2
+    assert th.equal(augmentation.center(images), images[:, :, top : top + seen[0], left : left + seen[1]])
 
 
 @pytest.mark.parametrize(
