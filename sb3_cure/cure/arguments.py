@@ -53,7 +53,6 @@ class CuReArguments(BaseModel):
     ent_coef_lr_factor: Factor
     update: Literal["joint", "sequential"]
     precision: Literal["auto", "fp32", "bf16"]
-    compile: Literal["auto"] | StrictBool
     overlap: StrictBool
     on_bad_transition: Literal["raise", "skip"]
 

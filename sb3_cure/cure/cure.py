@@ -5,8 +5,8 @@ which each update of Algorithm 1 is a method. What differs between SAC and TQC i
 encoder they share, in ``encoder_update.py``.
 """
 
+import contextlib
 import warnings
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,7 +30,7 @@ from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.networks.augmentations import Augmentation
-from sb3_cure.networks.precision import resolve_compile, resolve_precision
+from sb3_cure.networks.precision import compute_in, resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 
 #: Latents with their graph, and the copy of them that a loss reads: its gradient stops there
@@ -93,8 +93,6 @@ class CuRe(OffPolicyAlgorithm):
     :param update: ``"joint"`` (one encoder pass for all) or ``"sequential"`` (a pass and a step for each loss:
         Algorithm 1 to the letter), see ``EncoderUpdate``
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 for images where the hardware computes it
-    :param compile: Whether updates run the networks through torch.compile: True (with a warning and eager where it does
-        not work), False, or ``"auto"``: eager, as it does not pay on CPUs and was not measured on GPUs
     :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: actions then
         come from a policy that is one step behind
     :param on_bad_transition: What to do when an environment returns a reward or an observation that is not finite:
@@ -155,7 +153,6 @@ class CuRe(OffPolicyAlgorithm):
         encoder_tau: float = 0.05,
         update: str = "joint",
         precision: str = "auto",
-        compile: str | bool = "auto",
         overlap: bool = False,
         on_bad_transition: str = "raise",
         ent_coef: str | float = "auto_0.1",
@@ -205,7 +202,6 @@ class CuRe(OffPolicyAlgorithm):
         self.encoder_tau = encoder_tau
         self.update = update
         self.precision = precision
-        self.compile = compile
         self.overlap = overlap
         self.on_bad_transition = on_bad_transition
         self.ent_coef_lr_factor = ent_coef_lr_factor
@@ -255,13 +251,8 @@ class CuRe(OffPolicyAlgorithm):
         self.policy_kwargs = user_kwargs
         self._critics = self.critics(self)
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
-        enabled = self._computed_precision == "bf16"
-        self.policy.encoder_update.autocast = partial(th.autocast, self.device.type, th.bfloat16, enabled=enabled)
-        self._compiles, sentence = resolve_compile(self.compile, self.device)
-        if self._compiles:
-            self.policy.compile_networks()
         if self.verbose >= 1:
-            print(f"Networks compute in {self._computed_precision} (precision={self.precision!r}). {sentence}")
+            print(f"Networks compute in {self._computed_precision} (precision={self.precision!r})")
         self._setup_temperatures()
 
     def _policy_choices(self) -> dict[str, Any]:
@@ -447,7 +438,7 @@ class CuRe(OffPolicyAlgorithm):
                     ahead = self.replay_buffer.look_ahead(self.n_steps, self.gamma, self._vec_normalize_env)
                     batch = batch._replace(**ahead)
                 self._guard.begin(self._n_updates)
-                with crash_report(self, batch):
+                with crash_report(self, batch), self._autocast():
                     self._gradient_step(batch, learns_srl, learns_rl)
                 self._n_batches += 1
                 self._n_rl_batches += learns_rl
@@ -473,8 +464,11 @@ class CuRe(OffPolicyAlgorithm):
     def _gradient_step(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> None:
         """One update on one batch: UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1."""
         policy, encoder = self.policy, self.policy.encoder_update
+        if not policy.representation_frozen:
+            for each in (policy.encoder, policy.encoder_target):
+                each.update_statistics(batch.views)
         with th.no_grad(), self._autocast():
-            views, next_views = policy.preprocess(batch.views), {"next ": policy.augment(batch.next_observations)}
+            views, next_views = batch.views, {"next ": policy.augment(batch.next_observations)}
             if batch.n_step_next_observations is not None:
                 next_views["n-step "] = policy.augment(batch.n_step_next_observations)
             # Where each agent that learns bootstraps: the task's after n steps, the curious one after one
@@ -535,7 +529,7 @@ class CuRe(OffPolicyAlgorithm):
         if about_next and self.policy.intrinsic is not None and self.policy.intrinsic.needs_srl:
             with th.no_grad(), self._autocast(srl.mixed_precision):
                 views = self.policy.augmentation(batch.next_observations)
-                latents = self.policy.encoder(self.policy.preprocess(views)).float()
+                latents = self.policy.encoder(views).float()
                 # With nothing else, so that no head takes (s', a, s') for a transition.
                 shown = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
                 error = srl.loss(shown, latents).error
@@ -673,9 +667,9 @@ class CuRe(OffPolicyAlgorithm):
         """What schedules get: SB3's own goes below zero where the last rollout goes beyond ``total_timesteps``."""
         return max(self._current_progress_remaining, 0.0)
 
-    def _autocast(self, enabled: bool = True) -> th.autocast:
-        """Context in which convolutions and linear maps compute in bf16, if they are to; weights stay fp32."""
-        return th.autocast(self.device.type, th.bfloat16, enabled=enabled and self._computed_precision == "bf16")
+    def _autocast(self, enabled: bool = True) -> contextlib.AbstractContextManager[None]:
+        """Context in which the networks compute in the precision of updates."""
+        return compute_in(self.policy, self._computed_precision)
 
     def dump_logs(self) -> None:
         """Write the logs, and look at what a GPU has found."""
@@ -695,7 +689,7 @@ class CuRe(OffPolicyAlgorithm):
         self._guard.report()
 
     def _excluded_save_params(self) -> list[str]:
-        made_anew = ["_metrics", "_guard", "_mixer", "_critics", "_computed_precision", "_compiles", "ent_coef_tensor"]
+        made_anew = ["_metrics", "_guard", "_mixer", "_critics", "_computed_precision", "ent_coef_tensor"]
         return [*super()._excluded_save_params(), *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

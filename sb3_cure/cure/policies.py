@@ -24,9 +24,8 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import DictReward, IntrinsicReward, RewardScale
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.networks.layers import full_precision, init_weights, preprocess, run_mlp, set_mode
-from sb3_cure.networks.precision import compile_while_training
-from sb3_cure.srl import DictHead, SRLHead, heads_by_key
+from sb3_cure.networks.layers import MixedPrecision, init_weights, run_mlp, set_mode
+from sb3_cure.srl import DictHead, SRLHead
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -34,7 +33,7 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 EPSILON = 1e-6
 
 
-class TrunkActor(Actor):
+class TrunkActor(MixedPrecision, Actor):
     """SAC's actor on the (detached) trunk features of the shared encoder, behind a projection of its own."""
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
@@ -42,12 +41,11 @@ class TrunkActor(Actor):
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation before squashing, [B, action_dim] each
         """
-        latent = run_mlp(self.latent_pi, self.features_extractor(obs))
-        with full_precision(latent):
-            # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
-            log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
-            log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
-            return self.mu(latent), log_std, {}
+        latent = run_mlp(self.latent_pi, self.features_extractor(obs), self.compute_dtype)
+        # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
+        log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
+        log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
+        return self.mu(latent), log_std, {}
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
@@ -56,8 +54,7 @@ class TrunkActor(Actor):
         :return: Actions in [-1, 1], [B, action_dim]
         """
         mean, log_std, _ = self.get_action_dist_params(obs)
-        with full_precision(mean):
-            return th.tanh(mean if deterministic else mean + th.randn_like(mean) * log_std.exp())
+        return th.tanh(mean if deterministic else mean + th.randn_like(mean) * log_std.exp())
 
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -67,11 +64,10 @@ class TrunkActor(Actor):
         mean, log_std, _ = self.get_action_dist_params(obs)
         # What SB3's SquashedDiagGaussianDistribution computes; torch's Normal would read its arguments to check them,
         # for which a GPU has to stop.
-        with full_precision(mean):
-            noise = th.randn_like(mean)
-            actions = th.tanh(mean + noise * log_std.exp())
-            log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - log_std
-            return actions, (log_prob - th.log(1 - actions.square() + EPSILON)).sum(dim=1, keepdim=True)
+        noise = th.randn_like(mean)
+        actions = th.tanh(mean + noise * log_std.exp())
+        log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - log_std
+        return actions, (log_prob - th.log(1 - actions.square() + EPSILON)).sum(dim=1, keepdim=True)
 
 
 class ActorCritic(nn.Module):
@@ -382,19 +378,6 @@ class CuRePolicy(BasePolicy):
             return state_dicts, ["policy.curious.ent_coef_tensor"]
         return [*state_dicts, "policy.curious.ent_coef_optimizer"], ["policy.curious.log_ent_coef"]
 
-    def compile_networks(self) -> None:
-        """Run what is not compiled yet through torch.compile in training mode: encoders, projections and the head's
-        modules. The rest of actors and critics is products of matrices, between which there is nothing to fuse.
-        """
-        modules = [
-            part for encoder in (self.encoder, self.encoder_target) for part in (encoder.trunk, encoder.projection)
-        ]
-        modules += [agent.actor.features_extractor for agent in self.agents.values()]
-        modules += [part for head in heads_by_key(self.srl).values() for part in head.children()]
-        for module in modules:
-            if module._compiled_call_impl is None:
-                compile_while_training(module, self)
-
     def sense(self, observations: Any) -> Any:
         """
         :param observations: As stored, [B, *shape], or a dictionary of such
@@ -416,19 +399,12 @@ class CuRePolicy(BasePolicy):
         see = self.views if random else self.augmentation.center
         return Samples(**{**fields, "views": see(fields["observations"])})
 
-    def preprocess(self, views: Any) -> Any:
-        """
-        :param views: What the encoder is to see, images in 0-255
-        :return: The encoder's input: images in [0, 1]
-        """
-        return preprocess(views, self.augmentation.view_space)
-
     def augment(self, observations: Any) -> Any:
         """
         :param observations: [B, *shape], images in 0-255
-        :return: Randomly augmented encoder inputs, as in training
+        :return: Random views, as in training
         """
-        return self.preprocess(self.views(observations))
+        return self.views(observations)
 
     def views(self, observations: Any) -> Any:
         """
@@ -440,9 +416,9 @@ class CuRePolicy(BasePolicy):
     def center(self, observations: Any) -> Any:
         """
         :param observations: [B, *shape], images in 0-255
-        :return: Encoder inputs without randomness, as when acting
+        :return: Views without randomness, as when acting
         """
-        return self.preprocess(self.augmentation.center(self.sense(observations)))
+        return self.augmentation.center(self.sense(observations))
 
     def encode(self, observations: Any) -> th.Tensor:
         """

@@ -244,8 +244,6 @@ class Pretraining(CuRe):
         choices = self._policy_choices()
         policy.add_curious_agent(choices["intrinsic_class"], choices["intrinsic_kwargs"])
         policy.to(self.device)
-        if self._compiles:
-            policy.compile_networks()
         update = policy.encoder_update
         for source in choices["encoder_sources"]:
             if source not in update.mean_squares:

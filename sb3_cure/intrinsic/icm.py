@@ -10,7 +10,6 @@ from torch import nn
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
 from sb3_cure.intrinsic.reward_networks import MLP, make_network, scaled
-from sb3_cure.networks.layers import full_precision
 
 
 class ICM(IntrinsicReward):
@@ -78,14 +77,12 @@ class ICM(IntrinsicReward):
         assert latents is not None and next_latents is not None
         told = self.inverse_model(th.cat([latents, next_latents], dim=1))
         expected = self.forward_model(th.cat([latents.detach(), batch.actions], dim=1))
-        with full_precision(latents):
-            error = (expected - next_latents.detach()).square().mean(dim=1)
-            return (told - batch.actions).square().mean() + error.mean(), error.detach()
+        error = (expected - next_latents.detach()).square().mean(dim=1)
+        return (told - batch.actions).square().mean() + error.mean(), error.detach()
 
     def _encode(self, observations: th.Tensor) -> th.Tensor:
         features = self.encoder(scaled(observations, self.observation_space))  # type: ignore[misc]
-        with full_precision(features):
-            return self.norm(features)  # type: ignore[no-any-return]
+        return self.norm(features)  # type: ignore[no-any-return]
 
 
 class OwnEncoder(ICM):

@@ -15,7 +15,6 @@ from sb3_cure.data.buffers import SkipsMarked
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.reward_networks import make_network, scaled
-from sb3_cure.networks.layers import full_precision
 
 #: Rows of the replay buffer that are looked at in one go
 CHUNK = 1000
@@ -146,14 +145,13 @@ class Particle(IntrinsicReward):
         if self.encoder is not None:
             next_latents = self.encoder(scaled(batch.next_observations, self.observation_space))
         assert next_latents is not None
-        with full_precision(next_latents):
-            others = next_latents if self._remembered is None else th.cat([next_latents, self._remembered])
-            # Differences, as the products that torch prefers lose the small ones.
-            distances = th.cdist(next_latents, others, compute_mode="donot_use_mm_for_euclid_dist")
-            distances[~th.from_numpy(self._may_be_near).to(distances.device)] = math.inf
-            nearest = distances.topk(min(self.n_neighbours, len(others)), largest=False).values
-            found = nearest.isfinite()
-            mean = th.where(found, nearest, 0).sum(dim=1) / found.sum(dim=1).clamp(min=1)
+        others = next_latents if self._remembered is None else th.cat([next_latents, self._remembered])
+        # Differences, as the products that torch prefers lose the small ones.
+        distances = th.cdist(next_latents, others, compute_mode="donot_use_mm_for_euclid_dist")
+        distances[~th.from_numpy(self._may_be_near).to(distances.device)] = math.inf
+        nearest = distances.topk(min(self.n_neighbours, len(others)), largest=False).values
+        found = nearest.isfinite()
+        mean = th.where(found, nearest, 0).sum(dim=1) / found.sum(dim=1).clamp(min=1)
         self._remember(next_latents)
         return None, mean.log1p()
 

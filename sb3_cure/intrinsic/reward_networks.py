@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from torch import nn
 
-from sb3_cure.networks.layers import FlattenImage, FullPrecision, preprocess
+from sb3_cure.networks.layers import Convolutions, FlattenImage, flatten_vectors
 
 #: Variance of uniform noise within a step of 1/32, the dither of 5-bit images (SAC-AE), where pixels are in [0, 1]: how
 #: little a pixel must vary to count as constant
@@ -24,10 +24,10 @@ def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
     """
     if is_image_space(space, check_channels=False):
         return observations.contiguous(memory_format=th.channels_last).float().div_(255).sub_(0.5)
-    return preprocess(observations, space).flatten(1)
+    return flatten_vectors(observations, space)
 
 
-class MLP(FullPrecision):
+class MLP(nn.Sequential):
     """Linear maps with ReLUs in between, in fp32, whatever convolutions before them compute in.
 
     :param sizes: Of the input, the hidden layers and the output
@@ -62,8 +62,8 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16,
     for _ in range(n_layers):
         layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
         channels, size = n_filters, [(side + 1) // 2 for side in size]
-    network = init(nn.Sequential(*layers, FlattenImage()))
-    network.append(MLP([n_filters * math.prod(size), *sizes]))
+    convolutions = init(Convolutions(*layers, FlattenImage()))
+    network = nn.Sequential(convolutions, MLP([n_filters * math.prod(size), *sizes]))
     return network.to(memory_format=th.channels_last)  # type: ignore[call-overload, no-any-return]
 
 

@@ -9,6 +9,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward
 from sb3_cure.intrinsic.reward_networks import DITHER
+from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl.base import SRLHead
 
 
@@ -109,7 +110,7 @@ class SRLError(IntrinsicReward):
         views = srl.augment.center(observations)
         if views.dim() == 4:
             return views.contiguous(memory_format=th.channels_last).float().div_(255)
-        return srl.preprocess(views).flatten(1)
+        return flatten_vectors(views, srl.encoder.view_space)
 
     def _error(self, seen: th.Tensor, latents: th.Tensor) -> th.Tensor:
         drawn = self._srl[0].reconstruct(latents)

@@ -11,7 +11,6 @@ from torch.nn import functional as F
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 #: Side of CURL's crops, pixels, which decides whether ``augmentation="auto"`` crops or shifts
@@ -93,12 +92,11 @@ class CURL(SRLHead):
             self._fill_bank(batch.observations)
         keys = self._keys(self.augment(batch.observations))
         labels = th.arange(len(keys), device=keys.device)
-        with full_precision(keys):
-            # Row maxima are subtracted inside cross_entropy.
-            error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
-            loss = error.mean()
-            if self.positive:
-                error = _distance(latents, keys)
+        # Row maxima are subtracted inside cross_entropy.
+        error = F.cross_entropy(latents.float() @ self.W @ keys.T, labels, reduction="none")
+        loss = error.mean()
+        if self.positive:
+            error = _distance(latents, keys)
         return SRLOutput(loss, error.detach())
 
     @th.no_grad()
@@ -120,12 +118,11 @@ class CURL(SRLHead):
             return _distance(latents, own)
         negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
-        with full_precision(own):
-            weighted = latents.float() @ self.W
-            logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
-            first = th.zeros(len(logits), dtype=th.long, device=logits.device)
-            # Rounding can leave less than 0, or a -0.0.
-            return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
+        weighted = latents.float() @ self.W
+        logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
+        first = th.zeros(len(logits), dtype=th.long, device=logits.device)
+        # Rounding can leave less than 0, or a -0.0.
+        return F.cross_entropy(logits, first, reduction="none").clamp(min=0).abs()
 
     @th.no_grad()
     def set_bank(self, observations: th.Tensor) -> None:
@@ -147,7 +144,7 @@ class CURL(SRLHead):
 
     @th.no_grad()
     def _keys(self, views: th.Tensor) -> th.Tensor:
-        return self.target_encoder(self.preprocess(views)).float()
+        return self.target_encoder(views)
 
     @th.no_grad()
     def _fill_bank(self, observations: th.Tensor) -> None:

@@ -7,7 +7,7 @@ from torch import nn
 
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision, init_weights
+from sb3_cure.networks.layers import init_weights
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -73,11 +73,10 @@ class NextLatents(SRLHead):
 
     def _error(self, batch: Samples, latents: th.Tensor, next_views: th.Tensor, learns: bool) -> th.Tensor:
         with th.no_grad():
-            following = self.target_encoder(self.preprocess(next_views)).float()
-        with full_precision(latents):
-            with th.no_grad():
-                target = self._standardise(self.project(following), learns)
-            return self.distance(th.cat([latents, batch.actions], dim=1), target)
+            following = self.target_encoder(next_views)
+        with th.no_grad():
+            target = self._standardise(self.project(following), learns)
+        return self.distance(th.cat([latents, batch.actions], dim=1), target)
 
     def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:
         """By the batch's statistics, which the running ones follow; or else by these."""

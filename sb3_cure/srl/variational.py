@@ -8,7 +8,6 @@ from torch import nn
 
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import full_precision
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLOutput
 
@@ -43,9 +42,8 @@ class VAE(RAE):
         :param next_latents: Unused
         :return: Loss, and the mean squared error of each observation, drawn from its noisy latents, [B]
         """
-        with full_precision(latents):
-            log_variance = self.log_variance(latents)
-            divergence = 0.5 * (latents.square() + log_variance.exp() - log_variance - 1).sum(dim=1)
-            sampled = latents + (0.5 * log_variance).exp() * th.randn_like(latents)
+        log_variance = self.log_variance(latents)
+        divergence = 0.5 * (latents.square() + log_variance.exp() - log_variance - 1).sum(dim=1)
+        sampled = latents + (0.5 * log_variance).exp() * th.randn_like(latents)
         drawn = super().loss(batch, sampled)
         return SRLOutput(drawn.loss + self.beta * divergence.mean(), drawn.error)
