@@ -216,6 +216,8 @@ class DictEncoder(Encoder):
         sizes = [encoder.features_dim for encoder in encoders.values()]
         trunk_dim = sum(encoder.trunk_dim for encoder in encoders.values()) + vector_dim
         super().__init__(observation_space, sum(sizes) + vector_dim, trunk_dim)
+        #: Size of all vectors together
+        self.vector_dim = vector_dim
         #: Encoders of the images by key. Their modules are registered in trunk and projection
         self.images = encoders
         #: Where their latents are among all
