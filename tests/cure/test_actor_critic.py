@@ -4,12 +4,13 @@ from typing import Any
 
 import pytest
 import torch as th
-from envs_for_tests import VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
 from updates_for_tests import ALGORITHMS, filled_model, train_once
 
 from sb3_cure import CuReSAC
 from sb3_cure.cure.policies import ActorCritic
+from sb3_cure.networks import layers
 from sb3_cure.networks.layers import set_mode
 
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)

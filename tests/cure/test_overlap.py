@@ -6,7 +6,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from envs_for_tests import PixelBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback

@@ -316,7 +316,7 @@ def test_old_batches_fade() -> None:
 
 
 def test_nothing_explodes() -> None:
-    """Outliers are clipped, numbers that are not finite move no statistics, and before the first update none is used."""
+    """Outliers are clipped, infinite numbers move no statistics, and before the first update none are used."""
     standardize = standardizer()
     th.testing.assert_close(standardize(th.tensor([[0.5, -1.0, 200.0, 0.0]])), th.tensor([[0.5, -1.0, 10.0, 0.0]]))
     standardize.update(vectors(64, 0))

@@ -67,7 +67,7 @@ def test_rae_loss_against_straight_line_code(latent_penalty: float) -> None:
     encoder, head = make(RAE, space, latent_penalty=latent_penalty)
     randomise(head)
     batch = batch_of(noise_images(space))
-    latents = encoder(head.preprocess(batch.observations))
+    latents = encoder(batch.observations)
     th.manual_seed(3)
     target = from_cells(head.target(to_cells(batch.observations), dither=True)).numpy()
     th.manual_seed(3)
@@ -86,7 +86,7 @@ def test_rae_defaults_are_sac_aes() -> None:
     space = image_space()
     encoder, head = make(RAE, space)
     batch = batch_of(noise_images(space))
-    latents = encoder(head.preprocess(batch.observations)).detach()
+    latents = encoder(batch.observations).detach()
     loss, error = head.loss(batch, latents)
     penalty = 0.5 * float((latents**2).sum(dim=1).mean())
     # The latents of a LayerNorm have a penalty of the order of their number, hence well above rounding.
@@ -169,7 +169,7 @@ def test_decoder_draws_what_the_encoder_sees(height: int, width: int, frames: in
     encoder = PixelEncoder(space, features_dim=5, n_filters=3, n_layers=n_layers)
     head = RAE(encoder, space)
     batch = batch_of(noise_images(space, 2))
-    latents = encoder(head.preprocess(batch.observations))
+    latents = encoder(batch.observations)
     assert head.decoder(latents).shape == (2, *space.shape)
     assert head.reconstruct(latents).shape == (2, *space.shape)
     kernels = [tuple(p.shape) for p in head.decoder.parameters() if p.dim() == 4]
@@ -228,7 +228,7 @@ def test_decoder_is_to_draw_the_centred_views(augmentation: str) -> None:
     head: Any = policy.srl
     observations = noise_images(model.observation_space, 8)  # type: ignore[arg-type]
     views, centred = policy.augmentation(observations), policy.augmentation.center(observations)
-    latents = policy.encoder(policy.preprocess(views))
+    latents = policy.encoder(views)
     assert head.reconstruct(latents).shape == views.shape == (8, *policy.augmentation.view_space.shape)
     head.decoder = Draw(head.target(centred, dither=False))
     assert float(head.error(batch_of(observations, views), latents).max()) < 1e-12

@@ -24,7 +24,7 @@ def test_infonce_against_straight_line_code(size: int | None) -> None:
     with th.no_grad():
         head.W.normal_(generator=seeded(5))
     batch = batch_of(noise_images(space, 6))
-    latents = encoder(head.preprocess(head.augment(batch.observations)))
+    latents = encoder(head.augment(batch.observations))
     th.manual_seed(4)
     loss, error = head.loss(batch, latents)
     th.manual_seed(4)
@@ -65,7 +65,7 @@ def test_infonce_of_a_perfect_and_of_a_constant_encoder(batch_size: int) -> None
         for scale in (1.0, 5.0, 50.0):
             with th.no_grad():
                 head.W.copy_(scale * th.eye(table.shape[1]))
-            latents = encoder(head.preprocess(observations))
+            latents = encoder(observations)
             loss = float(head.loss(batch_of(observations), latents).loss.detach())
             assert expected <= loss + 1e-5 and loss <= previous + 1e-5
             previous = loss
@@ -78,7 +78,7 @@ def test_keys_come_from_the_momentum_encoder_without_gradient() -> None:
     encoder, head = make(CURL, space)
     target = head.target_encoder.requires_grad_(True)
     batch = batch_of(noise_images(space))
-    latents = encoder(head.preprocess(batch.observations)).detach().requires_grad_()
+    latents = encoder(batch.observations).detach().requires_grad_()
     losses = []
     for seed in (1, 2):
         randomise(target, seed)
@@ -111,7 +111,7 @@ def trained_curl(**kwargs: Any) -> tuple[Encoder, Any, spaces.Box]:
     encoder, head = make(CURL, space, **kwargs)
     for seed in (1, 2):
         batch = batch_of(noise_images(space, 6, seed))
-        head.loss(batch, encoder(head.preprocess(head.augment(batch.observations))))
+        head.loss(batch, encoder(head.augment(batch.observations)))
     return encoder, head, space
 
 
@@ -120,7 +120,7 @@ def test_curl_error_of_one_observation(size: int | None) -> None:
     """Positive for a batch of one, whose InfoNCE would be 0; independent of the rest of a batch; repeatable."""
     encoder, head, space = trained_curl(size=size)
     observations = noise_images(space, 5, seed=9)
-    latents = encoder(head.preprocess(head.augment.center(observations)))
+    latents = encoder(head.augment.center(observations))
     before = th.get_rng_state()
     errors = head.error(batch_of(observations), latents)
     assert th.equal(th.get_rng_state(), before)
@@ -146,7 +146,7 @@ def test_curl_error_against_straight_line_code() -> None:
     encoder, head = make(CURL, space, bank_size=10)
     flat = th.arange(0, 250, 25, dtype=th.uint8).view(-1, 1, 1, 1).expand(-1, 1, 36, 36)
     batch = batch_of(flat)
-    latents = encoder(head.preprocess(flat)).detach()
+    latents = encoder(flat).detach()
     # Fourteen are seen in training, but the bank holds ten.
     head.loss(batch_of(flat[:7]), latents[:7])
     head.loss(batch_of(flat[3:]), latents[3:])
@@ -170,13 +170,13 @@ def test_bank_is_filled_once_from_the_first_batches() -> None:
     seen = [noise_images(space, 3, seed) for seed in range(4)]
     assert int(head.bank_filled) == 0
     for n, observations in enumerate(seen):
-        head.loss(batch_of(observations), encoder(head.preprocess(observations)))
+        head.loss(batch_of(observations), encoder(observations))
         assert int(head.bank_filled) == min(3 * (n + 1), 8)
         filled = int(head.bank_filled)
         assert th.equal(head.bank[:filled], th.cat(seen)[:filled])
     # Measuring does not fill it.
     fresh_encoder, fresh = make(CURL, space)
-    fresh.error(batch_of(seen[0]), fresh_encoder(fresh.preprocess(seen[0])))
+    fresh.error(batch_of(seen[0]), fresh_encoder(seen[0]))
     assert int(fresh.bank_filled) == 0
 
 
@@ -189,7 +189,7 @@ def test_set_bank_chooses_the_negatives() -> None:
     _, fresh = make(CURL, space, bank_size=16)
     fresh.load_state_dict({**head.state_dict(), "bank": th.cat([chosen, th.zeros_like(head.bank[5:])])})
     observations = noise_images(space, 4, seed=9)
-    latents = encoder(head.preprocess(observations))
+    latents = encoder(observations)
     assert th.equal(fresh.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
     for wrong in (noise_images(space, 17), chosen[:0], chosen[:, :1]):
         with pytest.raises(ValueError, match=r"set_bank got observations of shape .* the bank holds 1 to 16"):
@@ -204,14 +204,14 @@ def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
     _, other = make(CURL, space, bank_size=16)
     if trained_before:
         full = noise_images(space, 16, seed=5)
-        other.loss(batch_of(full), encoder(head.preprocess(full)))
+        other.loss(batch_of(full), encoder(full))
     other.load_state_dict(head.state_dict())
     observations = noise_images(space, 4, seed=9)
-    latents = encoder(head.preprocess(observations))
+    latents = encoder(observations)
     assert th.equal(other.error(batch_of(observations), latents), head.error(batch_of(observations), latents))
     more = noise_images(space, 6, seed=7)
     for each in (head, other):
-        each.loss(batch_of(more), encoder(head.preprocess(more)))
+        each.loss(batch_of(more), encoder(more))
     assert int(other.bank_filled) == 16
     assert th.equal(other.bank, head.bank)
     assert th.equal(other.bank[12:], more[:4])
@@ -225,8 +225,8 @@ def test_logits_are_computed_in_fp32(precision: str) -> None:
     with th.no_grad():
         head.W.normal_(generator=seeded(5))
     observations = noise_images(space, 16)
-    latents = encoder(head.preprocess(observations)).detach()
-    keys = encoder(head.preprocess(noise_images(space, 16, seed=1))).detach()
+    latents = encoder(observations).detach()
+    keys = encoder(noise_images(space, 16, seed=1)).detach()
     head._keys = lambda views: keys
     with th.autocast("cpu", th.bfloat16, enabled=precision == "bf16"):
         error = head.loss(batch_of(observations), latents).error
