@@ -173,23 +173,6 @@ def test_reward_may_be_about_the_next_observation(pixels: bool, augmentation: st
 # ---------------------------------------------------------------- precision and what is returned
 
 
-@pytest.mark.parametrize("mixed", [False, True])
-def test_heads_run_in_fp32_unless_they_say_otherwise(mixed: bool) -> None:
-    """Its error would otherwise be left with bf16's eight bits without a word."""
-    formats: list[th.dtype] = []
-
-    class Mixed(Positions):
-        mixed_precision = mixed
-
-        def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-            formats.append(self.decode[0](latents).dtype)
-            return super().loss(batch, latents)
-
-    for target in ("observation", "next_observation"):
-        train_once(filled_model(srl=Mixed, precision="bf16", curiosity_target=target))
-    assert formats == [th.bfloat16 if mixed else th.float32] * 3
-
-
 def returns(change: Any) -> type[SRLHead]:
     class Returns(Positions):
         def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:

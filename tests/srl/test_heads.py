@@ -23,11 +23,6 @@ HEADS = pytest.mark.parametrize("srl", SRL_HEADS)
 OF_TRANSITIONS = pytest.mark.parametrize("srl", ["spr", "forward", "inverse"])
 
 
-def as_in_training(head: SRLHead) -> th.autocast:
-    """As updates with ``precision="bf16"`` run this head."""
-    return th.autocast("cpu", th.bfloat16, enabled=head.mixed_precision)
-
-
 # ---------------------------------------------------------------- the error
 
 
@@ -62,26 +57,6 @@ def test_measured_error_is_that_of_a_transition_alone(srl: str) -> None:
     part = Samples(*(None if column is None else column[3:5] for column in batch))  # type: ignore[arg-type]
     th.testing.assert_close(head.error(part, latents[3:5]), errors[3:5], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(srl_errors(model, batch), errors, rtol=1e-4, atol=1e-5)
-
-
-class FixedKeys(nn.Module):
-    """A target encoder whose latents do not depend on the images, and hence not on their precision."""
-
-    def forward(self, images: th.Tensor) -> th.Tensor:
-        return th.rand((len(images), 50), generator=th.Generator().manual_seed(len(images))) - 0.5
-
-
-@pytest.mark.parametrize("srl", ["spr", "forward"])
-def test_predictions_are_computed_in_fp32(srl: str) -> None:
-    """The same within autocast as outside: of bf16 they would differ in the third digit."""
-    model = filled_model(pixels=True, srl=srl, augmentation=None, curiosity=None)
-    head, batch = model.policy.srl, samples_of(model, 16)
-    head.bind(FixedKeys(), model.policy.augmentation)  # type: ignore[arg-type]
-    latents = FixedKeys()(th.zeros(16)).flip(0)
-    exact = head.loss(batch, latents).error
-    with as_in_training(head):
-        within = head.loss(batch, latents).error
-    th.testing.assert_close(within, exact, rtol=1e-6, atol=1e-6)
 
 
 def test_noise_of_the_vae_is_that_of_its_own_variance() -> None:
