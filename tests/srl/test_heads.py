@@ -17,6 +17,7 @@ from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation.rollouts import Episode, run_episodes, srl_errors, state_probe
+from sb3_cure.networks.precision import compute_in
 from sb3_cure.srl import SRL_HEADS, SRLHead, SRLOutput
 
 HEADS = pytest.mark.parametrize("srl", SRL_HEADS)
@@ -36,7 +37,7 @@ def test_error_is_finite_and_not_negative(srl: str, pixels: bool) -> None:
     train_once(model, rl=False)
     head, batch = model.policy.srl, samples_of(model, 16)
     latents = model.policy.encode(batch.observations)
-    with as_in_training(head):
+    with compute_in(head, "bf16"):
         output = head.loss(batch, latents, *([latents.flip(0)] if head.needs_next_latents else []))
         measured = head.error(batch, latents)
     for error in (output.error, measured):
