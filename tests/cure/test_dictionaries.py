@@ -241,7 +241,7 @@ def test_head_chooses_an_augmentation_for_each_image() -> None:
 
     augmentation = sensor_model(Large(), srl="curl").policy.augmentation
     assert {key: type(part) for key, part in augmentation.images.items()} == {"front": RandomCrop, "wrist": RandomShift}
-    assert augmentation.view_space["front"].shape == (6, 84, 84) and augmentation.view_space["joints"].shape == (2,)
+    assert augmentation.view_space["front"].shape == (6, 76, 76) and augmentation.view_space["joints"].shape == (2,)
     assert type(sensor_model().policy.augmentation) is Augmentation
     shifted = sensor_model(srl="curl").policy.augmentation
     index = th.arange(28, dtype=th.uint8).expand(8, 6, 28, 28)
