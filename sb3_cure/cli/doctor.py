@@ -16,7 +16,7 @@ from torch.utils import collect_env
 
 from sb3_cure import __version__
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
-from sb3_cure.networks.precision import resolve_compile, resolve_precision
+from sb3_cure.networks.precision import resolve_precision
 
 PACKAGE = "sb3-cure"
 #: What networks compute in bf16 where they can
@@ -89,7 +89,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     gpus = find_gpus()
     print(f"\nGPUs: {', '.join(gpus) or 'none'}; torch computes on {device} with {th.get_num_threads()} threads")
     print(f'precision="auto": {resolve_precision("auto", device, IMAGES)}')
-    print(f'compile="auto": {resolve_compile("auto", device)[1]}')
     if device.type == "cpu" and any(gpu.startswith("NVIDIA") for gpu in gpus):
         warnings.append("torch cannot use the GPU: install its CUDA build, see https://pytorch.org/get-started")
 

@@ -58,7 +58,7 @@ def _images_and_latents(model: BaseAlgorithm, observations: Any, key: str) -> tu
     policy: Any = model.policy
     if isinstance(policy, CuRePolicy):
         views = policy.center(observations)
-        return views[key] if key else views, policy.encoder(views)
+        return (views[key] if key else views).float() / 255, policy.encoder(views)
     found = encoder_of(policy)
     if found is None:
         raise ValueError(f"the {type(policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")

@@ -540,7 +540,7 @@ def check_arms(cells: Iterable[Cell]) -> None:
             if cell.kind == "visitation" and isinstance(envs[key].observation_space, gym.spaces.Dict):
                 raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
             with untouched_randomness(th.device("cpu")):
-                cell.make_model(envs[key], device="cpu", compile=False, buffer_size=1)
+                cell.make_model(envs[key], device="cpu", buffer_size=1)
         except GLUnavailableError:  # with Ray other machines may have what this one has not
             break
         except Exception as error:

@@ -194,7 +194,7 @@ def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator
         batch = observation_batch(observations[random.integers(len(observations), size=128)], model.device)
         views = policy.augmentation(batch.observations)
         with model._autocast():
-            latents = policy.encoder(policy.preprocess(views)).float()
+            latents = policy.encoder(views)
             loss = head.loss(batch._replace(views=views), latents).loss
         optimizer.zero_grad()
         loss.backward()

@@ -84,7 +84,7 @@ WARMUP_UPDATES = {"SAC-AE": 1000, "CURL": 0}
 #: What an arm may choose without becoming another method; its head, augmentation and curiosity are looked at
 FREE = {
     *("policy", "srl", "srl_kwargs", "augmentation", "augmentation_kwargs", "curiosity"),
-    *("buffer_size", "replay_buffer_kwargs", "precision", "compile", "update", "overlap", "device", "verbose"),
+    *("buffer_size", "replay_buffer_kwargs", "precision", "update", "overlap", "device", "verbose"),
 }
 
 

@@ -18,7 +18,7 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, write_csv
 from sb3_cure.evaluation.rollouts import Episode, even_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.grid import Cell
-from sb3_cure.networks.layers import preprocess
+from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE
 
 #: Plus the cell's seed: the arms of a seed start from the same states, another seed from others
@@ -93,7 +93,7 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
         if isinstance(head, RAE):
             yield head.target(images, dither=False).cpu().numpy()
         elif not is_image_space(model.observation_space):
-            yield preprocess(images, model.observation_space).flatten(1).cpu().numpy()
+            yield flatten_vectors(images, model.observation_space).cpu().numpy()
         else:
             yield ((images.div(8, rounding_mode="floor") + 0.5) / 32 - 0.5).cpu().numpy()
 

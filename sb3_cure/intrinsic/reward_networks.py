@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from torch import nn
 
-from sb3_cure.networks.layers import FlattenImage, preprocess
+from sb3_cure.networks.layers import Convolutions, FlattenImage, flatten_vectors
 
 #: Variance of uniform noise within a step of 1/32, the dither of 5-bit images (SAC-AE), for pixels in [0, 1]: pixels
 #: that vary less count as constant
@@ -25,24 +25,7 @@ def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
     """
     if is_image_space(space, check_channels=False):
         return observations.contiguous(memory_format=th.channels_last).float().div_(255).sub_(0.5)
-    return preprocess(observations, space).flatten(1)
-
-
-class Convolution(nn.Conv2d):
-    """torch's convolution, which casts its inputs and weights to ``compute_dtype``."""
-
-    #: Number format of the convolution, float32 or bfloat16; weights stay float32
-    compute_dtype: th.dtype = th.float32
-
-    def forward(self, images: th.Tensor) -> th.Tensor:
-        """Convolve images.
-
-        :param images: [B, in_channels, H, W]
-        :return: [B, out_channels, H', W']
-        """
-        assert self.bias is not None
-        images, weight, bias = (each.to(self.compute_dtype) for each in (images, self.weight, self.bias))
-        return self._conv_forward(images, weight, bias)
+    return flatten_vectors(observations, space)
 
 
 class MLP(nn.Sequential):
@@ -79,10 +62,10 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16,
     channels, *size = space.shape  # type: ignore[misc]
     layers: list[nn.Module] = []
     for _ in range(n_layers):
-        layers += [Convolution(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
+        layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
         channels, size = n_filters, [(side + 1) // 2 for side in size]
-    network = init(nn.Sequential(*layers, FlattenImage()))
-    network.append(MLP([n_filters * math.prod(size), *sizes]))
+    convolutions = init(Convolutions(*layers, FlattenImage()))
+    network = nn.Sequential(convolutions, MLP([n_filters * math.prod(size), *sizes]))
     return network.to(memory_format=th.channels_last)  # type: ignore[call-overload, no-any-return]
 
 

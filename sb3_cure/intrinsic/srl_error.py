@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import DITHER
+from sb3_cure.networks.layers import flatten_vectors, scale_images
 from sb3_cure.srl import SRLHead
 
 
@@ -84,8 +85,10 @@ class SRLError(IntrinsicReward):
     def _target(self, observations: th.Tensor) -> th.Tensor:
         """Return the centred views, images in [0, 1]."""
         (srl,) = self._srl
-        views = srl.preprocess(srl.augment.center(observations)).float()
-        return views if views.dim() == 4 else views.flatten(1)
+        views = srl.augment.center(observations)
+        if views.dim() == 4:
+            return scale_images(views.contiguous(memory_format=th.channels_last))
+        return flatten_vectors(views, srl.encoder.view_space)
 
     def _error(self, target: th.Tensor, latents: th.Tensor) -> th.Tensor:
         drawn = self._srl[0].reconstruct(latents)

@@ -1,4 +1,4 @@
-"""How the C library's allocator treats large blocks, which batches of images and activations are."""
+"""Settings of the C library's allocator for large blocks, such as batches of images and activations."""
 
 import ctypes
 import sys
@@ -9,10 +9,10 @@ _LARGEST_THRESHOLD = 32 * 1024 * 1024
 
 
 def tune_allocator() -> bool:
-    """Let the process keep freed blocks of up to 32 MiB instead of returning each to the system.
+    """Keep freed blocks of up to 32 MiB in the process instead of returning each to the system.
 
     By default glibc maps every large block anew and unmaps it when it is freed, so that each batch of images and each
-    layer's activations are paid for in page faults. Call it once, before training; ``MALLOC_MMAP_THRESHOLD_=33554432
+    layer's activations cost page faults. Call it once, before training; ``MALLOC_MMAP_THRESHOLD_=33554432
     MALLOC_TRIM_THRESHOLD_=2147483647`` in the environment does the same. The process's memory then stays at its peak.
 
     :return: Whether it worked; it does nothing where the C library is not glibc

@@ -1,4 +1,4 @@
-"""Decoders: what is drawn from latents, and how far it is from what was to be drawn."""
+"""Decoders, and the error of what they draw."""
 
 from collections.abc import Callable
 
@@ -6,14 +6,14 @@ import torch as th
 from torch import nn
 
 from sb3_cure.networks.fast_ops import SquaredError, conv_transpose_cells, from_cells, to_cells
-from sb3_cure.networks.layers import ConvTranspose2dReLU, FullPrecision, conv_sizes, init_weights
+from sb3_cure.networks.layers import ConvTranspose2dReLU, Linear, MixedPrecision, conv_sizes, init_weights
 
 
-class PixelDecoder(nn.Module):
-    """The mirror image of ``PixelEncoder``: a linear map, transposed 3x3 convolutions, the last one with stride 2.
+class PixelDecoder(MixedPrecision):
+    """Mirror image of ``PixelEncoder``: a linear map and transposed 3x3 convolutions, the last with stride 2.
 
     :param latent_dim: Size of the latent state
-    :param shape: Shape of the observation to draw, (C, H, W)
+    :param shape: Shape of the images to draw, (C, H, W)
     :param n_filters: Channels of the hidden layers
     :param n_layers: Number of transposed convolutions
     """
@@ -22,7 +22,7 @@ class PixelDecoder(nn.Module):
         super().__init__()
         sizes = conv_sizes(shape[1], shape[2], n_layers)
         self.first_shape = (*sizes[-1], n_filters)
-        self.linear = nn.Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
+        self.linear = Linear(latent_dim, n_filters * sizes[-1][0] * sizes[-1][1])
         self.hidden = nn.Sequential(*(ConvTranspose2dReLU(n_filters, n_filters, 3) for _ in range(n_layers - 1)))
         self.output = nn.ConvTranspose2d(n_filters, shape[0], 3, stride=2)
         self.shape = shape
@@ -30,11 +30,15 @@ class PixelDecoder(nn.Module):
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, latents: th.Tensor, as_cells: bool = False) -> th.Tensor:
-        """
+        """Draw images from latents.
+
         :param latents: [B, latent_dim]
-        :param as_cells: Whether to return them as ``to_cells`` does, as they are drawn; for even sizes
-        :return: Images in the target's scale, about [-0.5, 0.5], [B, C, H, W]
+        :param as_cells: Whether to return ``to_cells`` of the images, the form in which they are computed; needs an
+            even height and width
+        :return: Images in the target's scale, about [-0.5, 0.5], in ``compute_dtype``, [B, C, H, W]
         """
+        if self.compute_dtype != th.float32:
+            latents = latents.to(self.compute_dtype)
         hidden = th.relu(self.linear(latents)).view(-1, *self.first_shape)
         # The linear map writes NHWC, which the convolutions read without a copy.
         hidden = self.hidden(hidden.permute(0, 3, 1, 2))
@@ -42,10 +46,10 @@ class PixelDecoder(nn.Module):
         return cells if as_cells else from_cells(cells)[..., : self.shape[1], : self.shape[2]]
 
 
-class VectorDecoder(FullPrecision):
-    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim]; in fp32, as its target is.
+class VectorDecoder(nn.Sequential):
+    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim], always in fp32.
 
-    :param latent_dim: Size of the latents
+    :param latent_dim: Size of the latent state
     :param out_dim: Size of the flat observation
     :param hidden_dim: Units of the hidden layer
     """
@@ -56,20 +60,22 @@ class VectorDecoder(FullPrecision):
 
 
 def squared_error(
-    decoder: nn.Module, latents: th.Tensor, seen: th.Tensor, target: Callable[[th.Tensor], th.Tensor]
+    decoder: nn.Module, latents: th.Tensor, observations: th.Tensor, target: Callable[[th.Tensor], th.Tensor]
 ) -> th.Tensor:
-    """
+    """Compute the mean squared error of each observation that a decoder draws.
+
     :param decoder: Draws images [B, C, H, W] or vectors [B, n] from latents
     :param latents: [B, latent_dim]
-    :param seen: What is to be drawn, as stored, [B, *shape]
-    :param target: Makes of it what the decoder is to return, pixel by pixel, fp32
-    :return: Mean squared error of each, fp32, [B]
+    :param observations: Observations to draw, as stored, [B, *shape]
+    :param target: Function from observations to the decoder's targets, pixel by pixel, fp32
+    :return: fp32, [B]
     """
-    if isinstance(decoder, PixelDecoder) and not (seen.shape[2] % 2 or seen.shape[3] % 2):
-        drawn, seen = decoder(latents, as_cells=True), to_cells(seen)  # compared as it is drawn
+    if isinstance(decoder, PixelDecoder) and not (observations.shape[2] % 2 or observations.shape[3] % 2):
+        # Compared in the form in which they are drawn, which saves a pass.
+        drawn, observations = decoder(latents, as_cells=True), to_cells(observations)
     else:
         drawn = decoder(latents)
-    goal = target(seen)
+    expected = target(observations)
     if drawn.dim() == 4:
-        return SquaredError.apply(drawn, goal)  # type: ignore[no-any-return]
-    return (drawn - goal).square().mean(dim=1)
+        return SquaredError.apply(drawn, expected)  # type: ignore[no-any-return]
+    return (drawn - expected).square().mean(dim=1)

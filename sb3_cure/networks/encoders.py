@@ -1,37 +1,42 @@
-"""The shared encoder: a trunk that every part of the agent reads, and a projection to the latent state.
+"""Shared encoders: a trunk that every part of the agent reads, and a projection to the latent state.
 
 Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), which the CuRe paper uses (appendix A).
 """
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_cure.data.observations import by_key, image_spaces
+from sb3_cure.data.observations import image_spaces
 from sb3_cure.networks.layers import (
     Conv2dReLU,
+    Convolutions,
     FlattenImage,
-    FullPrecision,
     Projection,
-    VectorNorm,
+    RunningStandardize,
     conv_sizes,
-    full_precision,
     init_weights,
+    scale_images,
 )
+
+#: Parameters of one projection from which on ``PixelEncoder`` warns; 84x84 pixels give 2 million
+MANY_PARAMETERS = 20_000_000
 
 
 class Encoder(BaseFeaturesExtractor):
-    """What all encoders share: ``latents = projection(trunk(observation))``.
+    """Base class of encoders: ``latents = projection(trunk(views))``.
 
-    Actors read the trunk's features *detached* and own a projection of their own; the critics and the
-    state-representation head read the latents and train both parts.
+    Actors read the trunk's features *detached* and own a projection each; the critics and the SRL head read the latents
+    and train both parts. Views are observations as stored, shifted or cropped by the policy's augmentation: images are
+    uint8 in 0-255 (or floats in [0, 1]), vectors are neither standardised nor one-hot yet.
 
-    :param observation_space: Space of one observation
+    :param observation_space: Space of the views
     :param features_dim: Size of the latent state
     :param trunk_dim: Size of the (flat) trunk features
     """
@@ -45,21 +50,29 @@ class Encoder(BaseFeaturesExtractor):
 
     @property
     def view_space(self) -> spaces.Space:
-        """Space of what the encoder sees: the observations', or that of crops of them."""
+        """Space of the views."""
         return self._observation_space
 
     def make_projection(self) -> nn.Module:
-        """
-        :return: A new projection of the trunk's features, such as each actor owns
+        """Build another projection of the trunk's features, as each actor owns one.
+
+        :return: The projection, with fresh weights
         """
         return Projection(self.trunk_dim, self.features_dim, getattr(self.projection, "tanh", True))
 
-    def forward(self, observations: Any) -> th.Tensor:
+    def update_statistics(self, views: Any) -> None:
+        """Move the running statistics of vectors; encoders of images have none.
+
+        :param views: [B, *view shape]
         """
-        :param observations: Preprocessed observations, [B, *shape]; images in [0, 1]
-        :return: Latents, [B, features_dim]
+
+    def forward(self, views: Any) -> th.Tensor:
+        """Encode views.
+
+        :param views: [B, *view shape]
+        :return: Latents, fp32, [B, features_dim]
         """
-        return self.projection(self.trunk(observations))
+        return self.projection(self.trunk(views))
 
 
 class PixelEncoder(Encoder):
@@ -89,21 +102,34 @@ class PixelEncoder(Encoder):
             )
         height, width = conv_sizes(shape[1], shape[2], n_layers)[-1]
         super().__init__(observation_space, features_dim, trunk_dim=n_filters * height * width)
+        self._warn_if_large()  # before any memory is allocated
         self.n_filters = n_filters
         self.n_layers = n_layers
         first = Conv2dReLU(shape[0], n_filters, 3, stride=2)
         further = (Conv2dReLU(n_filters, n_filters, 3) for _ in range(n_layers - 1))
-        self.trunk = nn.Sequential(first, *further, FlattenImage())
+        self.trunk = Convolutions(first, *further, FlattenImage())
         self.projection = Projection(self.trunk_dim, features_dim, tanh)
         init_weights(self)
         # NHWC kernels are the fast ones for convolutions on CPU and GPU; the values are the same.
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
+    def _warn_if_large(self) -> None:
+        n = self.trunk_dim * self.features_dim
+        if n > MANY_PARAMETERS:
+            height, width = self.view_space.shape[1:]  # type: ignore[index]
+            # Five fp32 numbers per parameter: weight, gradient, two moments of Adam, and the target's weight.
+            warnings.warn(
+                f"images of {height}x{width} pixels give the encoder's projection {n / 1e6:.0f} million parameters, "
+                f"{20 * n / 1e9:.1f} GB with gradients, Adam's moments and the target encoder; each actor and pixel "
+                "decoder has as many. Resize them: make_pixel_env(..., image_size=84), or the ResizeImages wrapper.",
+                stacklevel=3,
+            )
+
 
 class VectorEncoder(Encoder):
-    """The same split for vectors: one hidden layer as the trunk, then a projection.
+    """Encoder of vectors: running standardisation and one hidden layer as the trunk, then a projection.
 
-    :param observation_space: Any space that SB3 can flatten (Box of rank 1, Discrete, ...)
+    :param observation_space: Any space without images that SB3 can flatten (Box, Discrete, ...), or a dictionary
     :param features_dim: Size of the latent state
     :param hidden_dim: Width of the hidden layer
     :param tanh: Whether latents end in a tanh
@@ -113,59 +139,66 @@ class VectorEncoder(Encoder):
         self, observation_space: spaces.Space, features_dim: int = 50, hidden_dim: int = 256, tanh: bool = True
     ):
         super().__init__(observation_space, features_dim, trunk_dim=hidden_dim)
-        inputs = get_flattened_obs_dim(observation_space)
-        self.trunk = FullPrecision(nn.Flatten(), nn.Linear(inputs, hidden_dim), nn.ReLU())
+        vectors = RunningStandardize(observation_space)
+        self.trunk = nn.Sequential(vectors, nn.Linear(len(vectors.mean), hidden_dim), nn.ReLU())
         self.projection = Projection(hidden_dim, features_dim, tanh)
         init_weights(self)
 
+    def update_statistics(self, views: Any) -> None:
+        """Move the running statistics.
+
+        :param views: [B, *shape], or a dictionary of them
+        """
+        self.trunk[0].update(views)  # type: ignore[index, operator]
+
 
 class DictTrunk(nn.Module):
-    """Features of each image by a trunk of its own, and the vectors as they are, side by side.
+    """Features of each image by its own trunk, and the standardised vectors, side by side.
 
     :param trunks: Trunks of the images, by key
-    :param vectors: Keys of the vectors
+    :param vectors: Standardises the vectors, or None if there are none
     """
 
-    def __init__(self, trunks: Mapping[str, nn.Module], vectors: list[str]):
+    def __init__(self, trunks: Mapping[str, nn.Module], vectors: RunningStandardize | None):
         super().__init__()
-        self.images, self.vectors = list(trunks), vectors
+        self.images = list(trunks)
         self.trunks = nn.ModuleList(trunks.values())
+        self.vectors = vectors
 
-    def forward(self, observations: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
-        """
-        :param observations: Preprocessed observations
+    def forward(self, views: dict[str, th.Tensor]) -> tuple[th.Tensor, ...]:
+        """Compute the features of each part.
+
+        :param views: By key
         :return: Features of each image, [B, its trunk_dim]; then, if there are any, all vectors as one, fp32, [B, n]
         """
-        features = [trunk(observations[key]) for key, trunk in zip(self.images, self.trunks, strict=True)]
-        if self.vectors:
-            features.append(th.cat([observations[key].flatten(1).float() for key in self.vectors], dim=1))
-        return tuple(features)
+        features = [trunk(views[key]) for key, trunk in zip(self.images, self.trunks, strict=True)]
+        return tuple(features if self.vectors is None else [*features, self.vectors(views)])
 
 
 class DictProjection(nn.Module):
-    """What ``DictTrunk`` returns to joined latents: a projection for each image, a LayerNorm for the vectors.
+    """Joined latents of what ``DictTrunk`` returns: a projection for each image; vectors are joined as they are.
 
     :param projections: Of the images, in their order
-    :param vector_dim: Size of all vectors together; 0: there are none
     """
 
-    def __init__(self, projections: list[nn.Module], vector_dim: int):
+    def __init__(self, projections: list[nn.Module]):
         super().__init__()
-        norms = [VectorNorm(vector_dim)] if vector_dim else []
-        self.parts = nn.ModuleList([*projections, *norms])
+        self.parts = nn.ModuleList(projections)
 
     def forward(self, features: tuple[th.Tensor, ...]) -> th.Tensor:
-        """
+        """Project and join the features.
+
         :param features: Of each part
         :return: Latents, fp32, [B, features_dim]
         """
-        return th.cat([part(feature) for part, feature in zip(self.parts, features, strict=True)], dim=1)
+        latents = [part(feature) for part, feature in zip(self.parts, features, strict=False)]
+        return th.cat([*latents, *features[len(latents) :]], dim=1)
 
 
 class DictEncoder(Encoder):
-    """Dictionaries of images and vectors: an encoder for each image, whose latents are joined with the vectors.
+    """Encoder of dictionaries of images and vectors: one encoder per image; vectors are joined to their latents.
 
-    Vectors need no encoder; they are normalised (``VectorNorm``), so that neither part drowns the other.
+    Vectors need no network of their own: standardised, they are of the same size as the latents.
 
     :param observation_space: Dictionary with at least one image
     :param by_key: Further arguments of the encoders of some images, by key
@@ -177,32 +210,39 @@ class DictEncoder(Encoder):
     ):
         found, own = image_spaces(observation_space), by_key or {}
         encoders = {key: PixelEncoder(space, **{**kwargs, **own.get(key, {})}) for key, space in found.items()}
-        vectors = {key: space for key, space in observation_space.spaces.items() if key not in found}
-        vector_dim = sum(map(get_flattened_obs_dim, vectors.values()))
+        others = spaces.Dict([(key, space) for key, space in observation_space.spaces.items() if key not in found])
+        vectors = RunningStandardize(others) if others.spaces else None
+        vector_dim = 0 if vectors is None else len(vectors.mean)
         sizes = [encoder.features_dim for encoder in encoders.values()]
-        super().__init__(
-            observation_space,
-            sum(sizes) + (vector_dim + 2 if vector_dim else 0),
-            sum(encoder.trunk_dim for encoder in encoders.values()) + vector_dim,
-        )
-        #: Encoders of the images by key. Their modules are those of trunk and projection, which register them
-        self.images = encoders
-        #: Which of the latents are theirs
-        self.slices = {key: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, key in enumerate(encoders)}
+        trunk_dim = sum(encoder.trunk_dim for encoder in encoders.values()) + vector_dim
+        super().__init__(observation_space, sum(sizes) + vector_dim, trunk_dim)
+        #: Size of all vectors together
         self.vector_dim = vector_dim
-        self.trunk = DictTrunk({key: encoder.trunk for key, encoder in encoders.items()}, list(vectors))
-        self.projection = DictProjection([encoder.projection for encoder in encoders.values()], vector_dim)
+        #: Encoders of the images by key. Their modules are registered in trunk and projection
+        self.images = encoders
+        #: Where their latents are among all
+        self.slices = {key: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, key in enumerate(encoders)}
+        self.trunk = DictTrunk({key: encoder.trunk for key, encoder in encoders.items()}, vectors)
+        self.projection = DictProjection([encoder.projection for encoder in encoders.values()])
 
     def make_projection(self) -> nn.Module:
+        """Build another projection of the same parts: one linear map of all features would drown the vectors.
+
+        :return: The projection, with fresh weights
         """
-        :return: Of the same parts as its own; one linear map of all features would drown the vectors
+        return DictProjection([encoder.make_projection() for encoder in self.images.values()])
+
+    def update_statistics(self, views: dict[str, th.Tensor]) -> None:
+        """Move the running statistics of the vectors, if there are any.
+
+        :param views: By key
         """
-        return DictProjection([encoder.make_projection() for encoder in self.images.values()], self.vector_dim)
+        if self.trunk.vectors is not None:
+            self.trunk.vectors.update(views)  # type: ignore[union-attr, operator]
 
 
 class ExtractorTrunk(nn.Module):
-    """An SB3 features extractor, which gets images in the memory order in which SB3 gives them (``view`` works on no
-    other), and computes in fp32 if it reads vectors.
+    """An SB3 features extractor. It gets what SB3 would give it, in SB3's memory order and in fp32.
 
     :param extractor: The features extractor
     """
@@ -210,18 +250,23 @@ class ExtractorTrunk(nn.Module):
     def __init__(self, extractor: BaseFeaturesExtractor):
         super().__init__()
         self.extractor = extractor
-        self._reads_vectors = not is_image_space(extractor._observation_space)
 
-    def forward(self, observations: Any) -> th.Tensor:
-        """
-        :param observations: Preprocessed observations
+    def forward(self, views: Any) -> th.Tensor:
+        """Run the extractor.
+
+        :param views: [B, *shape], or a dictionary of them
         :return: Features, [B, features_dim]
         """
-        if not self._reads_vectors:
-            return self.extractor(observations.contiguous())  # type: ignore[no-any-return]
-        parts = {key: part.float().contiguous() for key, part in by_key(observations).items()}
-        with full_precision(next(iter(parts.values()))):
-            return self.extractor(parts.get("", parts))  # type: ignore[no-any-return]
+        space = self.extractor._observation_space
+        if isinstance(space, spaces.Dict):
+            return self.extractor({key: _as_sb3(views[key], part) for key, part in space.spaces.items()})  # type: ignore[no-any-return]
+        return self.extractor(_as_sb3(views, space))  # type: ignore[no-any-return]
+
+
+def _as_sb3(views: th.Tensor, space: spaces.Space) -> th.Tensor:
+    # A user's `view` works on no other memory order.
+    views = views.contiguous()
+    return scale_images(views) if is_image_space(space) else preprocess_obs(views, space)  # type: ignore[return-value]
 
 
 class ExtractorEncoder(Encoder):
@@ -242,7 +287,7 @@ def make_encoder(
     """Build the shared encoder from SB3's ``features_extractor_class`` and ``features_extractor_kwargs``.
 
     :param extractor_class: One of ours, or any ``BaseFeaturesExtractor``
-    :param observation_space: Space of what the encoder sees (after the head's crop, if it has one)
+    :param observation_space: Space of the views
     :param kwargs: Passed on to the class
     :return: The encoder
     """

@@ -1,13 +1,13 @@
-"""The few kernels that are written for speed. Each has its plain twin in ``tests/test_fast_ops.py``."""
+"""Kernels written for speed. Each is compared with its plain twin in ``tests/networks/test_fast_ops.py``."""
 
 from typing import Any
 
 import torch as th
 from torch.nn import functional as F
 
-#: Up to so many channels a transposed convolution is faster as a plain one of the padded images
+#: With at most this many channels, a transposed convolution is faster as a convolution of the padded images
 FEW_CHANNELS = 16
-#: The bits of minus infinity in bf16, as an integer. Those of all negative numbers are below, those of NaNs are not
+#: The bits of minus infinity in bf16, as an integer. All negative numbers are below it, NaNs are not
 MINUS_INFINITY = -128
 
 
@@ -17,18 +17,17 @@ def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, stri
     if images.device.type != "cpu" or images.shape[1] > FEW_CHANNELS:
         return F.conv_transpose2d(images, weight, bias)
     border = weight.shape[-1] - 1
-    # With the argument `padding` oneDNN would be as slow as for the transposed one.
+    # With the argument `padding` oneDNN is as slow as for the transposed convolution.
     return F.conv2d(F.pad(images, (border,) * 4), weight.flip(2, 3).transpose(0, 1), bias)
 
 
 def _as_integers(images: th.Tensor) -> th.Tensor:
-    """The bits of bf16, which a CPU compares as integers several times as fast; other formats as they are."""
-    is_slow = images.dtype == th.bfloat16 and images.device.type == "cpu" and not th.compiler.is_compiling()
-    return images.view(th.int16) if is_slow else images
+    """View bf16 as integers, which a CPU compares several times as fast; return other formats unchanged."""
+    return images.view(th.int16) if images.dtype == th.bfloat16 and images.device.type == "cpu" else images
 
 
 def relu_(images: th.Tensor) -> th.Tensor:
-    """ReLU in place; what is not a number stays so.
+    """Apply a ReLU in place; NaNs stay NaNs.
 
     :param images: Any shape
     :return: The same tensor
@@ -38,19 +37,23 @@ def relu_(images: th.Tensor) -> th.Tensor:
     return images
 
 
-def relu_backward(gradient: th.Tensor, images: th.Tensor) -> th.Tensor:
+def relu_backward(gradient: th.Tensor, result: th.Tensor) -> th.Tensor:
+    """Compute the gradient of ``relu_``.
+
+    :param gradient: Gradient of the result, in its number format
+    :param result: Result of ``relu_``
+    :return: Gradient of the input
     """
-    :param gradient: Of the result, in its number format
-    :param images: Result of ``relu_``
-    :return: Gradient of what it was given
-    """
-    bits = th.ops.aten.threshold_backward(_as_integers(gradient), _as_integers(images), 0)
+    bits = th.ops.aten.threshold_backward(_as_integers(gradient), _as_integers(result), 0)
     return bits.view(gradient.dtype)
 
 
 class Convolution(th.autograd.Function):
-    """Convolution or, of stride 1, its transpose, with a ReLU or without: the gradient at the images of either is the
-    other one. oneDNN takes half as long again for the transposed one in bf16, if channels are few."""
+    """Convolution, or its transpose with stride 1, followed by an optional ReLU.
+
+    The gradient of one with respect to the images is the other one, so that backward passes use the fast variant too:
+    for few channels in bf16, oneDNN needs 1.5 times as long for a transposed convolution.
+    """
 
     @staticmethod
     def forward(
@@ -62,7 +65,7 @@ class Convolution(th.autograd.Function):
         transposed: bool,
         relu: bool,
     ) -> th.Tensor:
-        """Parameters as of ``convolve``, all in one number format."""
+        """Compute the result; parameters are those of ``convolve``, all in one number format."""
         result = _convolve(images, weight, bias, stride, transposed)
         if relu:
             relu_(result)
@@ -73,22 +76,23 @@ class Convolution(th.autograd.Function):
     @staticmethod
     @th.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        """
-        :param gradient: [B, C', H', W']
-        :return: Gradients of images, weight and bias
+        """Compute the gradients of images, weight and bias.
+
+        :param gradient: Gradient of the result, [B, C', H', W']
+        :return: One gradient or None for each argument of ``forward``
         """
         images, weight, result = ctx.saved_tensors
         if result is not None:
             gradient = relu_backward(gradient, result)
-        by_images, by_weight, by_bias, *_ = ctx.needs_input_grad
+        needs_images, needs_weight, needs_bias, *_ = ctx.needs_input_grad
         sizes = [ctx.stride] * 2, [0, 0], [1, 1], ctx.transposed, [0, 0], 1
-        of_images, of_weight, _ = th.ops.aten.convolution_backward(
-            gradient, images, weight, None, *sizes, [by_images and ctx.stride > 1, by_weight, False]
+        images_grad, weight_grad, _ = th.ops.aten.convolution_backward(
+            gradient, images, weight, None, *sizes, [needs_images and ctx.stride > 1, needs_weight, False]
         )
-        if by_images and ctx.stride == 1:
-            of_images = _convolve(gradient, weight, None, 1, not ctx.transposed)
-        # Inside of the transposed one, the bias's gradient costs as much as that of the weights.
-        return of_images, of_weight, gradient.sum((0, 2, 3)) if by_bias else None, None, None, None
+        if needs_images and ctx.stride == 1:
+            images_grad = _convolve(gradient, weight, None, 1, not ctx.transposed)
+        # Inside convolution_backward the bias's gradient would cost as much as that of the weights.
+        return images_grad, weight_grad, gradient.sum((0, 2, 3)) if needs_bias else None, None, None, None
 
 
 def convolve(
@@ -99,43 +103,41 @@ def convolve(
     transposed: bool = False,
     relu: bool = False,
 ) -> th.Tensor:
-    """
+    """Compute ``conv2d`` or ``conv_transpose2d`` in the number format of the images.
+
     :param images: In NHWC memory order, [B, C, H, W]
     :param weight: Square kernels, [C', C, k, k], transposed [C, C', k, k]
     :param bias: [C']
-    :param stride: 1 if transposed
-    :param transposed: Whether it is the transpose
-    :param relu: Whether a ReLU follows
-    :return: ``conv2d``, or ``conv_transpose2d``, within autocast in its number format, [B, C', H', W']
+    :param stride: Stride; 1 if transposed
+    :param transposed: Whether to compute the transposed convolution
+    :param relu: Whether to apply a ReLU to the result
+    :return: [B, C', H', W']
     """
-    device = images.device.type
-    if th.is_autocast_enabled(device):
-        dtype = th.get_autocast_dtype(device)
-        cast = [each if each is None or each.dtype != th.float32 else each.to(dtype) for each in (images, weight, bias)]
-        images, weight, bias = cast  # type: ignore[assignment]
+    weight, bias = weight.to(images.dtype), None if bias is None else bias.to(images.dtype)
     if th.is_grad_enabled():
         return Convolution.apply(images, weight, bias, stride, transposed, relu)  # type: ignore[no-any-return]
-    # Exports can follow these, but no function with a gradient of its own.
+    # ONNX export cannot follow an autograd.Function.
     result = _convolve(images, weight, bias, stride, transposed)
     return relu_(result) if relu else result
 
 
 def to_cells(images: th.Tensor) -> th.Tensor:
-    """The 2x2 pixels of each cell as channels.
+    """Turn each cell of 2x2 pixels into channels.
 
     :param images: In NHWC memory order, height and width even, [B, C, H, W]
     :return: In NHWC memory order, [B, 4 C, H / 2, W / 2]
     """
     batch, channels, height, width = images.shape
     rows = images.permute(0, 2, 3, 1).reshape(batch, height // 2, 2, width // 2, 2 * channels)
-    # Three times as fast as a permutation
+    # Three times as fast as a permutation.
     return th.cat((rows[:, :, 0], rows[:, :, 1]), dim=3).permute(0, 3, 1, 2)
 
 
 def from_cells(cells: th.Tensor) -> th.Tensor:
-    """
-    :param cells: As of ``to_cells``, [B, 4 C, h, w]
-    :return: The images, [B, C, 2 h, 2 w]
+    """Invert ``to_cells``.
+
+    :param cells: [B, 4 C, h, w]
+    :return: Images, [B, C, 2 h, 2 w]
     """
     batch, channels, height, width = cells.shape
     pixels = cells.permute(0, 2, 3, 1).reshape(batch, height, width, 2, 2, channels // 4)
@@ -143,29 +145,30 @@ def from_cells(cells: th.Tensor) -> th.Tensor:
 
 
 def conv_transpose_cells(images: th.Tensor, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
-    """A transposed 3x3 convolution of stride 2 into few channels, drawn by cells of 2x2 pixels: of a transposed 2x2
-    convolution of stride 1, which is several times as fast.
+    """Compute a transposed 3x3 convolution of stride 2 as cells of 2x2 pixels.
 
-    Pixels of even rows get the kernel's row 0 of one input and row 2 of the one before, those of odd rows get row 1.
+    It is a transposed 2x2 convolution of stride 1 into four times as many channels, which is several times as fast.
+    Pixels of even rows get the kernel's row 0 of one input and row 2 of the input before; those of odd rows get row 1.
 
     :param images: In NHWC memory order, [B, C, H, W]
-    :param weight: As ``nn.ConvTranspose2d`` has it, [C, C', 3, 3]
+    :param weight: Weight of the ``nn.ConvTranspose2d``, [C, C', 3, 3]
     :param bias: [C']
     :return: ``to_cells`` of ``conv_transpose2d(..., stride=2, output_padding=1)``, [B, 4 C', H + 1, W + 1]
     """
-    taps = th.tensor([[0, 2], [1, 3]], device=weight.device)  # by pixel of the cell and input; row 3 is empty
+    taps = th.tensor([[0, 2], [1, 3]], device=weight.device)  # by pixel of the cell and input; row 3 is zero
     kernel = F.pad(weight, (0, 1, 0, 1))[:, :, taps[:, None, :, None], taps[None, :, None, :]]
     kernel = kernel.permute(0, 2, 3, 1, 4, 5).flatten(1, 3)
     return convolve(images, kernel, bias.repeat(4), transposed=True)
 
 
 class SquaredError(th.autograd.Function):
-    """Mean squared error of each image, [B]: as few passes over the images as there can be, forward and backward."""
+    """Mean squared error of each image, [B], with as few passes over the images as possible."""
 
     @staticmethod
     def forward(ctx: Any, drawn: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """
-        :param drawn: Images, [B, C, H, W]; their gradient is all that is computed
+        """Compute the errors.
+
+        :param drawn: Images, [B, C, H, W]; only they get a gradient
         :param target: The same in fp32; it is overwritten
         :return: [B]
         """
@@ -176,16 +179,17 @@ class SquaredError(th.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor, None]:  # type: ignore[override]
-        """
-        :param gradient: [B]
-        :return: Gradient of ``drawn``
+        """Compute the gradient of ``drawn``.
+
+        :param gradient: Gradient of the errors, [B]
+        :return: [B, C, H, W], and None for the target
         """
         (difference,) = ctx.saved_tensors
         return difference * (gradient * (2 / difference[0].numel())).view(-1, 1, 1, 1).to(difference.dtype), None
 
 
 def random_bytes_like(images: th.Tensor) -> th.Tensor:
-    """Uniform random bytes, eight per draw of the generator: drawn singly they would cost as much as the encoder.
+    """Draw uniform random bytes, eight per draw of the generator: single draws cost as much as the encoder.
 
     :param images: uint8, dense
     :return: uint8 of the same shape and memory order

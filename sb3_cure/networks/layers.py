@@ -1,18 +1,21 @@
-"""Building blocks of the encoder, the decoder, the actors and the critics."""
+"""Building blocks of encoders, decoders, actors and critics."""
 
-import contextlib
 from collections.abc import Iterable, Sequence
-from functools import partial
 from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, preprocess_obs
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_cure.networks.fast_ops import convolve
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
+
+#: Number of weights from which on a hidden layer of an actor or a critic may compute in bf16: below, casting costs more
+#: than bf16 gains
+WIDE = 2**16
 
 
 def init_weights(module: ModuleT) -> ModuleT:
@@ -40,7 +43,7 @@ def init_weights(module: ModuleT) -> ModuleT:
 
 
 def set_mode(module: nn.Module, training: bool) -> None:
-    """``module.train(training)`` in an eighth of the time: SB3 asks for it several times in each step.
+    """Do ``module.train(training)`` in an eighth of the time, as SB3 calls it several times per step.
 
     :param module: Any module
     :param training: Whether layers behave as in training
@@ -55,7 +58,7 @@ def set_mode(module: nn.Module, training: bool) -> None:
 
 
 def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
-    """Sizes along a stack of 3x3 convolutions without padding, the first of stride 2.
+    """Compute the sizes along a stack of 3x3 convolutions without padding, the first of stride 2.
 
     :param height: Height of the image, pixels
     :param width: Width of the image, pixels
@@ -75,50 +78,50 @@ def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
     return sizes
 
 
-def preprocess(observations: Any, observation_space: spaces.Space) -> Any:
-    """SB3's preprocessing (images divided by 255, discrete values one-hot), images in the cheapest way.
+def scale_images(images: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:
+    """Convert images from bytes to [0, 1]; leave floats, which are in [0, 1] already, as they are.
 
-    :param observations: Observations as stored, [B, *shape], or a dictionary of them
-    :param observation_space: Their space (only its kind matters, so crops are welcome)
-    :return: Input of the encoder; images in [0, 1], in NHWC memory order and, within autocast, in its number format
+    :param images: uint8 in 0-255, or floats in [0, 1], any shape
+    :param dtype: Number format for bytes; 0-255 is exact in bf16, too
+    :return: Images in [0, 1]
+    """
+    return images.to(dtype).div_(255) if images.dtype == th.uint8 else images
+
+
+def flatten_vectors(observations: Any, observation_space: spaces.Space) -> th.Tensor:
+    """Make one vector of an observation without images, discrete values one-hot.
+
+    :param observations: As stored, [B, *shape], or a dictionary of them
+    :param observation_space: Their space; of a dictionary only its keys are read
+    :return: fp32, [B, n]
     """
     if isinstance(observation_space, spaces.Dict):
-        return {key: preprocess(observations[key], part) for key, part in observation_space.spaces.items()}
-    if not is_image_space(observation_space):
-        return preprocess_obs(observations, observation_space)
-    device = observations.device.type
-    dtype = th.get_autocast_dtype(device) if th.is_autocast_enabled(device) else th.float32
-    # Reordered while still one byte per value; all of 0-255 is exact in bfloat16.
-    images = observations.contiguous(memory_format=th.channels_last).to(dtype)
-    # Floats may still be the caller's own.
-    return images / 255 if observations.is_floating_point() else images.div_(255)
+        parts = [flatten_vectors(observations[key], part) for key, part in observation_space.spaces.items()]
+        return th.cat(parts, dim=1)
+    return preprocess_obs(observations, observation_space).float().flatten(1)  # type: ignore[union-attr]
 
 
-def full_precision(tensor: th.Tensor) -> contextlib.AbstractContextManager[Any]:
-    """Context in which autocast is off: output layers, log-probabilities, targets and losses stay fp32."""
-    device = tensor.device.type
-    # Where it is off, entering one more context would cost as much as a small operation, dozens of times in an update.
-    return th.autocast(device, enabled=False) if th.is_autocast_enabled(device) else contextlib.nullcontext()
+class MixedPrecision(nn.Module):
+    """Base class of modules that compute in bf16 within ``compute_in``, with weights and results for losses in fp32."""
+
+    #: Number format of the expensive layers, set by ``precision.compute_in``
+    compute_dtype: th.dtype = th.float32
 
 
-class FullPrecision(nn.Sequential):
-    """Modules that compute in fp32 within autocast, too: they read vectors, of which bf16 keeps three digits."""
+class Linear(nn.Linear):
+    """Linear map in the number format of its input."""
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
-        :param inputs: What the first module reads
-        :return: What the last module returns
-        """
-        with full_precision(inputs):
-            return super().forward(inputs)
+        """Apply the linear map.
 
-
-#: Weights from which on a layer of an actor or a critic is computed in bf16: below, casting costs what bf16 gains
-WIDE = 2**16
+        :param inputs: [..., in_features]
+        :return: [..., out_features]
+        """
+        return F.linear(inputs, self.weight.to(inputs.dtype), self.bias.to(inputs.dtype))
 
 
 class EnsembleLinear(nn.Module):
-    """Linear maps of several networks, side by side, as one product; orthogonal at first.
+    """Linear maps of several networks as one product, initialised orthogonally.
 
     :param n: Number of networks
     :param in_features: Size of each input
@@ -133,42 +136,44 @@ class EnsembleLinear(nn.Module):
         self.bias = nn.Parameter(th.zeros(n, 1, out_features))
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
+        """Apply each network's map to its input.
+
         :param inputs: [n, B, in_features]
         :return: [n, B, out_features]
         """
         return th.baddbmm(self.bias, inputs, self.weight)
 
 
-def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
-    """Run an actor or critics: within autocast, too, everything but wide hidden layers in fp32.
+def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:
+    """Run an actor or critics, with wide hidden layers in the given number format and the rest in fp32.
 
-    The first layer sees latents and actions: of bf16's digits, actions .500 and .501 are one. The last one gives values
-    and means, which need more digits, too.
+    The first layer reads latents and actions: in bf16 the actions .500 and .501 are equal. The last one returns values
+    and means, which need more than bf16's three digits, too.
 
     :param layers: Linear maps and activations
-    :param inputs: Latents, with or without actions, [..., B, n]
+    :param inputs: Latents, with or without actions, fp32, [..., B, n]
+    :param dtype: Number format of wide hidden layers
     :return: Output of the last layer, fp32
     """
-    layers, device = list(layers), inputs.device.type
-    fast = partial(th.autocast, device, th.get_autocast_dtype(device), th.is_autocast_enabled(device))
-    with full_precision(inputs):
-        for i, layer in enumerate(layers):
-            if 0 < i < len(layers) - 1 and getattr(layer, "weight", inputs[:0]).numel() >= WIDE:
-                with fast():
-                    inputs = layer(inputs)
-            elif i == 0 or isinstance(layer, nn.Linear | EnsembleLinear):
-                inputs = layer(inputs.float())
-            else:
+    layers = list(layers)
+    for i, layer in enumerate(layers):
+        weight = getattr(layer, "weight", None)
+        if weight is None:
+            inputs = layer(inputs)
+        elif dtype == th.float32 or weight.numel() < WIDE or i in (0, len(layers) - 1):
+            inputs = layer(inputs.float())
+        else:
+            with th.autocast(inputs.device.type, dtype):
                 inputs = layer(inputs)
-        return inputs.float()
+    return inputs.float()
 
 
 class Conv2dReLU(nn.Conv2d):
-    """torch's convolution without padding, and a ReLU."""
+    """torch's convolution without padding and a ReLU, in the number format of the images."""
 
     def forward(self, images: th.Tensor) -> th.Tensor:
-        """
+        """Apply convolution and ReLU.
+
         :param images: In NHWC memory order, [B, in_channels, H, W]
         :return: [B, out_channels, H', W']
         """
@@ -176,10 +181,11 @@ class Conv2dReLU(nn.Conv2d):
 
 
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
-    """torch's transposed convolution of stride 1, and a ReLU."""
+    """torch's transposed convolution of stride 1 and a ReLU, in the number format of the images."""
 
     def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
-        """
+        """Apply transposed convolution and ReLU.
+
         :param images: In NHWC memory order, [B, in_channels, H, W]
         :param output_size: Must be None
         :return: [B, out_channels, H', W']
@@ -188,10 +194,33 @@ class ConvTranspose2dReLU(nn.ConvTranspose2d):
 
 
 class FlattenImage(nn.Module):
-    """[B, C, H, W] to [B, H * W * C]: the order in memory of NHWC kernels, so that nothing is copied."""
+    """[B, C, H, W] to [B, H * W * C]: the memory order of NHWC kernels, so that nothing is copied."""
 
     def forward(self, images: th.Tensor) -> th.Tensor:
+        """Flatten images.
+
+        :param images: [B, C, H, W]
+        :return: [B, H * W * C]
+        """
         return images.permute(0, 2, 3, 1).flatten(1)
+
+
+class Convolutions(MixedPrecision, nn.Sequential):
+    """Convolutions and activations that read images and compute in ``compute_dtype``."""
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        """Run the layers.
+
+        :param images: uint8 in 0-255, scaled to [0, 1] here, or floats as they are, [B, C, H, W]
+        :return: Output of the last layer, in ``compute_dtype``
+        """
+        # Reordered while still one byte per value.
+        images = scale_images(images.contiguous(memory_format=th.channels_last), self.compute_dtype)
+        if self.compute_dtype == th.float32:
+            return super().forward(images)
+        # Our layers follow the format of their input; torch's own need autocast.
+        with th.autocast(images.device.type, self.compute_dtype):
+            return super().forward(images.to(self.compute_dtype))
 
 
 class Projection(nn.Module):
@@ -200,49 +229,88 @@ class Projection(nn.Module):
     :param in_dim: Size of the trunk's features
     :param out_dim: Size of the latent state
     :param tanh: Whether latents are squashed into (-1, 1) (SAC-AE, DrQ); CURL's code leaves it out
-    :raises ValueError: if there are too few latents to be normalised
+    :raises ValueError: if there are too few latents for LayerNorm
     """
 
     def __init__(self, in_dim: int, out_dim: int, tanh: bool = True):
         super().__init__()
-        if out_dim < 3:  # of one number LayerNorm leaves a constant, of two only which of them is larger
+        if out_dim < 3:  # LayerNorm turns one number into a constant, and two into their order
             raise ValueError(f"features_dim is {out_dim}, of which LayerNorm leaves nothing to learn: use at least 3.")
-        self.linear = nn.Linear(in_dim, out_dim)
+        self.linear = Linear(in_dim, out_dim)
         self.norm = nn.LayerNorm(out_dim)
         self.tanh = tanh
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        # Convolutions within autocast pass bf16 on; features of vectors are fp32, and stay so.
-        with full_precision(features) if features.dtype == th.float32 else contextlib.nullcontext():
-            projected = self.linear(features)
-        with full_precision(projected):
-            latents = self.norm(projected.float())
-            return th.tanh(latents) if self.tanh else latents
+        """Project features to latents.
+
+        :param features: fp32 or, of convolutions in mixed precision, bf16, [B, in_dim]
+        :return: Latents, fp32, [B, out_dim]
+        """
+        projected = self.linear(features)
+        # Only bf16 is widened, so that networks in fp64 stay in fp64.
+        latents = self.norm(projected.float() if projected.dtype == th.bfloat16 else projected)
+        return th.tanh(latents) if self.tanh else latents
 
 
-class VectorNorm(nn.Module):
-    """LayerNorm of a vector [B, n] beside the constants 1 and -1, to [B, n + 2].
+class RunningStandardize(nn.Module):
+    """Flattens vectors and standardises each entry by running statistics, so that units do not matter.
 
-    LayerNorm takes the mean and the size of what it is given away: of one joint nothing would be left, of a robot at
-    rest as much as of one that moves. Beside two constants both can be read from what these have become.
+    ``forward`` only reads the statistics; ``update`` moves them. An entry without variation becomes 0.
 
-    :param n: Size of the vector
+    :param observation_space: Space of the vectors: any space without images that SB3 can flatten, or a dictionary
+    :param decay: Weight of the past in the running statistics, per update
+    :param clip: Standardised entries are clipped to [-clip, clip]
     """
 
-    def __init__(self, n: int):
-        super().__init__()
-        self.norm = nn.LayerNorm(n + 2)
+    mean: th.Tensor
+    variance: th.Tensor
+    weight: th.Tensor
 
-    def forward(self, vectors: th.Tensor) -> th.Tensor:
-        with full_precision(vectors):
-            ones = th.ones_like(vectors[:, :1])
-            return self.norm(th.cat([vectors, ones, -ones], dim=1))
+    def __init__(self, observation_space: spaces.Space, decay: float = 0.999, clip: float = 10.0):
+        super().__init__()
+        self.observation_space = observation_space
+        self.decay = decay
+        self.clip = clip
+        n = get_flattened_obs_dim(observation_space)
+        self.register_buffer("mean", th.zeros(n))
+        self.register_buffer("variance", th.ones(n))
+        self.register_buffer("weight", th.zeros(n))
+
+    @th.no_grad()
+    def update(self, observations: Any) -> None:
+        """Move the statistics towards those of a batch.
+
+        :param observations: As stored, [B, *shape], or a dictionary of them
+        """
+        vectors = flatten_vectors(observations, self.observation_space)
+        mean, variance = vectors.mean(dim=0), vectors.var(dim=0, correction=0)
+        finite = (mean + variance).isfinite()
+        weight = self.weight + (1 - self.decay) * (1 - self.weight)
+        # 1 at first, then 1 / 2, 1 / 3, ... down to 1 - decay: averages without the bias of their initial values.
+        rate = (1 - self.decay) / weight
+        shift = mean - self.mean
+        spread = (1 - rate) * (self.variance + rate * shift.square()) + rate * variance
+        self.mean.copy_(th.where(finite, self.mean + rate * shift, self.mean))
+        self.variance.copy_(th.where(finite, spread, self.variance))
+        self.weight.copy_(th.where(finite, weight, self.weight))
+
+    def forward(self, observations: Any) -> th.Tensor:
+        """Standardise observations.
+
+        :param observations: As stored, [B, *shape], or a dictionary of them
+        :return: fp32, [B, n]
+        """
+        deviation = self.variance.sqrt()
+        # A deviation below 1e-5 of an entry's size is rounding.
+        scale = th.where(deviation > 1e-5 * self.mean.abs(), 1 / deviation, 0.0)
+        vectors = flatten_vectors(observations, self.observation_space)
+        return ((vectors - self.mean) * scale).clamp(-self.clip, self.clip)
 
 
 class MeanError(nn.Module):
-    """Mean over sensors of their errors, each divided by its running deviation; that of one sensor stays as it is.
+    """Mean over sensors of their errors, each divided by its running deviation; one sensor's error stays as it is.
 
-    Without it the sensor whose errors are the largest numbers would decide what is worth visiting.
+    Without it the sensor with the largest errors would decide which states are worth visiting.
 
     :param n: Number of sensors
     :param decay: Weight of the past in the running variances, per update
@@ -259,7 +327,8 @@ class MeanError(nn.Module):
 
     @th.no_grad()
     def forward(self, errors: Sequence[th.Tensor], learns: bool) -> th.Tensor:
-        """
+        """Average the errors.
+
         :param errors: Of each sensor, [B]
         :param learns: Whether the running variances follow
         :return: [B]
@@ -268,12 +337,12 @@ class MeanError(nn.Module):
             return errors[0].detach()
         each = th.stack([error.detach().float() for error in errors])
         if learns:
-            # As of rewards: a spread below a thousandth of the errors' size is rounding.
+            # A spread below a thousandth of the errors' size is rounding, as in RewardScale.
             new = th.maximum(each.var(dim=1, correction=0), 1e-6 * each.square().mean(dim=1))
             rate = (1 - self.decay) * new.isfinite().all()
             self.variances.lerp_(new.nan_to_num(), rate)
             self.weight.lerp_(th.ones_like(self.weight), rate)
-        # The averages start at zero, which their total weight undoes; before the first of them nothing is divided.
+        # The averages start at zero, and their total weight undoes that bias; before the first, nothing is divided.
         seen = self.weight > 0
         deviations = (self.variances / self.weight.clamp(min=1e-12)).sqrt().clamp(min=1e-12)
         return (each / th.where(seen, deviations, 1.0)[:, None]).mean(dim=0)

@@ -9,7 +9,6 @@ from torch import nn
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import preprocess
 
 
 class SRLOutput(NamedTuple):
@@ -92,14 +91,6 @@ class SRLHead(nn.Module):
         #: Draws another view of stored observations: ``self.augment(batch.observations)``
         self.augment = augmentation
 
-    def preprocess(self, views: th.Tensor) -> th.Tensor:
-        """Scale views as the encoder's input.
-
-        :param views: Views of observations, [B, *view shape], images in 0-255
-        :return: The encoder's input: images in [0, 1]
-        """
-        return preprocess(views, self.encoder.view_space)
-
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Compute the training loss, which may be noisy and may use the other samples of the batch.
 
@@ -126,7 +117,7 @@ class SRLHead(nn.Module):
         if not self.needs_next_latents:
             return self.loss(batch, latents).error
         next_views = self.augment.center(batch.next_observations)
-        return self.loss(batch, latents, self.encoder(self.preprocess(next_views))).error
+        return self.loss(batch, latents, self.encoder(next_views)).error
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor | None:
         """Draw views from latents.

@@ -143,7 +143,7 @@ class CURL(SRLHead):
 
     @th.no_grad()
     def _keys(self, views: th.Tensor) -> th.Tensor:
-        return self.target_encoder(self.preprocess(views))
+        return self.target_encoder(views)
 
     @th.no_grad()
     def _fill_bank(self, observations: th.Tensor) -> None:

@@ -74,7 +74,7 @@ class NextLatents(SRLHead):
 
     def _error(self, batch: Samples, latents: th.Tensor, next_views: th.Tensor, learns: bool) -> th.Tensor:
         with th.no_grad():
-            target = self._standardise(self.project(self.target_encoder(self.preprocess(next_views))), learns)
+            target = self._standardise(self.project(self.target_encoder(next_views)), learns)
         return self.distance(th.cat([latents, batch.actions], dim=1), target)
 
     def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:

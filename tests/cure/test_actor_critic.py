@@ -4,12 +4,13 @@ from typing import Any
 
 import pytest
 import torch as th
-from envs_for_tests import VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
 from updates_for_tests import ALGORITHMS, filled_model, train_once
 
 from sb3_cure import CuReSAC
 from sb3_cure.cure.policies import ActorCritic
+from sb3_cure.networks import layers
 from sb3_cure.networks.layers import set_mode
 
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
@@ -211,3 +212,43 @@ def test_temperature_without_a_model() -> None:
         if learned:
             group = agent.ent_coef_optimizer.param_groups[0]
             assert (group["lr"], group["betas"]) == (1e-3, (0.5, 0.999))
+
+
+def test_log_std_is_rescaled_not_clamped() -> None:
+    """Within [-10, 2] (the paper's bounds) for any features, the middle at 0, with a gradient almost everywhere."""
+    actor = tiny_model("CnnPolicy", PixelBox()).policy.actor
+    features = th.rand(64, actor.features_extractor.linear.in_features, generator=th.Generator().manual_seed(0))
+    raw = actor.log_std(actor.latent_pi(actor.features_extractor(features))).detach()
+    _, log_std, _ = actor.get_action_dist_params(features)
+    th.testing.assert_close(log_std.detach(), -4 + 6 * raw.tanh())
+    log_std.sum().backward()
+    assert float(actor.log_std.bias.grad.abs().min()) > 0
+    with th.no_grad():
+        actor.log_std.weight.mul_(1e3)
+        extreme = actor.get_action_dist_params(features)[1]
+    assert -10 <= float(extreme.min()) < -9.99
+    assert 1.99 < float(extreme.max()) <= 2
+
+
+def test_actors_and_critics_are_initialised_alike() -> None:
+    """Orthogonal linear maps and zero biases in both agents (SAC-AE), not torch's default."""
+    policy = tiny_model("CnnPolicy", PixelBox()).policy
+    for network in (policy.actor, policy.critic, policy.curious.actor, policy.curious.critic):
+        linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear | layers.EnsembleLinear)]
+        assert len(linear) >= 2
+        for layer in linear:
+            weights = layer.weight.detach()
+            for weight in weights if weights.dim() == 3 else [weights]:
+                smaller = weight if len(weight) <= weight.shape[1] else weight.T
+                th.testing.assert_close(smaller @ smaller.T, th.eye(len(smaller)), rtol=0, atol=1e-5)
+            assert not layer.bias.any()
+
+
+@pytest.mark.parametrize("update", ["joint", "sequential"])
+def test_what_is_frozen_in_training_stays(update: str) -> None:
+    """Also where the last update before left a gradient."""
+    model = tiny_model("CnnPolicy", PixelBox(), update=update).learn(15)
+    frozen = [model.policy.encoder.trunk[0], model.policy.srl.decoder, model.policy.critic.ensemble[0]]
+    before = [parameter.clone() for part in frozen for parameter in part.requires_grad_(False).parameters()]
+    model.learn(5, reset_num_timesteps=False)
+    assert all(map(th.equal, before, (parameter for part in frozen for parameter in part.parameters())))

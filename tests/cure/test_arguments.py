@@ -40,7 +40,6 @@ BAD: dict[str, list[Any]] = {
     "ent_coef_lr_factor": [-0.1],
     "update": ["together"],
     "precision": ["fp16"],
-    "compile": ["fast"],
     "overlap": ["no"],
     "on_bad_transition": ["ignore"],
 }

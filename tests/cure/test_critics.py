@@ -15,6 +15,7 @@ from updates_for_tests import ALGORITHMS, critic_values
 
 from sb3_cure.cure.critics import LatentCritic, TruncatedQuantiles, TwinQ
 from sb3_cure.networks import layers
+from sb3_cure.networks.precision import compute_in
 
 BASES = pytest.mark.parametrize("algorithm", ALGORITHMS)
 
@@ -157,7 +158,7 @@ def test_bf16_tells_actions_apart_that_differ_in_the_third_digit(
         assert float((found - exact).mean().abs()) < 0.5 * float(exact.abs().mean())
 
 
-def test_first_layer_of_critics_is_exact_within_autocast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_layer_of_critics_is_exact_in_bf16(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit what it is in fp32; wide hidden layers in between are the only ones in bf16."""
     _, critic = make(TwinQ)
     formats: dict[int, list[th.dtype]] = {0: [], 1: [], 2: []}
@@ -168,12 +169,12 @@ def test_first_layer_of_critics_is_exact_within_autocast(monkeypatch: pytest.Mon
     for i, layer in enumerate(linear):
         layer.register_forward_hook(lambda module, args, out, i=i: formats[i].append(out.dtype))
     latents, actions = inputs()
-    with th.autocast("cpu", th.bfloat16):
+    with compute_in(critic, "bf16"):
         critic(latents, actions)
     assert formats == {0: [th.float32], 1: [th.bfloat16], 2: [th.float32]}
     assert th.equal(outputs[0], linear[0](th.cat([latents, actions], dim=1).expand(2, -1, -1)))
     monkeypatch.undo()
-    with th.autocast("cpu", th.bfloat16):
+    with compute_in(critic, "bf16"):
         critic(latents, actions)
     assert formats[1][-1] == th.float32
 

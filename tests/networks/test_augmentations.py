@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import PixelBox, tiny_model
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,7 +25,7 @@ def shift(images: th.Tensor, pad: int) -> RandomShift:
     return RandomShift(image_space(*images.shape[1:]), pad)
 
 
-def crop(images: th.Tensor, size: int) -> RandomCrop:
+def crop(images: th.Tensor, size: int | tuple[int, int] | None) -> RandomCrop:
     return RandomCrop(image_space(*images.shape[1:]), size)
 
 
@@ -47,14 +47,14 @@ def test_crop_is_one_window_of_all_channels(
     batch: int, channels: int, height: int, width: int, data: st.DataObject, seed: int
 ) -> None:
     """Each image's crop equals the slice at one offset, which all of its channels (stacked frames) share."""
-    size = data.draw(st.integers(1, min(height, width) - 1))
+    rows, columns = data.draw(st.integers(1, height - 1)), data.draw(st.integers(1, width - 1))
     images = numbered(batch, channels, height, width)
-    augmentation = crop(images, size)
+    augmentation = crop(images, (rows, columns))
     crops = augmentation(images, seeded(seed))
-    assert crops.shape == (batch, *augmentation.view_space.shape) == (batch, channels, size, size)  # type: ignore[misc]
+    assert crops.shape == (batch, *augmentation.view_space.shape) == (batch, channels, rows, columns)  # type: ignore[misc]
     for image, view in zip(images.numpy(), crops.numpy(), strict=True):
         top, left = np.argwhere(image[0] == view[0, 0, 0])[0]
-        np.testing.assert_array_equal(view, image[:, top : top + size, left : left + size])
+        np.testing.assert_array_equal(view, image[:, top : top + rows, left : left + columns])
 
 
 @given(st.integers(1, 4), st.integers(1, 4), SIZES, SIZES, st.integers(1, 6), st.integers(0, 2**31))
@@ -105,15 +105,22 @@ def test_every_shift_is_equally_likely() -> None:
 def test_centre_view_of_crops_leaves_equal_margins(
     batch: int, channels: int, height: int, width: int, data: st.DataObject
 ) -> None:
-    """It is a window whose opposite margins differ by at most the one pixel that cannot be halved."""
-    size = data.draw(st.integers(1, min(height, width) - 1))
+    """Opposite margins differ by at most the one pixel that cannot be halved."""
+    rows, columns = data.draw(st.integers(1, height - 1)), data.draw(st.integers(1, width - 1))
     images = numbered(batch, channels, height, width)
-    crops = crop(images, size).center(images).numpy()
-    assert crops.shape == (batch, channels, size, size)
+    crops = crop(images, (rows, columns)).center(images).numpy()
     top, left = np.argwhere(images[0, 0].numpy() == crops[0, 0, 0, 0])[0]
-    np.testing.assert_array_equal(crops, images.numpy()[:, :, top : top + size, left : left + size])
-    assert abs(height - size - 2 * top) <= 1
-    assert abs(width - size - 2 * left) <= 1
+    np.testing.assert_array_equal(crops, images.numpy()[:, :, top : top + rows, left : left + columns])
+    assert abs(height - rows - 2 * top) <= 1
+    assert abs(width - columns - 2 * left) <= 1
+
+
+@pytest.mark.parametrize("size, expected", [((100, 100), (84, 84)), ((240, 320), (202, 269)), ((96, 50), (81, 42))])
+def test_crops_have_curls_proportion(size: tuple[int, int], expected: tuple[int, int]) -> None:
+    """Of images of any size, so that large ones are not reduced to their middle."""
+    images = th.zeros(2, 3, *size, dtype=th.uint8)
+    augmentation = crop(images, None)
+    assert augmentation(images).shape[2:] == augmentation.center(images).shape[2:] == expected
 
 
 def test_centre_view_is_the_observation_without_crops() -> None:
@@ -169,13 +176,13 @@ def test_generator_repeats_and_leaves_the_global_one_alone(kind: str) -> None:
 
 
 def test_unusable_augmentations_are_refused() -> None:
-    """Vectors have no views; crops are smaller than images, else they would be no augmentation."""
+    """Of vectors, and crops that are not smaller than the images in each direction."""
     for name in ("shift", "crop"):
-        with pytest.raises(ValueError, match=f"augmentation='{name}' works on images"):
-            tiny_model("MlpPolicy", VectorBox(), augmentation=name)
-    for size in (0, 36, 40):
-        with pytest.raises(ValueError, match=f"augmentation='crop' cuts {size} x {size} pixels"):
-            tiny_model("CnnPolicy", PixelBox(), augmentation="crop", augmentation_kwargs={"size": size})
+        with pytest.raises(ValueError, match=f"augmentation='{name}' needs images"):
+            make_augmentation(name, spaces.Box(-1, 1, (3,)))
+    for size in (0, 36, 40, (30, 40), (36, 30)):
+        with pytest.raises(ValueError, match="augmentation='crop' cannot cut"):
+            make_augmentation("crop", image_space(3, 36, 40), size=size)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +197,7 @@ def test_unusable_augmentations_are_refused() -> None:
         ("rae", None, 36, Augmentation),
     ],
 )
-def test_auto_is_what_the_head_asks_for(srl: str | None, augmentation: str | None, size: int, expected: type) -> None:
+def test_auto_is_chosen_by_the_head(srl: str | None, augmentation: str | None, size: int, expected: type) -> None:
     """The policy owns one, which its head shares; without a head augmentation alone is DrQ's idea."""
     arguments: dict[str, Any] = dict(srl=srl, augmentation=augmentation, buffer_size=40, curiosity=None)
     model = tiny_model("CnnPolicy", PixelBox(size=size), **arguments, policy_kwargs={"share_encoder": True})
@@ -208,7 +215,7 @@ def test_arguments_reach_the_augmentation() -> None:
 
 @pytest.mark.parametrize("augmentation, size", [("shift", 36), ("crop", 30)])
 def test_training_sees_views_acting_the_centre(augmentation: str, size: int) -> None:
-    """Observations and next observations are viewed anew, scaled to [0, 1]; `predict` never draws a view."""
+    """Observations and next observations are viewed anew in each update; `predict` never draws a view."""
     kwargs: dict[str, Any] = {"augmentation_kwargs": {"size": 30}} if augmentation == "crop" else {}
     model = filled_model(pixels=True, augmentation=augmentation, learning_rate=0.0, curiosity=None, **kwargs)
     policy = model.policy
@@ -229,10 +236,10 @@ def test_training_sees_views_acting_the_centre(augmentation: str, size: int) -> 
     assert len(drawn) == 2 and not th.equal(drawn[0][0], drawn[1][0])
     assert drawn[0][1].shape[2:] == (size, size)
     for (_, views), inputs in zip(drawn, seen, strict=True):
-        th.testing.assert_close(inputs, views.float() / 255)
+        assert th.equal(inputs, views)
     seen.clear()
     observation = PixelBox().reset(seed=0)[0]
     before = th.get_rng_state()
     model.predict(observation, deterministic=True)
     assert th.equal(th.get_rng_state(), before) and len(drawn) == 2
-    th.testing.assert_close(seen[0], original.center(th.as_tensor(observation)[None]).float() / 255)
+    assert th.equal(seen[0], original.center(th.as_tensor(observation)[None]))

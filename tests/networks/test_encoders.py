@@ -1,5 +1,6 @@
-"""Encoders and the networks that read them: architecture, initialisation, ranges and number formats."""
+"""Encoders: architecture, initialisation, what they read, and the statistics that standardise vectors."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -15,11 +16,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.data.samples import Samples
-from sb3_cure.networks import layers
+from sb3_cure.networks import encoders
 from sb3_cure.networks.decoders import PixelDecoder
-from sb3_cure.networks.encoders import Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.networks.layers import conv_sizes, preprocess
+from sb3_cure.networks.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
+from sb3_cure.networks.layers import RunningStandardize, conv_sizes
 
 
 def image_space(channels: int = 3, height: int = 84, width: int | None = None) -> spaces.Box:
@@ -99,53 +99,55 @@ def test_delta_orthogonal_initialisation(module: nn.Module) -> None:
     assert len(kinds) == 2
 
 
-def test_actors_and_critics_are_initialised_alike() -> None:
-    """Orthogonal linear maps and zero biases in both agents (SAC-AE), not torch's default."""
-    policy = tiny_model("CnnPolicy", PixelBox()).policy
-    for network in (policy.actor, policy.critic, policy.curious.actor, policy.curious.critic):
-        linear = [layer for layer in network.modules() if isinstance(layer, nn.Linear | layers.EnsembleLinear)]
-        assert len(linear) >= 2
-        for layer in linear:
-            weights = layer.weight.detach()
-            for weight in weights if weights.dim() == 3 else [weights]:
-                smaller = weight if len(weight) <= weight.shape[1] else weight.T
-                th.testing.assert_close(smaller @ smaller.T, th.eye(len(smaller)), rtol=0, atol=1e-5)
-            assert not layer.bias.any()
-
-
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 6))
 @settings(deadline=None, max_examples=60)
 def test_smallest_image(height: int, width: int, n_layers: int) -> None:
-    """Just the sizes through which a 3x3 window fits at every layer are accepted, and their shapes are foretold."""
+    """Exactly the sizes through which a 3x3 window fits at every layer are accepted, with the right shapes."""
     layers = [nn.Conv2d(1, 1, 3, stride=2 if i == 0 else 1) for i in range(n_layers)]
     try:
         expected = tuple(nn.Sequential(*layers)(th.zeros(1, 1, height, width)).shape[2:])
     except RuntimeError:
-        with pytest.raises(ValueError, match=rf"{height}x{width} pixels are too small for {n_layers} convolutions"):
+        with pytest.raises(ValueError, match=f"need at least {4 * n_layers - 1}x{4 * n_layers - 1}"):
             conv_sizes(height, width, n_layers)
     else:
         assert conv_sizes(height, width, n_layers)[-1] == expected
 
 
-def test_an_image_that_is_too_small_is_refused_with_the_size_that_would_do() -> None:
-    """The sentence names the smallest size, which works."""
-    with pytest.raises(ValueError, match=r"14x20 pixels are too small for 4 convolutions, which need at least 15x15"):
-        PixelEncoder(image_space(3, 14, 20))
-    space = image_space(3, 15, 20)
-    assert PixelEncoder(space, n_filters=2)(images(space)).shape == (2, 50)
+@pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
+@pytest.mark.parametrize("make", [PixelEncoder, lambda space: make_encoder(MeanColour, space)])
+def test_bytes_and_scaled_floats_give_the_same_latents(make: Any, memory_format: th.memory_format) -> None:
+    """Views in 0-255, as stored, and images in [0, 1]; neither is written to."""
+    space = image_space(3, 20, 24)
+    encoder = make(space)
+    views = th.randint(256, (2, *space.shape), dtype=th.uint8, generator=th.Generator().manual_seed(0))
+    views = views.contiguous(memory_format=memory_format)
+    scaled = views.float() / 255
+    before = views.clone(), scaled.clone()
+    assert th.equal(encoder(views), encoder(scaled))
+    assert th.equal(views, before[0]) and th.equal(scaled, before[1])
+
+
+def test_large_cameras_are_warned_of_before_memory_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the parameters that the projection would have, and a remedy."""
+
+    def allocate(*args: Any) -> None:
+        raise AssertionError("allocated")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(PixelEncoder(image_space(9, 100)).projection.linear.weight) == 50
+        monkeypatch.setattr(encoders, "Projection", allocate)
+        for height, width, n in ((480, 640, 117), (240, 320, 28)):
+            with pytest.raises(UserWarning, match=rf"{height}x{width} .* {n} million parameters, .* ResizeImages"):
+                PixelEncoder(image_space(3, height, width))
 
 
 @pytest.mark.parametrize("features_dim", [1, 2])
 def test_too_few_latents_are_refused(features_dim: int) -> None:
-    """LayerNorm makes 0 of one number, and of two their order: no observation would be told from another."""
+    """LayerNorm makes 0 of one number, and of two their order: all observations would look alike."""
     for make in (lambda **k: PixelEncoder(image_space(), **k), lambda **k: VectorEncoder(spaces.Box(-1, 1, (7,)), **k)):
         with pytest.raises(ValueError, match=rf"features_dim is {features_dim}, .* use at least 3"):
             make(features_dim=features_dim)
-
-
-def test_pixel_encoder_refuses_vectors() -> None:
-    with pytest.raises(ValueError, match=r"shape \(7,\): use 'MlpPolicy' for vectors"):
-        PixelEncoder(spaces.Box(-1, 1, (7,)))
 
 
 @pytest.mark.parametrize(
@@ -204,33 +206,6 @@ class Viewing(BaseFeaturesExtractor):
         return self.linear(features.view(len(features), -1))
 
 
-class ImageAndVector(BaseFeaturesExtractor):
-    """A user's extractor of a dictionary, as SB3's documentation writes it."""
-
-    def __init__(self, observation_space: spaces.Dict):
-        super().__init__(observation_space, 6)
-        self.image = Viewing(observation_space["front"])
-        self.vector = nn.Linear(2, 1)
-
-    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        return th.cat([self.image(observations["front"]), self.vector(observations["joints"])], dim=1)
-
-
-def test_vectors_beside_images_reach_an_extractor_in_full_precision() -> None:
-    """.5000 and .5005, which are one number in bf16."""
-    policy_kwargs = {"features_extractor_class": ImageAndVector}
-    env = SensorBox(("front", "joints"))
-    policy = tiny_model("MultiInputPolicy", env, srl="forward", precision="bf16", policy_kwargs=policy_kwargs).policy
-    seen = {
-        "front": th.zeros(2, 6, 36, 36, dtype=th.uint8),
-        "joints": th.tensor([[0.5, 0.5], [0.5005, 0.5]]),
-    }
-    with th.autocast("cpu", th.bfloat16):
-        latents = policy.encode(seen)
-    expected = 0.0005 * policy.encoder.trunk.extractor.vector.weight[0, 0]
-    th.testing.assert_close(latents[1, 5] - latents[0, 5], expected, rtol=1e-2, atol=0)
-
-
 @pytest.mark.parametrize(
     "policy, env, extractor, kwargs, srl_kwargs",
     [
@@ -248,14 +223,13 @@ def test_vectors_beside_images_reach_an_extractor_in_full_precision() -> None:
     ],
     ids=["nature-rae", "nature-curl", "own-curl-crop", "own-vector", "own-view"],
 )
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("update", ["joint", "sequential"])
 def test_any_features_extractor_is_shared(
-    policy: str, env: gym.Env, extractor: type, kwargs: dict[str, Any], srl_kwargs: Any, update: str, precision: str
+    policy: str, env: gym.Env, extractor: type, kwargs: dict[str, Any], srl_kwargs: Any, update: str
 ) -> None:
     """It is trained, every part of the agent reads it, and actors have a projection of its features."""
     policy_kwargs = {"features_extractor_class": extractor, "features_extractor_kwargs": kwargs}
-    model = tiny_model(policy, env, policy_kwargs=policy_kwargs, update=update, precision=precision, **srl_kwargs)
+    model = tiny_model(policy, env, policy_kwargs=policy_kwargs, update=update, **srl_kwargs)
     encoder = model.policy.encoder
     dim = kwargs.get("features_dim", 12 if extractor is MeanColour else 5)
     assert isinstance(encoder, Encoder)
@@ -278,85 +252,6 @@ def test_make_encoder_leaves_ours_as_they_are() -> None:
     x = images(space)
     assert isinstance(wrapped, Encoder)
     assert th.equal(wrapped(x), wrapped.trunk(x))
-
-
-def test_log_std_is_rescaled_not_clamped() -> None:
-    """Within [-10, 2] (the paper's bounds) for any features, the middle at 0, with a gradient almost everywhere."""
-    actor = tiny_model("CnnPolicy", PixelBox()).policy.actor
-    features = th.rand(64, actor.features_extractor.linear.in_features, generator=th.Generator().manual_seed(0))
-    raw = actor.log_std(actor.latent_pi(actor.features_extractor(features))).detach()
-    _, log_std, _ = actor.get_action_dist_params(features)
-    th.testing.assert_close(log_std.detach(), -4 + 6 * raw.tanh())
-    log_std.sum().backward()
-    assert float(actor.log_std.bias.grad.abs().min()) > 0
-    with th.no_grad():
-        actor.log_std.weight.mul_(1e3)
-        extreme = actor.get_action_dist_params(features)[1]
-    assert -10 <= float(extreme.min()) < -9.99
-    assert 1.99 < float(extreme.max()) <= 2
-
-
-def test_log_probability_is_that_of_the_squashed_gaussian() -> None:
-    """Against the change of variables, written out: log N(u; mu, sigma) - sum log(1 - tanh(u)^2)."""
-    actor = tiny_model("CnnPolicy", PixelBox()).policy.actor
-    features = th.rand(8, actor.features_extractor.linear.in_features, generator=th.Generator().manual_seed(0))
-    with th.no_grad():
-        actions, log_prob = actor.action_log_prob(features)
-        mean, log_std, _ = actor.get_action_dist_params(features)
-    u = np.arctanh(actions.double().numpy())
-    mu, sigma = mean.double().numpy(), np.exp(log_std.double().numpy())
-    gaussian = -0.5 * ((u - mu) / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2 * np.pi)
-    expected = (gaussian - np.log(1 - np.tanh(u) ** 2)).sum(axis=1)
-    np.testing.assert_allclose(log_prob[:, 0].numpy(), expected, rtol=1e-3, atol=1e-3)
-
-
-def test_bf16_stays_within_the_hidden_layers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under autocast wide layers compute in bf16; latents, Q, log-probabilities, targets and losses are fp32."""
-    monkeypatch.setattr(layers, "WIDE", 0)
-    model = tiny_model("CnnPolicy", PixelBox(), precision="bf16", policy_kwargs={"net_arch": [16, 16]})
-    policy = model.policy
-    observations = th.randint(256, (4, 6, 36, 36), dtype=th.uint8, generator=th.Generator().manual_seed(0))
-    zeros = th.zeros(4, 1)
-    batch = Samples(observations, th.zeros(4, 2), observations, zeros, zeros, views=observations)
-    hidden: list[th.dtype] = []
-    for layer in (policy.encoder.trunk[0], policy.encoder.projection.linear, policy.actor.latent_pi[2]):
-        layer.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
-    policy.critic.ensemble[2].register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
-    policy.srl.decoder.linear.register_forward_hook(lambda module, inputs, output: hidden.append(output.dtype))
-
-    def compute() -> dict[str, th.Tensor]:
-        features = policy.encoder.trunk(policy.center(observations))
-        latents = policy.encoder.projection(features)
-        th.manual_seed(0)
-        actions, log_prob = policy.actor.action_log_prob(features)
-        mean, log_std, _ = policy.actor.get_action_dist_params(features)
-        q_values = policy.critic(latents, batch.actions)
-        loss, error = policy.srl.loss(batch, latents)
-        own = policy.actor.features_extractor(features)
-        actor = {"own": own, "actions": actions, "log_prob": log_prob, "mean": mean, "log_std": log_std}
-        return {**actor, "latents": latents, "q": q_values, "loss": loss, "error": error}
-
-    with th.no_grad(), model._autocast():
-        halves = compute()
-    assert set(hidden) == {th.bfloat16}
-    assert len(hidden) == 6
-    with th.no_grad():
-        full = compute()
-    for name, value in halves.items():
-        assert value.dtype == th.float32, name
-        if name not in ("loss", "error"):
-            th.testing.assert_close(value, full[name], rtol=0.05, atol=0.05)
-    assert {parameter.dtype for parameter in policy.parameters()} == {th.float32}
-
-
-@pytest.mark.parametrize("memory_format", [th.contiguous_format, th.channels_last])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_preprocessing_leaves_its_input_alone(channels: int, memory_format: th.memory_format) -> None:
-    """Also of floats, which a caller may still own."""
-    space = image_space(channels, 20)
-    given = th.full((2, channels, 20, 20), 200.0).contiguous(memory_format=memory_format)
-    scaled = preprocess(given, space)
-    assert (given == 200).all() and scaled.max() == th.tensor(200.0) / 255
 
 
 @pytest.mark.parametrize("update", ["joint", "sequential"])
@@ -386,24 +281,97 @@ def test_pretrained_extractor_may_be_frozen(update: str) -> None:
     assert changed == {"head", "critic", "actor"}
 
 
-@pytest.mark.parametrize("update", ["joint", "sequential"])
-def test_what_is_frozen_in_training_stays(update: str) -> None:
-    """Also where the last update before left a gradient."""
-    model = tiny_model("CnnPolicy", PixelBox(), update=update).learn(15)
-    frozen = [model.policy.encoder.trunk[0], model.policy.srl.decoder, model.policy.critic.ensemble[0]]
-    before = [parameter.clone() for part in frozen for parameter in part.requires_grad_(False).parameters()]
-    model.learn(5, reset_num_timesteps=False)
-    assert all(map(th.equal, before, (parameter for part in frozen for parameter in part.parameters())))
+# ---------------------------------------------------------------- running statistics of vectors
 
 
-def test_bf16_and_fp32_train_alike() -> None:
-    """A few updates from equal weights on equal data: losses differ by bf16's rounding only, parameters stay finite."""
-    losses = {}
-    for precision in ("fp32", "bf16"):
-        model = tiny_model("CnnPolicy", PixelBox(), precision=precision, learning_rate=1e-4)
-        model.learn(14, log_interval=10**9)
-        logged = model.logger.name_to_value
-        losses[precision] = [float(logged[f"train/{name}"]) for name in ("srl_loss", "critic_loss", "actor_loss")]
-        assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
-    assert losses["bf16"] == pytest.approx(losses["fp32"], rel=0.05)
-    assert losses["bf16"] != losses["fp32"]
+def vectors(n: int, seed: int) -> th.Tensor:
+    """Joints of .1 rad beside forces of 100 N, one of them constant."""
+    noise = th.randn(n, 4, generator=th.Generator().manual_seed(seed))
+    return noise * th.tensor([0.1, 100.0, 0.1, 0.0]) + th.tensor([0.0, 50.0, 1.0, 1000.1])
+
+
+def standardizer(**kwargs: Any) -> RunningStandardize:
+    return RunningStandardize(spaces.Box(-np.inf, np.inf, (4,)), **kwargs)
+
+
+def test_entries_are_standardised_each_by_itself() -> None:
+    """After any number of updates by mean and deviation of all batches; a constant entry gives 0."""
+    standardize, seen = standardizer(), [vectors(64, seed) for seed in range(5)]
+    for batch in seen:
+        standardize.update(batch)
+    together = th.cat(seen)
+    expected = (together - together.mean(dim=0)) / together.std(dim=0, correction=0)
+    found = standardize(together)
+    # Early batches weigh a little less than late ones.
+    th.testing.assert_close(found[:, :3], expected[:, :3], rtol=0.02, atol=0.02)
+    assert not found[:, 3].any()
+
+
+def test_old_batches_fade() -> None:
+    standardize = standardizer(decay=0.9)
+    for seed in range(100):
+        standardize.update(vectors(256, seed) + (0 if seed < 20 else 7))
+    found = standardize(vectors(256, 200) + 7)
+    assert found[:, :3].mean(dim=0).abs().max() < 0.2
+
+
+def test_nothing_explodes() -> None:
+    """Outliers are clipped, infinite numbers move no statistics, and before the first update none are used."""
+    standardize = standardizer()
+    th.testing.assert_close(standardize(th.tensor([[0.5, -1.0, 200.0, 0.0]])), th.tensor([[0.5, -1.0, 10.0, 0.0]]))
+    standardize.update(vectors(64, 0))
+    state = {name: value.clone() for name, value in standardize.state_dict().items()}
+    standardize.update(th.full((4, 4), th.inf))
+    assert all(th.equal(value, state[name]) for name, value in standardize.state_dict().items())
+    assert standardize(th.full((1, 4), 1e9)).tolist() == [[10.0, 10.0, 10.0, 0.0]]
+
+
+def test_joints_move_latents_beside_forces() -> None:
+    """.1 rad beside forces of 100 N moves the joint's entry by its deviation, and nothing else."""
+    space = spaces.Dict({"front": image_space(3, 36), "joints": spaces.Box(-np.inf, np.inf, (4,))})
+    encoder = DictEncoder(space, n_filters=2)
+    views = {"front": th.zeros(64, 3, 36, 36, dtype=th.uint8), "joints": vectors(64, 0)}
+    encoder.update_statistics(views)
+    moved = {**views, "joints": views["joints"] + th.tensor([0.1, 0.0, 0.0, 0.0])}
+    difference = (encoder(moved) - encoder(views)).detach()
+    assert 0.8 < float(difference[:, 50].mean()) < 1.2
+    difference[:, 50] = 0
+    assert not difference.any()
+    assert encoder.features_dim == 50 + 4 and encoder.make_projection()(encoder.trunk(views)).shape == (64, 54)
+
+
+def test_dictionaries_without_images_are_one_vector() -> None:
+    """Discrete values one-hot, in the order of the keys."""
+    space = spaces.Dict({"goal": spaces.Box(-1, 1, (2, 2)), "mode": spaces.Discrete(3)})
+    views = {"goal": th.rand(5, 2, 2), "mode": th.tensor([0, 1, 2, 1, 0])}
+    encoder = VectorEncoder(space, features_dim=6)
+    joined = th.cat([views["goal"].flatten(1), F.one_hot(views["mode"], 3)], dim=1)
+    th.testing.assert_close(encoder.trunk[0](views), joined)  # type: ignore[index]
+    encoder.update_statistics(views)
+    th.testing.assert_close(encoder.trunk[0].mean, joined.mean(dim=0))  # type: ignore[index]
+    assert encoder(views).shape == (5, 6)
+
+
+@pytest.mark.parametrize("policy, env", [("MlpPolicy", VectorBox), ("MultiInputPolicy", SensorBox)])
+def test_statistics_follow_updates_alone(policy: str, env: type[gym.Env]) -> None:
+    """Once an update, those of targets too; never while acting, nor where the representation is frozen."""
+    srl = "forward" if policy == "MultiInputPolicy" else "rae"
+    model = tiny_model(policy, env(), srl=srl).learn(10)
+
+    def statistics(encoder: Encoder) -> dict[str, th.Tensor]:
+        return {name: value.clone() for name, value in encoder.named_buffers()}
+
+    def n_updates() -> float:
+        (weight,) = (value for name, value in statistics(model.policy.encoder).items() if name.endswith("weight"))
+        return float(np.log1p(-float(weight[0])) / np.log(0.999))
+
+    assert n_updates() == 0
+    for total in (11, 12, 15):
+        model.learn(total - model.num_timesteps, reset_num_timesteps=False)
+        assert n_updates() == pytest.approx(total - 10, rel=1e-3)
+        target = statistics(model.policy.encoder_target)
+        assert all(th.equal(value, target[name]) for name, value in statistics(model.policy.encoder).items())
+    model.predict(model.env.reset())
+    model.policy.freeze_representation()
+    model.train(2, 8)
+    assert n_updates() == pytest.approx(5, rel=1e-3)

@@ -318,7 +318,7 @@ SCRIPT = textwrap.dedent(
     else:
         model = CuReSAC(
             "CnnPolicy", env, learning_starts=20, batch_size=8, buffer_size=150, warmup_updates=5, precision="fp32",
-            compile=False, seed=0, device="cpu",
+            seed=0, device="cpu",
             policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
         )
     model.set_logger(configure(str(folder / "logs"), ["csv"]))

@@ -36,7 +36,7 @@ class Denoising(SRLHead):
         return SRLOutput(error.mean(), error.detach())
 
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        return (self.decoder(latents) - self.preprocess(batch.views).flatten(1)).square().mean(dim=1)
+        return (self.decoder(latents) - (batch.views.float() / 255).flatten(1)).square().mean(dim=1)
 
     def reconstruct(self, latents: th.Tensor) -> th.Tensor:
         drawn = self.decoder(latents).view(-1, *self.observation_space.shape)

@@ -49,7 +49,7 @@ class Lookup(Encoder):
         self.table = table
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.table[(observations[:, 0, 0, 0] * 255).round().long()]
+        return self.table[observations[:, 0, 0, 0].long()]
 
 
 @pytest.mark.parametrize("batch_size", [2, 16, 128])

@@ -1,14 +1,12 @@
-"""The quick ways of doing things do the same things: overlapped updates, bfloat16, no waiting for the device."""
+"""Updates overlap with environment steps, and never wait for the device."""
 
-import copy
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
-from envs_for_tests import PixelBox, gradients_of_an_update, samples_of, tiny_model
+from envs_for_tests import PixelBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -176,54 +174,6 @@ def test_overlap_needs_worker_processes(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"overlap=True .* in this process .* vec_env_cls=SubprocVecEnv"):
         loaded.learn(5)
     CuReSAC.load(tmp_path / "model", env=PixelBox(), overlap=False).learn(5)
-
-
-# ----------------------------------------------------------------------- bfloat16
-
-
-@pytest.mark.parametrize("srl", ["rae", "curl"])
-def test_bfloat16_gradients_point_where_those_of_float32_do(srl: str) -> None:
-    """One state, one batch, one stream of random numbers: cosine of at least 0.99 for every part of the agent.
-
-    A batch of the paper's size: in one of a few samples an actor's gradients may nearly cancel.
-    """
-    arguments: dict[str, Any] = dict(
-        srl=srl,
-        update="joint",
-        batch_size=128,
-        policy_kwargs=dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=16, n_layers=3)),
-    )
-    trained = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(60)
-    state = copy.deepcopy(trained.get_parameters())
-    found = {}
-    for precision in ("fp32", "bf16"):
-        model = tiny_model("CnnPolicy", PixelBox(), precision=precision, **arguments)
-        model.set_logger(trained.logger)
-        model.set_parameters(state)
-        model.replay_buffer = trained.replay_buffer
-        found[precision] = gradients_of_an_update(model, seed=5)
-    assert found["fp32"].keys() == found["bf16"].keys() and len(found["fp32"]) == 6
-    for name, expected in found["fp32"].items():
-        cosine = float(th.cosine_similarity(expected, found["bf16"][name], dim=0))
-        assert cosine >= 0.99, (name, cosine)
-
-
-@pytest.mark.parametrize("srl", ["rae", "curl"])
-def test_losses_are_computed_in_float32(srl: str) -> None:
-    """Within bfloat16 networks the head's loss and errors, the Q values and the log-probabilities are float32."""
-    model = tiny_model("CnnPolicy", PixelBox(), srl=srl, precision="bf16").learn(12)
-    policy, batch = model.policy, samples_of(model, 8)
-    with model._autocast():
-        images = policy.augment(batch.observations)
-        assert images.dtype == th.bfloat16
-        features = policy.encoder.trunk(images)
-        assert features.dtype == th.bfloat16
-        latents = policy.encoder.projection(features)
-        loss, error = policy.srl.loss(batch, latents)
-        actions, log_prob = policy.actor.action_log_prob(features)
-        q_values = policy.critic(latents, actions)
-    for value in (latents, loss, error, actions, log_prob, q_values, policy.srl.error(batch, latents)):
-        assert value.dtype == th.float32
 
 
 # ------------------------------------------------------------ waiting for the device
