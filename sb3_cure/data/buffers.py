@@ -85,13 +85,13 @@ class FrameRing:
         slots = np.zeros((len(stacks), 2, self.frame_stack), np.int32)
         continues = np.zeros(len(stacks), bool)
         for i, (stack, successor) in enumerate(zip(stacks, successors, strict=True)):
-            if tails is not None:
-                continues[i] = np.array_equal(self.frames[tails[i]], stack)
+            same = tails is not None and np.array_equal(self.frames[tails[i]], stack)
             # A shared frame must outlive this `add` and the next one.
-            if continues[i] and self._ages(tails[i], count).max() < self.capacity - 2 * self.max_new:  # type: ignore[index]
+            if same and self._age(tails[i, 0], count) < self.capacity - 2 * self.max_new:  # type: ignore[index]
                 slots[i, 0] = tails[i]  # type: ignore[index]
             else:
                 slots[i, 0], count = self._put(stack, count)
+            continues[i] = same
             if np.array_equal(successor[:-1], stack[1:]):
                 slots[i, 1, :-1] = slots[i, 0, 1:]
                 slots[i, 1, -1:], count = self._put(successor[-1:], count)
@@ -109,9 +109,9 @@ class FrameRing:
             slots.append((count - 1) % self.capacity)
         return slots, count
 
-    def _ages(self, slots: ndarray, count: int) -> ndarray:
-        """How many frames were stored after those in the slots."""
-        return (count - 1 - slots) % self.capacity
+    def _age(self, slot: int, count: int) -> int:
+        """Number of frames stored after the one in the slot."""
+        return (count - 1 - int(slot)) % self.capacity
 
     def is_lost(self, slots: ndarray, count: int) -> bool:
         """
@@ -121,7 +121,7 @@ class FrameRing:
         :param count: Frames stored so far
         :return: Whether it may
         """
-        return bool(self._ages(slots[:, 0, 0], count).max() >= self.capacity - self.max_new)
+        return max(self._age(slot, count) for slot in slots[:, 0, 0]) >= self.capacity - self.max_new
 
     def stacks(self, slots: ndarray) -> ndarray:
         """
@@ -209,6 +209,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage, self.handle_timeout_termination = False, handle_timeout_termination
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
+        self._spaces = by_key(getattr(observation_space, "spaces", observation_space))
+        self._shapes = {key: (n_envs, *shape) for key, shape in by_key(self.obs_shape).items()}
         self.reset()
 
         def zeros(*shape: int, dtype: Any = np.float32) -> ndarray:
@@ -218,7 +220,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         for key, space in self._spaces.items():
             if key not in self.rings:
                 for name in ("observations", "next_observations"):
-                    self.rows[f"{name}/{key}"] = zeros(*by_key(self.obs_shape)[key], dtype=space.dtype)
+                    self.rows[f"{name}/{key}"] = zeros(*self._shapes[key][1:], dtype=space.dtype)
         self.rows["actions"] = zeros(self.action_dim, dtype=self._maybe_cast_dtype(action_space.dtype))
         self.rows |= {name: zeros() for name in ("rewards", "dones", "timeouts")}
         self.rows["starts"] = zeros(dtype=bool)
@@ -232,10 +234,6 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     #: Whether a row's observation is not the successor stored in the row before, bool [buffer_size, n_envs]
     starts: ndarray
-
-    @property
-    def _spaces(self) -> dict[str, spaces.Space]:
-        return by_key(getattr(self.observation_space, "spaces", self.observation_space))
 
     @property
     def nbytes(self) -> int:
@@ -301,7 +299,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         checked = {}
         for key, space in self._spaces.items():
             array = np.asarray(by_key(observations)[key])
-            shape = (self.n_envs, *by_key(self.obs_shape)[key])
+            shape = self._shapes[key]
             what = f"the observation {key!r}" if key else "the observation"
             if (array.size != self.n_envs) if isinstance(space, spaces.Discrete) else (array.shape != shape):
                 raise ValueError(f"{what} has shape {array.shape}, but the replay buffer stores {shape}.")
@@ -375,7 +373,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         parts: dict[str, Any] = {}
         for key in self._spaces:
             if key in self.rings:  # of both at once
-                parts[key] = self.rings[key].stacks(self.rows[f"slots/{key}"][rows, env_inds, which].swapaxes(0, 1))
+                parts[key] = self.rings[key].stacks(self.rows[f"slots/{key}"][rows, env_inds].swapaxes(0, 1)[which])
             else:
                 names = ("observations", "next_observations")[which]
                 parts[key] = [self.rows[f"{name}/{key}"][rows, env_inds] for name in names]
