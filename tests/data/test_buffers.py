@@ -57,16 +57,6 @@ def test_any_stream_equals_sb3s(twins: Twins) -> None:
     event(f"wrapped: {twins.ours.full}, rows lost: {twins.ours.size() < twins.sb3.size()}, {twins.kind}")
 
 
-@all_kinds
-@pytest.mark.parametrize(("frame_stack", "n_envs"), [(1, 3), (2, 1), (4, 3)])
-def test_long_streams_wrap_around_often(kind: str, frame_stack: int, n_envs: int) -> None:
-    twins, rng = Twins(37 * n_envs, n_envs, frame_stack, kind), np.random.default_rng(0)
-    for t in range(300):
-        twins.step(random_events(rng, n_envs, EVENTS))
-        if t % 10 == 0:
-            twins.check()
-
-
 def distinct_frame(number: int) -> np.ndarray:
     frame = np.zeros((1, 4, 5), np.uint8)
     frame.flat[:3] = number & 255, number >> 8 & 255, number >> 16
@@ -146,17 +136,6 @@ def test_sampling_is_uniform_where_rows_are_lost() -> None:
     np.testing.assert_array_equal(values, np.arange(twins.n_added - n_transitions, twins.n_added))
     # Binomial, 5 standard deviations
     assert np.abs(counts - 2000).max() < 5 * 2000**0.5
-
-
-@all_kinds
-def test_equal_seeds_leave_equal_generators(kind: str) -> None:
-    twins, after = Twins(90, 3, kind=kind), set()
-    for _ in range(20):
-        twins.step(random_events(np.random.default_rng(0), 3, ("step",)))
-    for buffer in (twins.ours, twins.sb3):
-        seeded_sample(buffer)
-        after.add(np.random.random())
-    assert len(after) == 1
 
 
 def test_inputs_are_copied_and_batches_are_copies() -> None:

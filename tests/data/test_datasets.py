@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from updates_for_tests import ALGORITHMS
 
 from sb3_cure import CuReSAC
-from sb3_cure.data.buffers import FrameStackReplayBuffer, transitions
+from sb3_cure.data.buffers import transitions
 from sb3_cure.data.datasets import RecordedEpisode, RecordEpisodes, load_episode, save_episode
 from sb3_cure.evaluation.rollouts import run_episodes
 from sb3_cure.persistence import ExactCheckpoint
@@ -293,23 +293,6 @@ class Interrupt(BaseCallback):
         if self.num_timesteps == self.at:
             raise KeyboardInterrupt
         return True
-
-
-def test_calls_that_were_over_are_skipped_after_a_kill(tmp_path: Path) -> None:
-    """A script that is run again neither loads nor fits twice, and ends as one that was not killed."""
-    record(VectorBox, tmp_path / "episodes", 20)
-
-    def script(model: CuReSAC, *callbacks: BaseCallback) -> CuReSAC:
-        model.load_transitions(tmp_path / "episodes")
-        return model.fit_representation(5).learn(40, callback=list(callbacks))
-
-    checkpoint = ExactCheckpoint(10, tmp_path / "checkpoints")
-    with pytest.raises(KeyboardInterrupt):
-        script(tiny_model("MlpPolicy", VectorBox()), checkpoint, Interrupt())
-    resumed = script(CuReSAC.resume(tmp_path / "checkpoints", VectorBox(), device="cpu"))
-    whole = script(tiny_model("MlpPolicy", VectorBox()))
-    assert type(whole.replay_buffer) is FrameStackReplayBuffer and whole.replay_buffer.size() == 60
-    assert differences(state_of(whole), state_of(resumed)) == []
 
 
 def test_resumed_run_records_each_episode_once(tmp_path: Path) -> None:

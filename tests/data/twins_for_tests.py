@@ -98,8 +98,9 @@ class Twins:
     def add(self, obs: Any, next_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         rewards = self.n_added + np.arange(self.n_envs, dtype=np.float32)
         actions = np.stack([self.action_space.sample() for _ in range(self.n_envs)])
-        for buffer in (self.ours, self.sb3):
-            parts = ({**each} if isinstance(each, dict) else each for each in (obs, next_obs))
+        buffers: Any = (self.ours, self.sb3)
+        for buffer in buffers:
+            parts: Any = ({**each} if isinstance(each, dict) else each for each in (obs, next_obs))
             buffer.add(*parts, actions, rewards, dones, infos)
         begins = np.ones(self.n_envs, bool)
         if self.last is not None:
@@ -137,7 +138,9 @@ class Twins:
             batch = seeded_sample(ours)
             assert_equal(transitions(ours, *ours.last_sampled), batch)  # type: ignore[misc]
             if ours.size() == sb3.size():
+                after = np.random.random()
                 assert_equal(batch, seeded_sample(sb3))
+                assert np.random.random() == after
 
 
 def _parts(observations: Any) -> list[np.ndarray]:

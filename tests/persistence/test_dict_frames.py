@@ -33,6 +33,8 @@ def test_checkpoint_adds_the_new_frames_of_each_image(tmp_path: Path) -> None:
         assert all(sizes[name] == (last - first) * frame for name, first, last in spans)
     resumed: Any = CuReSAC.resume(tmp_path, environment(), device="cpu")
     rows, env_inds, _ = stored_places(buffer)
+    found: Any
+    expected: Any
     found, expected = (transitions(each, rows, env_inds) for each in (resumed.replay_buffer, buffer))
     for key in ("front", "joints", "wrist"):
         np.testing.assert_array_equal(found.next_observations[key], expected.next_observations[key])
