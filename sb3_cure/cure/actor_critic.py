@@ -9,7 +9,7 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from sb3_cure.cure.critics import LatentCritic
-from sb3_cure.networks.layers import run_mlp
+from sb3_cure.networks.layers import MixedPrecision, run_mlp
 
 # Bounds of the actor's log standard deviation (paper, table of hyperparameters); SB3 clamps to [-20, 2] instead.
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -17,7 +17,7 @@ LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 EPSILON = 1e-6
 
 
-class TrunkActor(Actor):
+class TrunkActor(MixedPrecision, Actor):
     """SAC's actor on the (detached) trunk features of the shared encoder, behind a projection of its own."""
 
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
@@ -26,7 +26,7 @@ class TrunkActor(Actor):
         :param obs: Trunk features of the encoder, [B, trunk_dim]
         :return: Mean and log standard deviation, [B, action_dim] each, and an empty dictionary
         """
-        latent = run_mlp(self.latent_pi, self.features_extractor(obs))
+        latent = run_mlp(self.latent_pi, self.features_extractor(obs), self.compute_dtype)
         # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
         log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)

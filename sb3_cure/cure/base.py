@@ -20,7 +20,7 @@ from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
-from sb3_cure.networks.precision import resolve_precision, set_compute_dtype
+from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments
 
@@ -214,7 +214,9 @@ class CuReBase(OffPolicyAlgorithm):
             warnings.filterwarnings("ignore", "`n_steps=")  # SB3 cannot know that our buffer has returns of n steps
             super()._setup_model()
         self.policy_kwargs = user_kwargs
-        self._set_precision()
+        self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
+        if self.verbose >= 1:
+            print(f"Updates compute in {self._computed_precision} (precision={self.precision!r}).")
         self._setup_temperatures()
 
     def _policy_settings(self) -> dict[str, Any]:
@@ -237,12 +239,6 @@ class CuReBase(OffPolicyAlgorithm):
             curiosity_encoder_grad=self.curiosity_encoder_grad,
             update=self.update,
         )
-
-    def _set_precision(self) -> None:
-        chosen = resolve_precision(self.precision, self.device, self.observation_space)
-        set_compute_dtype(self.policy, th.bfloat16 if chosen == "bf16" else th.float32)
-        if self.verbose >= 1:
-            print(f"Networks compute in {chosen} (precision={self.precision!r}).")
 
     def _setup_temperatures(self) -> None:
         """Let the task's agent adopt SB3's temperature, and give the curious one its own."""
@@ -381,7 +377,7 @@ class CuReBase(OffPolicyAlgorithm):
         self._guard.report()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_guard", "_mixer", "_overlapped", "ent_coef_tensor"]
+        return [*super()._excluded_save_params(), "_guard", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -10,10 +10,10 @@ from sb3_contrib.common.utils import quantile_huber_loss
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.networks.layers import EnsembleLinear, run_mlp
+from sb3_cure.networks.layers import EnsembleLinear, MixedPrecision, run_mlp
 
 
-class LatentCritic(nn.Module):
+class LatentCritic(MixedPrecision):
     """Several critics side by side on the latents of the shared encoder, which they do not own.
 
     :param features_dim: Size of the latents
@@ -49,7 +49,7 @@ class LatentCritic(nn.Module):
         :return: Values in fp32, [B, n_critics, n_values]
         """
         inputs = th.cat([latents, actions], dim=1).expand(self.n_critics, -1, -1)
-        return run_mlp(self.ensemble, inputs).transpose(0, 1)
+        return run_mlp(self.ensemble, inputs, self.compute_dtype).transpose(0, 1)
 
     def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Compute the values to bootstrap from, without the entropy; asked of target critics.

@@ -24,6 +24,7 @@ from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import RewardInputs
 from sb3_cure.networks.augmentations import Augmentation
+from sb3_cure.networks.precision import compute_in
 from sb3_cure.srl import SRLHead, get_srl_class
 
 
@@ -130,7 +131,7 @@ class CuRe(CuReBase):
             for _ in range(2 if self._alternates else 1):
                 batch = self._sample_batch(batch_size, learns_rl)
                 self._guard.update = self._n_updates
-                with crash_report(self, batch):
+                with crash_report(self, batch), compute_in(self.policy, self._computed_precision):
                     metrics.append(self._update(batch, learns_srl, learns_rl))
                 self._n_batches += 1
                 self._n_rl_batches += learns_rl
@@ -173,9 +174,10 @@ class CuRe(CuReBase):
         views = {"observations": batch.views, "next_observations": policy.augmentation(batch.next_observations)}
         if batch.n_step is not None:
             views["n_step"] = policy.augmentation(policy.sense(batch.n_step.next_observations))
-        encoder.begin({name: policy.preprocess(view) for name, view in views.items()}, self._guard.check)
+        encoder.begin(views, self._guard.check)
         if not policy.representation_frozen:
-            policy.encoder.update_statistics(encoder.views["observations"])
+            for each in (policy.encoder, policy.encoder_target):
+                each.update_statistics(batch.views)
 
         metrics: Metrics = {}
         inputs = self._reward_inputs(batch)
@@ -217,7 +219,7 @@ class CuRe(CuReBase):
     @th.no_grad()
     def _next_srl_error(self, srl: SRLHead, batch: Samples) -> th.Tensor:
         views = self.policy.augmentation(batch.next_observations)
-        latents = self.policy.encoder(self.policy.preprocess(views)).float()
+        latents = self.policy.encoder(views)
         # With nothing else, so that no head takes (s', a, s') for a transition.
         return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error  # type: ignore[arg-type]
 

@@ -23,7 +23,7 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, RewardScale, make_reward
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.networks.layers import init_weights, preprocess, set_mode
+from sb3_cure.networks.layers import init_weights, set_mode
 from sb3_cure.srl import DictHead, SRLHead
 
 
@@ -347,21 +347,13 @@ class CuRePolicy(BasePolicy):
         view = self.augmentation if random else self.augmentation.center
         return Samples(**{**fields, "views": _channels_last(view(fields["observations"]))})
 
-    def preprocess(self, views: Any) -> Any:
-        """Make the encoder's input of views.
-
-        :param views: Images in 0-255, vectors, or a dictionary of both
-        :return: Images in [0, 1]
-        """
-        return preprocess(views, self.augmentation.view_space)
-
     def center(self, observations: Any) -> Any:
-        """Make the encoder's input of observations, without randomness, as when acting.
+        """Make the view of observations that has no randomness, as when acting.
 
         :param observations: As stored, [B, *shape]
-        :return: Images in [0, 1]
+        :return: [B, *view shape]
         """
-        return self.preprocess(self.augmentation.center(self.sense(observations)))
+        return self.augmentation.center(self.sense(observations))
 
     def encode(self, observations: Any) -> th.Tensor:
         """Encode observations as the acting agent sees them.
@@ -411,7 +403,7 @@ class CuRePolicy(BasePolicy):
         """
         observations = self.sense(observations)
         latents = self.encode(observations)
-        for part, seen in ((self.srl, self.augmentation.center(observations)), (self.intrinsic, observations)):
+        for part, seen in ((self.srl, self.center(observations)), (self.intrinsic, observations)):
             drawn = None if part is None else part.reconstruct(latents)
             if isinstance(drawn, dict):
                 return images_of(seen, self.sensed_space), drawn

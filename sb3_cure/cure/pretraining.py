@@ -197,7 +197,6 @@ class Pretraining(CuRe):
             return
         if self.policy.curious is None:  # for this pretraining alone
             self.policy.add_curious_agent(get_intrinsic_class(self.intrinsic), self.intrinsic_kwargs)
-            self._set_precision()
             self._setup_curious_temperature()
         self.policy.default_agent = "curious"
 

@@ -137,8 +137,7 @@ class Particle(IntrinsicReward):
         for start in range(0, n_new, CHUNK):
             rows = (buffer.pos - n_new + np.arange(start, min(start + CHUNK, n_new))) % size
             before = (rows - 1) % size
-            continues = buffer._goes_on(*np.broadcast_arrays(before, rows, np.arange(n_envs)[:, None])).T
-            begins = ~continues | (buffer.dones[before] > 0)
+            begins = buffer.starts[rows] | (buffer.dones[before] > 0)
             self._episodes[rows] = self._episodes[before[:1]] + n_envs * begins.cumsum(axis=0)
         self._n_numbered = buffer.n_added
         return self._episodes
