@@ -59,9 +59,9 @@ endef
 
 # Prints the OpenGL renderer in use, or one sentence about what is missing.
 gl: .venv/.installed
-	@if ! $(RUN) sb3_cure.envs.rendering; then
+	@if ! $(RUN) sb3_cure.envs; then
 		$(call apt_install,libegl1 libopengl0 libgl1-mesa-dri)
-		$(RUN) sb3_cure.envs.rendering
+		$(RUN) sb3_cure.envs
 	fi
 
 # A browser that opens the report as its readers do, and a display for windows; without them those tests are skipped.

@@ -6,12 +6,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import RecordConstructorArgs
 
 from sb3_cure.envs.backgrounds import Background, Seed
 from sb3_cure.envs.physics import Proprioception
 from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
-from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, PixelObservation, StackFrames
+from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, StackFrames, at_least_one, to_image
 
 # PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
 ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}
@@ -23,170 +25,127 @@ RENDER_FLAGS: dict[str, dict[str, bool]] = {"dmc": {}, "fast": {"shadow": False,
 VIDEO_SIZE = 256
 
 
-class DMCPixels(PixelObservation):
-    """
-    Observes a dm_control environment through one of its cameras.
+class DMCPixels(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Observes a dm_control environment through cameras, and through the joints of the robot.
 
     ``render()`` is left to the environment, so that videos can have another size than the observations.
 
     :param env: An environment of shimmy that has not rendered yet
-    :param image_size: Height and width of the observation in pixels
+    :param cameras: Index of each camera of the model by the key of its images, -1 for the free camera. The key ``""``,
+        alone, stands for observations that are one image and no dictionary
+    :param image_size: Height and width of the images in pixels
     :param grayscale: One channel of luminance instead of three of RGB
-    :param camera_id: Index of a camera of the model, -1 for its free camera
     :param renderer: ``"dmc"`` or ``"fast"``, see :func:`make_dmc_env`
     :param background: What is seen in place of sky and floor, see :func:`make_dmc_env`
-    :param seed: Of the background
-    :raises ValueError: If there is no such background, or, when first reset, if the model has no such camera
-    """
-
-    def __init__(
-        self,
-        env: gym.Env,
-        image_size: int = 84,
-        grayscale: bool = False,
-        camera_id: int = 0,
-        renderer: str = "dmc",
-        background: str | None = None,
-        seed: Seed = None,
-    ) -> None:
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            image_size=image_size,
-            grayscale=grayscale,
-            camera_id=camera_id,
-            renderer=renderer,
-            background=background,  # but no seed: what was drawn from it is part of the state
-        )
-        super().__init__(env, image_size, grayscale)
-        self.renderer = renderer
-        self.camera_id = camera_id
-        self._physics = env.get_wrapper_attr("physics")
-        self._camera: Any = None
-        # These take effect because the rendering context is made with the first frame.
-        buffer = self._physics.model.vis.global_
-        buffer.offwidth = max(buffer.offwidth, self.image_size)
-        buffer.offheight = max(buffer.offheight, self.image_size)
-        self.background = None if background is None else Background(background, self._physics, self.image_size, seed)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        if self.background is not None:
-            self.background.begin(seed)
-        return super().reset(seed=seed, options=options)
-
-    def frame(self) -> np.ndarray:
-        if self._camera is None:
-            from dm_control.mujoco import Camera
-
-            # The same pixels as `physics.render`, which builds such a camera, and frees it, for every frame.
-            self._camera = Camera(self._physics, self.image_size, self.image_size, self.camera_id)
-        flags = RENDER_FLAGS[self.renderer]
-        if self.background is None:
-            return self._camera.render(render_flag_overrides=flags)
-        mask = self.background.mask(self._camera)  # before the frame, which lies where the camera draws next
-        return self.background.behind(self._camera.render(render_flag_overrides=flags), mask)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Copies make a camera of their own with their first frame."""
-        return {**self.__dict__, "_camera": None}
-
-    def close(self) -> None:
-        self._camera = None
-        super().close()
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: The background's; all else that frames depend on is the physics'
-        """
-        return {} if self.background is None else self.background.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Result of ``state_dict``
-        """
-        if self.background is not None:
-            self.background.load_state_dict(state)
-
-
-class DMCSensors(gym.ObservationWrapper[dict[str, np.ndarray], Any, Any], gym.utils.RecordConstructorArgs):
-    """
-    Observes a dm_control environment through cameras, and through the joints of the robot itself.
-
-    :param env: An environment of shimmy that has not rendered yet
-    :param cameras: By the key of its images, the index of each camera
-    :param proprioception: Whether there is a key ``"proprioception"``: what
-        :class:`~sb3_cure.envs.physics.Proprioception` gives
-    :param image_size: Height and width of the images in pixels
-    :param seed: Of the backgrounds
-    :param kwargs: Further arguments of :class:`DMCPixels`
+    :param proprioception: Whether there is a key ``"proprioception"`` with the values of
+        :class:`~sb3_cure.envs.physics.Proprioception`
+    :param seed: Seed of the backgrounds
+    :raises ValueError: If there is no such background, or, when first reset, no such camera
     """
 
     def __init__(
         self,
         env: gym.Env,
         cameras: dict[str, int],
-        proprioception: bool,
         image_size: int = 84,
+        grayscale: bool = False,
+        renderer: str = "dmc",
+        background: str | None = None,
+        proprioception: bool = False,
         seed: int | None = None,
-        **kwargs: Any,
     ) -> None:
-        gym.utils.RecordConstructorArgs.__init__(
-            self,
-            cameras=list(cameras.items()),
-            proprioception=proprioception,
-            image_size=image_size,
-            **kwargs,  # but no seed, as of `DMCPixels`
+        built: dict[str, Any] = dict(
+            image_size=image_size, grayscale=grayscale, renderer=renderer, background=background
         )
+        # No seed: what was drawn from it is part of the state.
+        RecordConstructorArgs.__init__(self, cameras=list(cameras.items()), proprioception=proprioception, **built)
         super().__init__(env)
-        self._cameras = {
-            key: DMCPixels(env, image_size, camera_id=index, seed=own, **kwargs)
-            for (key, index), own in zip(cameras.items(), _apart(seed, len(cameras)), strict=True)
-        }
+        self.image_size = size = at_least_one("image_size", image_size)
+        self.grayscale, self.renderer, self._indices = grayscale, renderer, cameras
+        self._physics = env.get_wrapper_attr("physics")
+        # These take effect because the rendering context is made with the first frame.
+        buffer = self._physics.model.vis.global_
+        buffer.offwidth, buffer.offheight = max(buffer.offwidth, size), max(buffer.offheight, size)
+        self._cameras: dict[str, Any] = {}
+        self._backgrounds: dict[str, Background] = {}
+        if background is not None:
+            for key, own in zip(cameras, self._background_seeds(seed), strict=True):
+                self._backgrounds[key] = Background(background, self._physics, size, own)
+        image = spaces.Box(0, 255, (1 if grayscale else 3, size, size), np.uint8)
+        parts: list[tuple[str, gym.Space]] = [(key, image) for key in cameras]
         self._joints = Proprioception(env) if proprioception else None
-        first = next(iter(self._cameras.values()))
-        self.image_size, self.renderer = first.image_size, first.renderer
-        parts: list[tuple[str, gym.Space]] = [(key, each.observation_space) for key, each in self._cameras.items()]
         if self._joints is not None:
             #: Names of the joints' positions and velocities
             self.proprioception_names = self._joints.names
-            parts.append(("proprioception", gym.spaces.Box(-np.inf, np.inf, (len(self._joints.names),), np.float32)))
-        self.observation_space = gym.spaces.Dict(parts)  # type: ignore[assignment]
+            parts.append(("proprioception", spaces.Box(-np.inf, np.inf, (len(self._joints.names),), np.float32)))
+        self.observation_space = image if "" in cameras else spaces.Dict(parts)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        for camera, own in zip(self._cameras.values(), _apart(seed, len(self._cameras)), strict=True):
-            if camera.background is not None:
-                camera.background.begin(own)
+    def _background_seeds(self, seed: int | None) -> list[Seed]:
+        """Derive a seed for each camera; that of the first is the seed itself, as if it were the only one."""
+        return [seed if seed is None or position == 0 else [seed, position] for position in range(len(self._indices))]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment, and draw the backgrounds of an episode.
+
+        :param seed: Seed of both; None: continue their random streams
+        :param options: Options of the environment
+        :return: First observation and info
+        """
+        for background, own in zip(self._backgrounds.values(), self._background_seeds(seed), strict=False):
+            background.begin(own)
         return super().reset(seed=seed, options=options)
 
-    def observation(self, observation: Any) -> dict[str, np.ndarray]:
-        seen = {key: camera.observation(observation) for key, camera in self._cameras.items()}
+    def frame(self, key: str = "") -> np.ndarray:
+        """Render through one camera.
+
+        :param key: Key of its images
+        :return: uint8 [image_size, image_size, 3]
+        """
+        if key not in self._cameras:
+            from dm_control.mujoco import Camera
+
+            # The same pixels as `physics.render`, which makes such a camera, and frees it, for every frame.
+            self._cameras[key] = Camera(self._physics, self.image_size, self.image_size, self._indices[key])
+        camera, flags, background = self._cameras[key], RENDER_FLAGS[self.renderer], self._backgrounds.get(key)
+        if background is None:
+            return camera.render(render_flag_overrides=flags)
+        mask = background.mask(camera)  # before the frame, which is in the array that the camera draws into next
+        return background.behind(camera.render(render_flag_overrides=flags), mask)
+
+    def observation(self, observation: Any) -> Any:
+        """Render through all cameras, and measure the joints.
+
+        :param observation: The environment's own, unused
+        :return: An image, uint8 [channels, image_size, image_size], or a dictionary
+        """
+        seen = {key: to_image(self.frame(key), self.image_size, self.grayscale) for key in self._indices}
+        if "" in seen:
+            return seen[""]
         return seen if self._joints is None else {**seen, "proprioception": self._joints()}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies make cameras of their own with their first frame."""
+        return {**self.__dict__, "_cameras": {}}
+
     def close(self) -> None:
-        for camera in self._cameras.values():
-            camera._camera = None
+        """Free the cameras, and close the environment."""
+        self._cameras = {}
         super().close()
 
     def state_dict(self) -> dict[str, Any]:
+        """Get the backgrounds' state; all else that frames depend on is the physics'.
+
+        :return: Plain data
         """
-        :return: The cameras'; all else that observations depend on is the physics'
-        """
-        return {key: camera.state_dict() for key, camera in self._cameras.items()}
+        return {key: background.state_dict() for key, background in self._backgrounds.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
+        """Restore the backgrounds' state.
+
         :param state: Result of ``state_dict``
         """
-        for key, camera in self._cameras.items():
-            camera.load_state_dict(state[key])
-
-
-def _apart(seed: int | None, n_cameras: int) -> list[Seed]:
-    """Seeds of the cameras' backgrounds; that of the first is the seed itself, as if it were the only one."""
-    return [seed if position == 0 or seed is None else [seed, position] for position in range(n_cameras)]
+        for key, background in self._backgrounds.items():
+            background.load_state_dict(state[key])
 
 
 def make_dmc_env(
@@ -205,15 +164,14 @@ def make_dmc_env(
     cameras: Sequence[int] | None = None,
     proprioception: bool = False,
 ) -> gym.Env:
-    """
-    Make a task of the DeepMind Control suite that is seen through pixels.
+    """Make a task of the DeepMind Control suite that is seen through pixels.
 
     Observations are uint8 of shape (3 x frame_stack, image_size, image_size), oldest frame first; the first frame is
     repeated at reset, and one frame is rendered per agent step. Actions are float32 in [-1, 1]. Episodes last 1000
     environment steps and end by truncation. ``unwrapped`` is shimmy's ``DmControlCompatibilityV0``.
 
     With ``cameras`` or ``proprioception`` observations are dictionaries, for ``"MultiInputPolicy"``: such images under
-    ``"image"``, or ``"camera0"``, ``"camera1"``, ... (by their indices), and what the robot tells of itself under
+    ``"image"``, or ``"camera0"``, ``"camera1"``, ... (by their indices), and the robot's own joints under
     ``"proprioception"``.
 
     :param domain: Domain of the suite, such as ``"cartpole"``
@@ -227,7 +185,7 @@ def make_dmc_env(
         which is several times faster without a GPU and shows other pixels: another environment
     :param render_mode: ``"rgb_array"`` lets ``render()`` give RGB frames of 256 x 256 for videos; it does not change
         the observations
-    :param seed: Seed of the first ``reset`` that is given none; later ones go on with its random stream
+    :param seed: Seed of the first ``reset`` that is given none; later ones continue its random stream
     :param grayscale: One channel of luminance per frame instead of three of RGB
     :param background: What is seen behind the robot in place of sky, floor and walls: ``"noise"``, random pixels that
         are new in each frame, or a folder of images, one of which is drawn for each episode. Drawn by ``seed``, apart
@@ -241,6 +199,7 @@ def make_dmc_env(
     :raises ValueError: If there is no such task or an argument is out of range
     :raises GLUnavailableError: If OpenGL is missing
     """
+    arguments = dict(locals())
     if task not in DMC_TASKS.get(domain, ()):
         known = [f"{each}-{its_task}" for each, tasks in DMC_TASKS.items() for its_task in tasks]
         close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
@@ -249,13 +208,35 @@ def make_dmc_env(
             "(sb3_cure.envs.DMC_TASKS has all)."
         )
     if renderer not in RENDER_FLAGS:
-        raise ValueError(f"renderer={renderer!r} is unknown; use 'dmc', or 'fast' for no shadows and reflections.")
+        raise ValueError(f"renderer must be 'dmc', or 'fast' for no shadows and reflections, not {renderer!r}.")
     if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode={render_mode!r} is not supported; use 'rgb_array', or None for no videos.")
-    action_repeat = ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat
+        raise ValueError(f"render_mode must be 'rgb_array', or None for no videos, not {render_mode!r}.")
     if camera_id is None:
         camera_id = cameras[0] if cameras else CAMERAS.get(domain, 0)
+    video = dict(height=VIDEO_SIZE, width=VIDEO_SIZE, camera_id=camera_id, render_flag_overrides=RENDER_FLAGS[renderer])
+    env = _make_shimmy_env(domain, task, seed, render_mode=render_mode, render_kwargs=video)
+    # As gymnasium.make would set it, so that loggers and copies see this environment and not the one inside.
+    env.unwrapped.spec = EnvSpec(
+        dmc_env_id(domain, task),
+        entry_point=ENTRY_POINT,
+        order_enforce=False,
+        disable_env_checker=True,
+        kwargs=arguments,
+    )
+    env = NormalizeActions(ActionRepeat(env, ACTION_REPEATS.get(domain, 4) if action_repeat is None else action_repeat))
+    views = {"image": camera_id} if proprioception else {"": camera_id}
+    if cameras:
+        views = {f"camera{index}": index for index in cameras}
+    env = DMCPixels(env, views, image_size, grayscale, renderer, background, proprioception, seed)
+    return StackFrames(env, frame_stack)
 
+
+# With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) when it is asked for "human".
+make_dmc_env.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]
+
+
+def _make_shimmy_env(domain: str, task: str, seed: int | None, **kwargs: Any) -> gym.Env:
+    """Make shimmy's environment of a task, without observations of its own."""
     from sb3_cure.envs.rendering import load_gl
 
     load_gl()
@@ -267,57 +248,17 @@ def make_dmc_env(
         disable_env_checker=True,
         # lqr draws the stiffness of its springs when it is built: an id must mean the same physics every time.
         task_kwargs={"random": 0},
-        render_mode=render_mode,
-        render_kwargs={
-            "height": VIDEO_SIZE,
-            "width": VIDEO_SIZE,
-            "camera_id": camera_id,
-            "render_flag_overrides": RENDER_FLAGS[renderer],
-        },
+        **kwargs,
     )
     base: Any = env.unwrapped
     base.np_random = np.random.RandomState(seed)
     # What nobody sees would be computed in every step of physics: a tenth of cartpole's time in 36 px.
     base.task.get_observation = _no_observation
-    base.observation_space = gym.spaces.Dict()
+    base.observation_space = spaces.Dict()
     # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.
     base.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / base.control_timestep()}
-    # As gymnasium.make would set it, so that loggers and copies see this environment and not the one underneath.
-    base.spec = EnvSpec(
-        dmc_env_id(domain, task),
-        entry_point=ENTRY_POINT,
-        order_enforce=False,
-        disable_env_checker=True,
-        kwargs=dict(
-            domain=domain,
-            task=task,
-            image_size=image_size,
-            frame_stack=frame_stack,
-            action_repeat=action_repeat,
-            camera_id=camera_id,
-            renderer=renderer,
-            render_mode=render_mode,
-            seed=seed,
-            grayscale=grayscale,
-            background=background,
-            cameras=cameras,
-            proprioception=proprioception,
-        ),
-    )
-    env = NormalizeActions(ActionRepeat(env, action_repeat))
-    seen: dict[str, Any] = dict(grayscale=grayscale, renderer=renderer, background=background, seed=seed)
-    if cameras or proprioception:
-        views = {f"camera{index}": index for index in cameras} if cameras else {"image": camera_id}
-        env = DMCSensors(env, views, proprioception, image_size, **seen)
-    else:
-        env = DMCPixels(env, image_size, camera_id=camera_id, **seen)
-    return StackFrames(env, frame_stack)
+    return env
 
 
 def _no_observation(physics: Any) -> dict[str, Any]:
-    """In place of a task's own: observations are what the cameras see."""
     return {}
-
-
-# With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) when it is asked for "human".
-make_dmc_env.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]

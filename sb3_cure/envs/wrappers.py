@@ -1,6 +1,7 @@
-"""From an environment that can render itself to one that an agent sees through pixels."""
+"""Wrappers from an environment that can render itself, or returns images, to one that an agent sees through pixels."""
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
+from sb3_cure.data.observations import image_spaces
 from sb3_cure.envs.rendering import choose_backend
 
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
@@ -19,16 +21,16 @@ UNBOUNDED = 1e10
 OVERSAMPLING = 2
 
 
-def check_at_least_one(name: str, value: Any, usual: int) -> int:
-    """
-    :param name: What the value is, for the message
-    :param value: The value to check
-    :param usual: A good value to suggest
-    :return: The value as a plain integer
+def at_least_one(name: str, value: Any) -> int:
+    """Check that a number is a positive integer.
+
+    :param name: Name of the number, for the message
+    :param value: The number
+    :return: A plain integer
     :raises ValueError: If it is not an integer of at least 1
     """
     if not _is_positive_integer(value):
-        raise ValueError(f"{name}={value!r} is not an integer of at least 1; use {name}={usual}, for example.")
+        raise ValueError(f"{name} must be an integer of at least 1, not {value!r}.")
     return int(value)
 
 
@@ -36,20 +38,31 @@ def _is_positive_integer(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 1)
 
 
-def check_frame(frame: Any, env: gym.Env) -> None:
+def to_image(frame: np.ndarray, image_size: int, grayscale: bool = False) -> np.ndarray:
+    """Make an observation of a rendered frame.
+
+    :param frame: uint8 [height, width, 3]
+    :param image_size: Height and width of the observation
+    :param grayscale: One channel of luminance instead of three of RGB
+    :return: Copy, uint8 [1 or 3, image_size, image_size]
     """
-    :param frame: What an environment's ``render()`` returned
-    :param env: The environment
-    :raises ValueError: If it is no uint8 frame of shape (height, width, 3)
+    if grayscale:
+        frame = np.asarray(Image.fromarray(frame).convert("L"))[..., None]
+    return resize_image(np.array(np.moveaxis(frame, -1, 0), order="C"), image_size, image_size)
+
+
+def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Average areas of an image, channel by channel.
+
+    :param image: uint8 [channels, old height, old width]
+    :param height: New height
+    :param width: New width
+    :return: uint8 [channels, height, width]
     """
-    if isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3:
-        return
-    given = f"{frame.dtype} of shape {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
-    fix = "let its render() return such frames" if env.render_mode == "rgb_array" else "make it with 'rgb_array'"
-    raise ValueError(
-        f"Rendering {env} with render_mode={env.render_mode!r} gave {given}, but frames are uint8 of shape (height, "
-        f"width, 3): {fix}."
-    )
+    if image.shape[1:] == (height, width):
+        return image
+    channels = (Image.fromarray(each).resize((width, height), Image.Resampling.BOX) for each in image)
+    return np.stack([np.asarray(each) for each in channels])
 
 
 def draw_fast(env: gym.Env, image_size: int) -> None:
@@ -118,7 +131,7 @@ class ActionRepeat(RepeatAction):
     """
 
     def __init__(self, env: gym.Env, num_repeats: int) -> None:
-        num_repeats = check_at_least_one("action_repeat", num_repeats, usual=4)
+        num_repeats = at_least_one("action_repeat", num_repeats)
         super().__init__(env, num_repeats)
         # The environment may repeat actions, too.
         self.action_repeat = num_repeats * action_repeat_of(env)
@@ -126,27 +139,28 @@ class ActionRepeat(RepeatAction):
             self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / num_repeats}
 
 
-def told_by(env: gym.Env, name: str) -> int:
-    """
+def positive_attribute(env: gym.Env, name: str) -> int:
+    """Look for an attribute of an environment.
+
     :param env: Any environment
     :param name: Name of an attribute that is an integer of at least 1
-    :return: Its value, or 1 where the environment has none or means something else by that name
+    :return: Its value, or 1 if the environment has none or means something else by that name
     """
-    told = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else 1
-    return int(told) if _is_positive_integer(told) else 1
+    value = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else 1
+    return int(value) if _is_positive_integer(value) else 1
 
 
 def action_repeat_of(env: gym.Env) -> int:
-    """
+    """Look for the action repeat of an environment.
+
     :param env: Any environment
-    :return: Environment steps per agent step: what it tells, else 1
+    :return: Environment steps per agent step: its attribute, else 1
     """
-    return told_by(env, "action_repeat")
+    return positive_attribute(env, "action_repeat")
 
 
 class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConstructorArgs):
-    """
-    Replaces observations by rendered frames: uint8 of shape (channels, image_size, image_size), one render per step.
+    """Replaces observations by rendered frames: uint8 of shape (channels, image_size, image_size), one render per step.
 
     :param env: An environment made with ``render_mode="rgb_array"``
     :param image_size: Height and width of the observation in pixels; frames of another size are area-averaged to it
@@ -159,39 +173,91 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
     def __init__(self, env: gym.Env, image_size: int = 84, grayscale: bool = False, renderer: str = "env") -> None:
         RecordConstructorArgs.__init__(self, image_size=image_size, grayscale=grayscale, renderer=renderer)
         super().__init__(env)
-        self.image_size = check_at_least_one("image_size", image_size, usual=84)
+        self.image_size = at_least_one("image_size", image_size)
         if renderer not in ("env", "fast"):
-            raise ValueError(f"renderer is {renderer!r}: choose 'env' or 'fast'.")
+            raise ValueError(f"renderer must be 'env' or 'fast', not {renderer!r}.")
         if renderer == "fast":
             draw_fast(env, self.image_size)
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
 
-    def frame(self) -> Any:
-        """
-        :return: The frame to observe, uint8 of shape (height, width, 3)
-        """
-        return self.env.render()
-
     def observation(self, observation: Any) -> np.ndarray:
-        frame = self.frame()
-        check_frame(frame, self.env)
-        if self.grayscale or frame.shape[:2] != (self.image_size, self.image_size):
-            image = Image.fromarray(frame)
-            if self.grayscale:
-                image = image.convert("L")
-            frame = np.asarray(image.resize((self.image_size, self.image_size), Image.Resampling.BOX))
-        # Always a copy, because a renderer may draw its next frame into the same memory.
-        return np.array(np.moveaxis(np.atleast_3d(frame), -1, 0), order="C")
+        """Render a frame.
+
+        :param observation: The environment's own, unused
+        :return: uint8 [channels, image_size, image_size]
+        :raises ValueError: If the environment renders something else than uint8 RGB frames
+        """
+        frame: Any = self.env.render()
+        if not (isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3):
+            given = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
+            raise ValueError(
+                f"Frames must be uint8 [height, width, 3], but {self.env} with render_mode={self.env.render_mode!r} "
+                f"rendered {given}: make it with render_mode='rgb_array', and let its render() return such frames."
+            )
+        return to_image(frame, self.image_size, self.grayscale)
+
+
+class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Averages areas of images, so that networks and replay buffer need less memory.
+
+    Images are uint8, with the channels first or last, which stays as it is. Of dictionaries the images are resized.
+
+    :param env: An environment whose observations are an image, or a dictionary with images
+    :param image_size: New height and width in pixels, one number or two
+    :param keys: Keys of the images to resize; None: all
+    :raises ValueError: If there are no such images, or a size is not an integer of at least 1
+    """
+
+    def __init__(self, env: gym.Env, image_size: int | tuple[int, int] = 84, keys: Sequence[str] | None = None) -> None:
+        RecordConstructorArgs.__init__(self, image_size=image_size, keys=keys)
+        super().__init__(env)
+        sizes = image_size if isinstance(image_size, tuple) else (image_size, image_size)
+        self.image_size = image_size
+        self._height, self._width = (at_least_one("image_size", size) for size in sizes)
+        space = env.observation_space
+        images = image_spaces(space)
+        self._keys = list(images if keys is None else keys)
+        if not self._keys or not set(self._keys) <= set(images):
+            raise ValueError(
+                f"ResizeImages needs images, uint8 with three dimensions, which are {keys or 'not'} in {space}."
+            )
+        resized = {
+            key: spaces.Box(0, 255, self._resize(np.zeros(images[key].shape, np.uint8)).shape, np.uint8)
+            for key in self._keys
+        }
+        if isinstance(space, spaces.Dict):
+            self.observation_space = spaces.Dict(list({**space.spaces, **resized}.items()))
+        else:
+            self.observation_space = resized[""]
+
+    def observation(self, observation: Any) -> Any:
+        """Resize an observation.
+
+        :param observation: An image, or a dictionary
+        :return: The same with smaller images
+        """
+        if not isinstance(observation, dict):
+            return self._resize(observation)
+        return {**observation, **{key: self._resize(observation[key]) for key in self._keys}}
+
+    def _resize(self, image: np.ndarray) -> np.ndarray:
+        if _channel_axis(image.shape) == 0:
+            return resize_image(image, self._height, self._width)
+        return np.moveaxis(resize_image(np.moveaxis(image, 2, 0), self._height, self._width), 0, 2)
+
+
+def _channel_axis(shape: tuple[int, ...]) -> int:
+    """Find the axis of the channels; as in SB3, they are the smallest dimension."""
+    return 2 if len(shape) == 3 and shape[2] < min(shape[:2]) else 0
 
 
 class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """
-    Joins the last observations along their first axis, oldest first.
+    """Joins the last observations along their first axis, oldest first.
 
-    Images with the channels last (their smallest dimension, as SB3 tells them) are joined along the last axis. Of
-    dictionaries the images are stacked, the rest stays as it is.
+    Images with the channels last (as in SB3, the smallest dimension) are joined along the last axis. Of dictionaries
+    the images are stacked; the rest stays as it is.
 
     :param env: An environment whose observations are arrays, such as images, or dictionaries with images
     :param frame_stack: Number of observations in a stack
@@ -205,9 +271,9 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, frame_stack=frame_stack, padding=padding)
         super().__init__(env)
         if padding not in ("first", "zeros"):
-            raise ValueError(f"padding is {padding!r}: choose 'first' or 'zeros'.")
+            raise ValueError(f"padding must be 'first' or 'zeros', not {padding!r}.")
         self.padding = padding
-        self.frame_stack = check_at_least_one("frame_stack", frame_stack, usual=3)
+        self.frame_stack = at_least_one("frame_stack", frame_stack)
         space = env.observation_space
         # Of observations that are no dictionary, under the key ""
         parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
@@ -219,9 +285,7 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise ValueError(
                 f"Observations of {space} cannot be stacked: expected a Box; wrap in PixelObservation first."
             )
-        self._axes = {
-            k: 2 if len(box.shape) == 3 and box.shape[2] < min(box.shape[:2]) else 0 for k, box in boxes.items()
-        }
+        self._axes = {key: _channel_axis(box.shape) for key, box in boxes.items()}
         stacked = {**parts, **{key: self._stacked_space(box, self._axes[key]) for key, box in boxes.items()}}
         self.observation_space = spaces.Dict(list(stacked.items())) if is_dict else stacked[""]
         self._frames: dict[str, deque[np.ndarray]] = {key: deque(maxlen=self.frame_stack) for key in boxes}
@@ -263,30 +327,36 @@ def make_pixel_env(
     action_repeat: int = 1,
     grayscale: bool = False,
     renderer: str = "env",
+    source: str = "render",
 ) -> gym.Env:
-    """
-    Make any Gymnasium environment that can render itself one that is seen through pixels.
+    """Make a Gymnasium environment one that an agent sees through small, stacked images.
 
-    Observations are uint8 of shape (channels x frame_stack, image_size, image_size), oldest frame first; the first
-    frame is repeated at reset, and one frame is rendered per agent step. Float actions in a ``Box`` become float32 in
-    [-1, 1]. What ``env`` observed is dropped.
+    With ``source="render"`` observations are uint8 of shape (channels x frame_stack, image_size, image_size), oldest
+    frame first, of what the environment renders, once per agent step; its own observations are dropped. With
+    ``source="observation"`` its own images, alone or in a dictionary, are resized and stacked. The first frame is
+    repeated at reset. Float actions in a ``Box`` become float32 in [-1, 1].
 
     :param env: Gymnasium id, or an environment made with ``render_mode="rgb_array"``
-    :param image_size: Height and width of the observation in pixels
+    :param image_size: Height and width of the images in pixels
     :param frame_stack: Number of frames in an observation
     :param action_repeat: Environment steps per agent step; their rewards are summed
-    :param grayscale: One channel of luminance per frame instead of three of RGB
+    :param grayscale: One channel of luminance per rendered frame instead of three of RGB
     :param renderer: ``"env"`` gives the pixels of ``env``; ``"fast"``, for MuJoCo environments of Gymnasium, leaves out
         shadows and reflections and draws at twice the ``image_size``, which is many times faster without a GPU and
         shows other pixels: another environment (videos of it have these frames, too)
+    :param source: ``"render"`` or ``"observation"``
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack`` and ``action_repeat``
     :raises ValueError: If an argument is out of range, ``env`` cannot be drawn fast or, when first reset, does not
         render RGB frames
     """
+    if source not in ("render", "observation") or (source == "observation" and (grayscale or renderer != "env")):
+        raise ValueError("source must be 'render', or 'observation', which takes neither grayscale nor renderer.")
     if isinstance(env, str):
         choose_backend()
         env = gym.make(env, render_mode="rgb_array")
     env = ActionRepeat(env, action_repeat)
     if isinstance(env.action_space, spaces.Box) and np.issubdtype(env.action_space.dtype, np.floating):
         env = NormalizeActions(env)
+    if source == "observation":
+        return StackFrames(ResizeImages(env, image_size), frame_stack)
     return StackFrames(PixelObservation(env, image_size, grayscale, renderer), frame_stack)

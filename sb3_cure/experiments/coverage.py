@@ -13,7 +13,7 @@ COLUMNS = ("environment_steps", "agent_steps", "cells", "entropy_bits")
 
 
 class CoverageRecorder(BaseCallback):
-    """Counts the cells that training environments in ``TellCell`` report, and writes ``coverage.csv``.
+    """Counts the cells that training environments in ``CellInfo`` report, and writes ``coverage.csv``.
 
     Whoever acts: what is measured is the data that a method collects, from the first step of its random warm-up on.
     What it has counted stands in plain attributes, which checkpoints keep.

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
 from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
-from sb3_cure.envs.counting import TellCell
+from sb3_cure.envs.counting import CellInfo
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
@@ -232,7 +232,7 @@ class Cell:
         env = gym.make(self.task, **self.env_kwargs)
         for wrap, kwargs in self._wrappers():
             env = wrap(env, **kwargs)
-        return env if self.coverage is None else TellCell(env, self.coverage.widths)
+        return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
         """An environment to measure policies in: in the same wrappers but those of rewards

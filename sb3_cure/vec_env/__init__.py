@@ -1,9 +1,10 @@
-"""Vectorised environments: workers that may fail, a check of all numbers, updates beside the environments."""
+"""Vectorised environments: checks, workers that may fail, and updates while workers step."""
 
 from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
+from sb3_cure.vec_env.checks import check_environments, same_environment
 from sb3_cure.vec_env.finite_check import BadTransitionError, FiniteCheck
 from sb3_cure.vec_env.frame_watch import FrameWatch
-from sb3_cure.vec_env.workers import EnvFaultError, FaultTolerantSubprocVecEnv
+from sb3_cure.vec_env.workers import EnvFaultError, FaultTolerantSubprocVecEnv, restarts_workers
 
 __all__ = [
     "BadTransitionError",
@@ -12,4 +13,7 @@ __all__ = [
     "FiniteCheck",
     "FrameWatch",
     "OverlappedVecEnv",
+    "check_environments",
+    "restarts_workers",
+    "same_environment",
 ]

@@ -9,24 +9,25 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 
 class OverlappedVecEnv(VecEnvWrapper):
-    """Does deferred work between the moment when actions are sent and the moment when results are fetched.
+    """Does deferred work between sending actions and fetching their results.
 
     :param venv: Environments in worker processes (``SubprocVecEnv``)
-    :raises ValueError: if the environments live in this process, where nothing can overlap
+    :raises ValueError: If the environments live in this process, where nothing can overlap
     """
 
-    def __init__(self, venv: VecEnv):
+    def __init__(self, venv: VecEnv) -> None:
         if isinstance(venv.unwrapped, DummyVecEnv):
             raise ValueError(
-                "overlap=True was given with environments in this process (DummyVecEnv), where stepping and updating "
-                "cannot overlap: use make_vec_env(..., vec_env_cls=SubprocVecEnv), or overlap=False."
+                "overlap=True needs environments in other processes: use make_vec_env(..., vec_env_cls=SubprocVecEnv), "
+                "or overlap=False."
             )
         super().__init__(venv)
         self._work: list[Callable[[], None]] = []
 
     def defer(self, work: Callable[[], None]) -> None:
-        """
-        :param work: What to do during the next step
+        """Do some work during the next step.
+
+        :param work: A function
         """
         self._work.append(work)
 
@@ -37,7 +38,8 @@ class OverlappedVecEnv(VecEnvWrapper):
             each()
 
     def reset(self) -> VecEnvObs:
-        """
+        """Reset the environments.
+
         :return: First observations
         """
         return self.venv.reset()
@@ -45,20 +47,21 @@ class OverlappedVecEnv(VecEnvWrapper):
     def step_async(self, actions: np.ndarray) -> None:
         """Send the actions, then work.
 
-        :param actions: One per environment
+        :param actions: Actions, [n_envs, ...]
         """
         self.venv.step_async(actions)
         try:
             self.finish()
         except BaseException:
-            # Ctrl-C, say: the results under way must not be taken for those of a later step. Where they do not come, as
-            # it has ended the workers, too, that is not what is to be told.
+            # After Ctrl-C, for example, these results must not be taken for those of a later step. Ignore errors here:
+            # the original one is reported.
             with contextlib.suppress(Exception):
                 self.venv.step_wait()
             raise
 
     def step_wait(self) -> VecEnvStepReturn:
-        """
-        :return: What the environments returned
+        """Fetch the results.
+
+        :return: What the environments return
         """
         return self.venv.step_wait()

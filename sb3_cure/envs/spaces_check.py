@@ -1,0 +1,63 @@
+"""Refuse observation spaces whose images would be read as vectors without a word."""
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+
+#: Sides of fewer pixels are taken for those of tables and grids.
+MIN_SIDE = 8
+#: Bounds that float images usually have
+IMAGE_BOUNDS = ((0, 1), (-1, 1), (0, 255))
+
+
+def check_observation_space(space: spaces.Space, policy: str | type | None = None) -> None:
+    """Refuse spaces that would be read as something else than meant.
+
+    An image is a ``Box`` of dtype uint8 with three dimensions and bounds 0 and 255. All other boxes are vectors.
+    Refused are nested dictionaries, boxes that look like images but would be read as vectors, and policies for another
+    kind of space.
+
+    :param space: Space of observations
+    :param policy: Name or class of the policy; None: do not check that it fits
+    :raises ValueError: If a part of the space is refused; the message names its key
+    """
+    if isinstance(space, spaces.Tuple):
+        raise ValueError(
+            "Observations are a Tuple, which replay buffers cannot store: use a Dict with one key per part."
+        )
+    name = policy if isinstance(policy, str) or policy is None else policy.__name__
+    if isinstance(space, spaces.Dict):
+        for key, part in space.spaces.items():
+            _check_part(part, f"the observation {key!r}", is_image=True)
+        return
+    if name is not None and name.endswith("MultiInputPolicy"):
+        fitting = "CnnPolicy" if is_image_space(space) else "MlpPolicy"
+        raise ValueError(f"MultiInputPolicy is for dictionaries, but observations are one {space}: use {fitting!r}.")
+    _check_part(space, "the observation", is_image=name is not None and name.endswith("CnnPolicy"))
+
+
+def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        raise ValueError(
+            f"{name} is a {type(space).__name__} inside of a Dict, which replay buffers cannot store: flatten it in an "
+            "ObservationWrapper, so that each part has a key of its own, such as 'pixels_top' for ['pixels']['top']."
+        )
+    if not isinstance(space, spaces.Box) or len(space.shape) < 2 or sorted(space.shape)[-2] < MIN_SIDE:
+        return
+    rank, bounds = len(space.shape), (space.low.min(), space.high.max())
+    reads = (
+        f"{name} is {space.dtype} of shape {space.shape}, which would be read as a vector of {space.low.size} numbers"
+    )
+    if space.dtype == np.uint8 and bounds == (0, 255) and is_image:
+        if rank == 2:
+            raise ValueError(f"{reads}: if it is an image, return it as [H, W, 1], else flatten it.")
+        if rank == 4:
+            raise ValueError(
+                f"{reads}: if it is an image, return the newest as [H, W, C] (StackFrames of sb3_cure.envs stacks "
+                "them), else flatten it."
+            )
+    if rank == 3 and np.issubdtype(space.dtype, np.floating) and bounds in IMAGE_BOUNDS:
+        raise ValueError(
+            f"{reads}: if it is an image, return it as uint8 from 0 to 255, else flatten it (images are normalised "
+            "inside of the networks)."
+        )

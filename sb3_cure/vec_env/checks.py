@@ -1,0 +1,68 @@
+"""Put environments into the checks that every training needs."""
+
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
+
+from sb3_cure.data.observations import image_spaces
+from sb3_cure.envs.copy_observations import CopyObservations
+from sb3_cure.vec_env.finite_check import FiniteCheck
+
+
+def check_environments(venv: VecEnv) -> FiniteCheck:
+    """Copy and check what environments return.
+
+    Environments of this process are put into ``CopyObservations``, and ``venv`` into ``FiniteCheck``. In workers of
+    SB3's ``SubprocVecEnv`` only you can do the former, see :class:`~sb3_cure.envs.CopyObservations`.
+
+    :param venv: Environments, wrapped as SB3 does
+    :return: The environments in a ``FiniteCheck``
+    :raises ValueError: If ``VecNormalize`` is used in a way that makes the replay buffer store something else
+    """
+    if isinstance(venv, FiniteCheck):
+        return venv
+    _check_normalizer(venv)
+    base = venv.unwrapped
+    if isinstance(base, DummyVecEnv):
+        base.envs = [env if isinstance(env, CopyObservations) else CopyObservations(env) for env in base.envs]
+    return FiniteCheck(venv)
+
+
+def same_environment(first: gym.Env | VecEnv, second: gym.Env | VecEnv) -> bool:
+    """Check whether two environments, in any wrappers, share one that is stepped.
+
+    :param first: An environment, or several
+    :param second: Another one
+    :return: Whether a step of one changes the other
+    """
+    return not _innermost(first).isdisjoint(_innermost(second))
+
+
+def _innermost(env: Any) -> set[int]:
+    base = env.unwrapped
+    return {id(each.unwrapped) for each in base.envs} if isinstance(base, DummyVecEnv) else {id(base)}
+
+
+def _check_normalizer(venv: VecEnv) -> None:
+    normalizer = unwrap_vec_wrapper(venv, VecNormalize)
+    if normalizer is None:
+        return
+    if _shapes(venv.observation_space) != _shapes(normalizer.observation_space):
+        raise ValueError(
+            "VecNormalize is inside of a wrapper that changes the shape of observations, but the replay buffer stores "
+            "what VecNormalize gets: put it outside, such as VecNormalize(VecTransposeImage(venv)) for images with the "
+            "channels last."
+        )
+    lost = image_spaces(normalizer.venv.observation_space).keys() - image_spaces(normalizer.observation_space).keys()
+    if lost:
+        raise ValueError(
+            "VecNormalize would standardise images, which networks expect as uint8: pass norm_obs=False, or "
+            "norm_obs_keys with the vectors alone."
+        )
+
+
+def _shapes(space: spaces.Space) -> dict[str, Any]:
+    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+    return {key: part.shape for key, part in parts.items()}
