@@ -2,7 +2,7 @@
 (paper, "Effect of Pretraining"), episodes on disk, or a model of another task (the paper's outlook)."""
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,10 +22,6 @@ class Pretraining(CuRe):
     """Adds ``pretrain`` to CuRe: a ``learn`` with ``task=False``, after which the settings are what they were; the same
     from episodes on disk (``load_transitions``, ``fit_representation``), and ``transfer_from`` another model.
     """
-
-    #: Of ``Persistence``: whether a script that is run again has nothing to do in this call, and what counts the calls
-    _was_over: Callable[[str, bool], bool]
-    _run: Any
 
     @functools.wraps(CuRe.__init__)  # type: ignore[misc]  # so that help() shows the arguments
     def __init__(self, *args: Any, **kwargs: Any):
@@ -60,15 +56,12 @@ class Pretraining(CuRe):
         :return: Number of transitions that were added
         :raises ValueError: if the episodes are of other observations or actions
         """
-        if self._was_over("load_transitions", True):
-            return 0
         if self._vec_normalize_env is not None and self._vec_normalize_env.training:
             raise ValueError(
                 "load_transitions stores what is on disk, but VecNormalize has no statistics of that: load its own "
                 "(VecNormalize.load) and set training=False, or leave it out."
             )
-        with self._run.calling("load_transitions"):
-            return fill(self.replay_buffer, episodes_of(source), self.policy.scale_action)  # type: ignore[arg-type]
+        return fill(self.replay_buffer, episodes_of(source), self.policy.scale_action)  # type: ignore[arg-type]
 
     def fit_representation(self: Self, updates: int, log_interval: int = 1000) -> Self:
         """``pretrain`` without collecting: train the representation alone, on what the replay buffer holds.
@@ -83,19 +76,16 @@ class Pretraining(CuRe):
         self._check_that_srl_learns("fit_representation")
         if self.replay_buffer is None or self.replay_buffer.size() == 0:
             raise ValueError("fit_representation has no transitions to learn from: call load_transitions before it.")
-        if self._was_over("fit_representation", True):
-            return self
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "fit_representation")
         self._metrics.attach(self.logger)
         self._begin_pretraining("random")
         try:
-            with self._run.calling("fit_representation"):
-                for done in range(0, updates, log_interval):
-                    self._current_progress_remaining = 1 - done / updates  # what schedules follow
-                    self.train(min(log_interval, updates - done), self.batch_size)
-                    self.logger.dump(self._n_updates)
-                    self._guard.report()
+            for done in range(0, updates, log_interval):
+                self._current_progress_remaining = 1 - done / updates  # what schedules follow
+                self.train(min(log_interval, updates - done), self.batch_size)
+                self.logger.dump(self._n_updates)
+                self._guard.report()
         finally:
             self._end_pretraining(keeps_transitions=True)
             self.policy.set_training_mode(False)
@@ -114,8 +104,6 @@ class Pretraining(CuRe):
         :raises ValueError: if networks of the two models differ in their shapes, or would mean something else: other
             kinds or another order of observations, latents with and without tanh, another head or intrinsic reward
         """
-        if self._was_over("transfer_from", True):
-            return self
         networks, temperature, their_traits = archived_networks(path)
         parts = ["encoder.", "encoder_target."] + (["srl."] if self.srl is not None else [])
         curious: Any = getattr(self.policy, "curious", None)
@@ -141,14 +129,18 @@ class Pretraining(CuRe):
                     f"{path} has {name}={their_traits.get(name)!r}, and this model {trait!r}: of equal shapes, its "
                     "networks would mean something else here."
                 )
-        with self._run.calling("transfer_from"):
-            self.policy.load_state_dict({**own, **there})
-            if "curious." in parts and curious.log_ent_coef is not None and temperature is not None:
-                curious.log_ent_coef.data.copy_(temperature)
-            self.representation_frozen = self.representation_frozen or freeze
-            if self.representation_frozen:
-                self.policy.freeze_representation()
+        self.policy.load_state_dict({**own, **there})
+        if "curious." in parts and curious.log_ent_coef is not None and temperature is not None:
+            curious.log_ent_coef.data.copy_(temperature)
+        self.representation_frozen = self.representation_frozen or freeze
+        if self.representation_frozen:
+            self.policy.freeze_representation()
         return self
+
+    @property
+    def is_pretraining(self) -> bool:
+        """Whether ``pretrain`` runs, or ran when the checkpoint was written that this model was resumed from."""
+        return self._before_pretraining is not None
 
     def _phase(self) -> tuple[bool, bool]:
         learns_srl, learns_rl = super()._phase()
@@ -185,14 +177,10 @@ class Pretraining(CuRe):
         self._check_that_srl_learns("pretrain")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector is {collector!r}: choose 'curious' or 'random'.")
-        if self._was_over("pretrain", reset_num_timesteps):
-            return self
         self._begin_pretraining(collector)
-        self._call_name = "pretrain"
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
-            del self._call_name
             self._end_pretraining()
         return self
 
@@ -214,8 +202,6 @@ class Pretraining(CuRe):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
-        if self._was_over("learn", reset_num_timesteps):
-            return self
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
         if self._is_pretrained:
             self._restart_random_streams()

@@ -14,13 +14,12 @@ import stable_baselines3
 import torch as th
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
-from sb3_cure.persistence.encoding import VERSION, ArchiveError, decode, encode, named_by, refusing, write_tensors
+from sb3_cure.persistence.encoding import VERSION, ArchiveError, check_version, decode, encode, named_by, refusing, write_tensors
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
 Self = TypeVar("Self", bound="SavesModels")
@@ -29,6 +28,12 @@ _DATA, _TENSORS, _SYSTEM_INFO = "data", "tensors.safetensors", "system_info.txt"
 _PLACEHOLDER = "!not saved"
 #: What torch's optimisers keep as one number for each parameter
 _COUNTS = ("step", "eta", "mu", "mu_product")
+
+#: Tensors and optimizers of each temperature, by the setting that chooses between fixed and learned
+_TEMPERATURES = {
+    setting: [prefix + name for name in ("log_ent_coef", "ent_coef_tensor", "ent_coef_optimizer")]
+    for setting, prefix in (("ent_coef", ""), ("curiosity_ent_coef", "policy.curious."))
+}
 
 
 class Stateful(Protocol):
@@ -43,23 +48,6 @@ class Stateful(Protocol):
         """
         :param state: Of ``state_dict``
         """
-
-
-class ObjectsMissing(ArchiveError):
-    """What no archive holds, such as a head of the user's own, was not given to ``load``.
-
-    :param name: What to call the file
-    :param missing: What each of the settings was
-    """
-
-    def __init__(self, name: str, missing: dict[str, str]):
-        needed = ", ".join(f"{key!r}: ..." for key in missing)
-        super().__init__(
-            f"{name} was saved with what no archive holds ({'; '.join(missing.values())}): give it to load with "
-            f"custom_objects={{{needed}}}."
-        )
-        self.name = name
-        self.missing = missing
 
 
 class ModelArchive:
@@ -81,8 +69,8 @@ class ModelArchive:
                 raise ArchiveError(f"{name} declares more bytes than it has: it is damaged, or hostile.")
             self.content = json.loads(archive.read(_DATA))
             self.is_pickled = "format" not in self.content  # but attributes of the model, as SB3 writes them
-            if not self.is_pickled and self.content["format"] != VERSION:
-                raise ArchiveError(f"{name} has the format {self.content['format']!r:.20}, not {VERSION}.")
+            if not self.is_pickled:
+                check_version(self.content["format"], name)
             self._tensors = {} if self.is_pickled else load_tensors(archive.read(_TENSORS))
             self.system_info = "" if self.is_pickled else archive.read(_SYSTEM_INFO).decode(errors="replace")
 
@@ -100,7 +88,7 @@ class ModelArchive:
         :param given: Settings in place of the archive's
         :param not_needed: Names of settings that may be missing
         :return: Settings by name
-        :raises ObjectsMissing: if there are placeholders that nothing was given for
+        :raises ArchiveError: if there are placeholders that nothing was given for
         """
         with refusing(self.name):
             nodes = self.content["settings"]
@@ -112,17 +100,12 @@ class ModelArchive:
                 elif key not in settings:
                     settings[key] = decode(node, self._tensors.__getitem__, named)
             if needed := {key: what for key, what in missing.items() if key not in not_needed}:
-                raise ObjectsMissing(self.name, needed)
+                objects = ", ".join(f"{key!r}: ..." for key in needed)
+                raise ArchiveError(
+                    f"{self.name} was saved with objects that no archive holds ({'; '.join(needed.values())}): give "
+                    f"load custom_objects={{{objects}}}."
+                )
             return settings
-
-
-def is_pickled_model(path: PathOrFile) -> bool:
-    """
-    :param path: A model's file
-    :return: Whether SB3's own ``save`` wrote it, so that its settings are pickled
-    """
-    with reading(path, "zip") as (file, name):
-        return ModelArchive(file, name).is_pickled
 
 
 def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None, dict[str, Any]]:
@@ -164,13 +147,11 @@ class SavesModels(OffPolicyAlgorithm):
         :param include: Refused but for settings: an archive holds all of these, and no other part of a running model
         :raises ValueError: if ``include`` names parts of the running model
         """
-        excluded = {*self._excluded_save_params()}
-        if impossible := sorted(excluded & {*(include or ())}):
-            raise ValueError(
-                f"save was called with include={impossible}, which an archive does not hold: leave it out."
-            )
-        state_dicts, variables = self._get_torch_save_params()
-        left_out = excluded | {*(exclude or ())} | {name.split(".")[0] for name in [*state_dicts, *variables]}
+        included, state_dicts_and_variables = {*(include or ())}, sum(self._get_torch_save_params(), [])
+        left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in state_dicts_and_variables)}
+        if impossible := sorted(left_out & included):
+            raise ValueError(f"save got include={impossible}, which an archive does not hold: leave it out.")
+        left_out |= {*(exclude or ())} - included
         tensors: dict[str, th.Tensor] = {}
         named = named_by(type(self))
         settings = {}
@@ -183,7 +164,7 @@ class SavesModels(OffPolicyAlgorithm):
         content = {
             # Without the versions of modules, which an OrderedDict of torch carries
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
-            "variables": {name: recursive_getattr(self, name) for name in variables},
+            "variables": {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[1]},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
             "traits": getattr(self.policy, "traits", {}),  # of SB3's own policies: none
         }
@@ -241,12 +222,6 @@ class SavesModels(OffPolicyAlgorithm):
         settings = archive.settings(cls, custom_objects or {}, kwargs)
         if kwargs.get("policy_kwargs", settings.get("policy_kwargs")) != settings.get("policy_kwargs"):
             raise ValueError(f"the policy kwargs do not equal those that {name} was saved with: leave them out.")
-        chosen = {key: settings.get(key) for key in ("n_steps", "gamma")}
-        arguments = settings.get("replay_buffer_kwargs", {})
-        if settings.get("replay_buffer_class") is NStepReplayBuffer and chosen.items() <= arguments.items():
-            # SB3 chose it for these, and does so anew: `load` may be given others.
-            arguments = {key: value for key, value in arguments.items() if key not in chosen}
-            settings |= {"replay_buffer_class": None, "replay_buffer_kwargs": arguments}
         if env is not None:
             env = cls._wrap_env(env, settings.get("verbose", 0))
             check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
@@ -263,10 +238,18 @@ class SavesModels(OffPolicyAlgorithm):
             raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
         vars(model).update(kwargs)
         model._setup_model()
-        model.set_parameters(archive.read("parameters"), exact_match=True, device=device)
+        # A temperature that was given stays as it was set up.
+        given = {key for key in _TEMPERATURES if key in kwargs and kwargs[key] != settings.get(key)}
+        if "ent_coef" in given and getattr(model, "curiosity_ent_coef", None) is None:
+            given.add("curiosity_ent_coef")
+        fresh = {name for key in given for name in _TEMPERATURES[key]}
+        saved, own = archive.read("parameters"), model.get_parameters()
+        parameters = {key: state for key, state in saved.items() if key not in fresh}
+        parameters |= {key: state for key, state in own.items() if key in fresh}
+        model.set_parameters(parameters, exact_match=True, device=device)
         variables, states = archive.read("variables"), archive.read("parts")
         with refusing(name):
-            for key in model._get_torch_save_params()[1]:
+            for key in {*model._get_torch_save_params()[1]} - fresh:
                 recursive_getattr(model, key).data.copy_(variables[key])
             for key, part in model._stateful_parts().items():
                 if key in states:

@@ -9,7 +9,7 @@ import contextlib
 import json
 import math
 import struct
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from functools import partial
@@ -23,11 +23,14 @@ from safetensors import safe_open
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common import torch_layers
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 from torch.nn.modules import activation
 
@@ -37,7 +40,7 @@ from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
 #: Of the format of what is written
-VERSION = 3
+VERSION = 4
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
     **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64"},
@@ -68,6 +71,19 @@ def refusing(name: str) -> Iterator[None]:
     except Exception as error:  # hostile bytes fail in many ways
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".rstrip(".")
         raise ArchiveError(f"{name} is damaged, or was not written by this package ({reason}).") from error
+
+
+def check_version(version: Any, name: str) -> None:
+    """Refuse files of other versions of this package.
+
+    :param version: Format of the file
+    :param name: What to call it
+    :raises ArchiveError: if it is not ``VERSION``
+    """
+    if version != VERSION:
+        raise ArchiveError(
+            f"{name} has format {version!r:.20} of another version of sb3_cure, and this one reads format {VERSION}."
+        )
 
 
 # ---------------------------------------------------------------------- names
@@ -222,7 +238,21 @@ def _arguments(names: str, space: Any) -> dict[str, Any]:
     return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
 
 
+def _generator(state: dict[str, Any]) -> np.random.Generator:
+    kinds = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64)
+    generator = np.random.Generator({kind.__name__: kind for kind in kinds}[state["bit_generator"]]())
+    generator.bit_generator.state = state
+    return generator
+
+
+def _random_state(state: dict[str, Any]) -> np.random.RandomState:
+    random = np.random.RandomState()
+    random.set_state(state)
+    return random
+
+
 _BY_ATTRIBUTES = (
+    *(RunningMeanStd, GymRunningMeanStd, StackedObservations),
     *(ConstantSchedule, FloatSchedule, LinearSchedule),
     *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
 )
@@ -246,7 +276,11 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     # Its items in this order, where a dict would be sorted
     "Dict": (spaces.Dict, lambda space: OrderedDict(space.spaces), spaces.Dict),
     "Tuple": (spaces.Tuple, lambda space: space.spaces, spaces.Tuple),
-    **{kind.__name__: (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
+    "set": (set, list, set),
+    "Counter": (Counter, lambda value: [list(item) for item in value.items()], lambda items: Counter(dict(items))),
+    "Generator": (np.random.Generator, lambda generator: generator.bit_generator.state, _generator),
+    "RandomState": (np.random.RandomState, lambda random: random.get_state(legacy=False), _random_state),
+    **{name_of(kind): (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
 }
 _TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()}
 
@@ -285,7 +319,7 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
     :raises TypeError: for anything else; the file is not touched then
     """
     tensors: dict[str, th.Tensor] = {}
-    metadata = {"format": f"sb3_cure {VERSION}", "state": json.dumps(encode(state, "state", tensors))}
+    metadata = {"format": str(VERSION), "state": json.dumps(encode(state, "state", tensors))}
     with open(file, "wb") if isinstance(file, str | Path) else contextlib.nullcontext(file) as stream:
         write_tensors(stream, tensors, metadata)
 
@@ -319,7 +353,6 @@ def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]
         return _decoded(metadata, tensors.__getitem__)
 
 
-def _decoded(metadata: dict[str, str] | None, tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
-    if metadata is None or metadata.get("format") != f"sb3_cure {VERSION}":
-        raise ArchiveError(f"the file holds no state of version {VERSION}: another version of this package wrote it.")
+def _decoded(metadata: dict[str, str], tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
+    check_version(int(metadata["format"].removeprefix("sb3_cure ")), "the file")
     return decode(json.loads(metadata["state"]), tensors)
