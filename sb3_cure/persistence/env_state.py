@@ -35,11 +35,10 @@ from sb3_cure.envs.physics import integration_state, is_of_the_suite, load_integ
 from sb3_cure.persistence.encoding import encode
 
 _SPACES = ("action_space", "observation_space")
-#: Attributes of known classes that are no state: other layers, constructor arguments, clocks, files, completed checks
+#: Attributes of known classes that are no state: other layers, constructor arguments, clocks, files
 _NO_STATE: dict[type, set[str]] = {
     gym.Wrapper: {"env"},
     RecordConstructorArgs: {"_saved_kwargs"},
-    wrappers.PassiveEnvChecker: {"checked_reset", "checked_step", "checked_data_reuse", "_previous_data"},
     wrappers.RecordEpisodeStatistics: {"episode_start_time", "time_queue"},
     Monitor: {"t_start", "episode_times", "results_writer"},
     VecMonitor: {"t_start", "results_writer"},
@@ -223,6 +222,9 @@ def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, An
         own, attributes = integration_state(layer._env), {}
     elif isinstance(layer, DummyVecEnv | SubprocVecEnv):
         attributes = {"_seeds": layer._seeds, "_options": layer._options}
+    elif isinstance(layer, wrappers.PassiveEnvChecker):
+        # It compares the first observations and infos, which need not be plain, and is done with that when resumed.
+        attributes = dict.fromkeys(("checked_reset", "checked_step", "checked_data_reuse"), True)
     elif not isinstance(layer, gym.Env | VecEnvWrapper):
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as sb3_worker
 
+from sb3_cure.persistence.env_state import ResumableEnv
 from sb3_cure.vec_env.frame_watch import FrameFaultError, FrameWatch
 
 # Seconds that workers are given to leave by themselves when the environments are closed; and that one is given when its
@@ -92,7 +93,7 @@ def _work(
 
     def get_env() -> gym.Env:
         if not made:
-            made.append(FrameWatch(_patch_env(env_fn.var()), **watch.var))
+            made.append(ResumableEnv(FrameWatch(_patch_env(env_fn.var()), **watch.var)))
         return made[0]
 
     while True:
