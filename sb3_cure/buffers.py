@@ -1,9 +1,5 @@
 """Public names of :mod:`sb3_cure.data.buffers`."""
 
-from sb3_cure.data.buffers import (
-    DictFrameStackReplayBuffer,
-    FrameStackReplayBuffer,
-    SkippingReplayBuffer,
-)
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 
-__all__ = ["DictFrameStackReplayBuffer", "FrameStackReplayBuffer", "SkippingReplayBuffer"]
+__all__ = ["FrameStackReplayBuffer"]

@@ -25,7 +25,7 @@ from sb3_cure.cure.critics import TwinQ
 from sb3_cure.cure.metrics import Metrics
 from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import ActorCritic, CuRePolicy
-from sb3_cure.data.buffers import SkipsMarked, choose_replay_buffer, transitions
+from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack, transitions
 from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
@@ -232,15 +232,9 @@ class CuRe(OffPolicyAlgorithm):
         check_arguments(self)
         self._metrics, self._guard = Metrics(), Guard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
-        sb3_sums = self.everything_off and self.n_steps > 1
-        if self.replay_buffer_class is None and not (sb3_sums or self.optimize_memory_usage):
-            self.replay_buffer_class, self.replay_buffer_kwargs = choose_replay_buffer(
-                self.env,
-                self.observation_space,
-                self.replay_buffer_kwargs,
-                plain=self.everything_off,
-                skips=self.on_bad_transition == "skip",
-            )
+        if self.replay_buffer_class is None and not self.everything_off:
+            self.replay_buffer_class = FrameStackReplayBuffer
+            self.replay_buffer_kwargs = {"frame_stack": infer_frame_stack(self.env), **self.replay_buffer_kwargs}
         if self.everything_off:
             self.policy_kwargs.pop("share_encoder", None)
             self.policy_class = self.plain_policies.get(self.policy_class, self.policy_class)
@@ -249,7 +243,7 @@ class CuRe(OffPolicyAlgorithm):
         user_kwargs = self.policy_kwargs
         self.policy_kwargs = {**user_kwargs, **self._policy_choices()}
         with warnings.catch_warnings():
-            if issubclass(self.replay_buffer_class or object, SkipsMarked):  # type: ignore[arg-type]
+            if issubclass(self.replay_buffer_class or object, FrameStackReplayBuffer):  # type: ignore[arg-type]
                 warnings.filterwarnings("ignore", "`n_steps=")  # which SB3 takes for ignored
             super()._setup_model()
         self.policy_kwargs = user_kwargs
@@ -443,9 +437,14 @@ class CuRe(OffPolicyAlgorithm):
             for _ in range(2 if self._takes_turns else 1):
                 sampled: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
                 batch = self.policy.samples(sampled)
-                if self.n_steps > 1 and self.task and learns_rl and isinstance(self.replay_buffer, SkipsMarked):
-                    ahead = self.replay_buffer.look_ahead(self.n_steps, self.gamma, self._vec_normalize_env)
-                    batch = batch._replace(**ahead)
+                if (
+                    self.n_steps > 1
+                    and self.task
+                    and learns_rl
+                    and isinstance(self.replay_buffer, FrameStackReplayBuffer)
+                ):
+                    n_step = self.replay_buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env)
+                    batch = batch._replace(n_step=n_step)
                 self._guard.begin(self._n_updates)
                 with crash_report(self, batch):
                     self._gradient_step(batch, learns_srl, learns_rl)
@@ -475,8 +474,8 @@ class CuRe(OffPolicyAlgorithm):
         policy, encoder = self.policy, self.policy.encoder_update
         with th.no_grad(), self._autocast():
             views, next_views = policy.preprocess(batch.views), {"next ": policy.augment(batch.next_observations)}
-            if batch.n_step_next_observations is not None:
-                next_views["n-step "] = policy.augment(batch.n_step_next_observations)
+            if batch.n_step is not None:
+                next_views["n-step "] = policy.augment(batch.n_step.next_observations)
             # Where each agent that learns bootstraps: the task's after n steps, the curious one after one
             goals = {"task": list(next_views)[-1]} if self.task and learns_rl else {}
             if self._has_curious_agent and learns_rl:
@@ -594,10 +593,9 @@ class CuRe(OffPolicyAlgorithm):
 
     def _task_return(self, batch: Samples, rewards: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """The task's rewards, of one step or of n, and the discount of what follows them, [B, 1] each."""
-        if batch.n_step_rewards is None:
+        if batch.n_step is None:
             return rewards, (1 - batch.dones) * (self.gamma if batch.discounts is None else batch.discounts)
-        assert batch.n_step_dones is not None and batch.n_step_discounts is not None
-        return batch.n_step_rewards, (1 - batch.n_step_dones) * batch.n_step_discounts
+        return batch.n_step.rewards, (1 - batch.n_step.dones) * batch.n_step.discounts
 
     def _update_actor_critic(
         self, name: str, batch: Samples, rewards: th.Tensor, discounts: th.Tensor, next_latents: th.Tensor, goal: str

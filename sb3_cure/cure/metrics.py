@@ -8,7 +8,7 @@ from stable_baselines3.common.logger import Image, KVWriter, Logger, TensorBoard
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.data.buffers import frame_stack_of
+from sb3_cure.data.buffers import infer_frame_stack
 from sb3_cure.data.observations import by_key, image_spaces, rows_of
 from sb3_cure.data.samples import Samples
 
@@ -64,7 +64,7 @@ class Metrics(KVWriter):
         """
         keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
         if keeps and model._n_updates % RECONSTRUCTION_INTERVAL == 1:
-            strips = reconstruction_strips(model.policy, batch, frame_stack_of(model.get_env()))  # type: ignore[arg-type]
+            strips = reconstruction_strips(model.policy, batch, infer_frame_stack(model.get_env()))
             for key, strip in strips.items():
                 name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
                 model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))

@@ -1,7 +1,7 @@
 """Episodes on disk: of an expert, of another agent, of a robot that was steered by hand.
 
 An episode of T steps is one ``.npz`` file of five arrays, named and shaped as Minari's ``EpisodeData``:
-``observations`` [T + 1, ...] (of dictionaries one array per key, ``observations/<key>``), ``actions`` [T, ...],
+``observations`` [T + 1, ...] (one array per key of a dictionary, ``observations/<key>``), ``actions`` [T, ...],
 ``rewards``, ``terminations`` and ``truncations`` [T]. Observations and actions are those of the environment that the
 agent is given: images unscaled, channels first or last. No file is unpickled.
 """
@@ -20,7 +20,6 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 
-from sb3_cure.data.buffers import SkipsMarked
 from sb3_cure.data.observations import by_key, copied, rows_of, stacked
 
 #: One array, or one for each key of a dictionary
@@ -28,7 +27,8 @@ Arrays = Any
 
 
 class RecordedEpisode(NamedTuple):
-    """An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
+    """
+    An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
 
     :param observations: [T + 1, ...], or a dictionary of such arrays
     :param actions: In the bounds of the action space, [T, ...]
@@ -46,8 +46,10 @@ class RecordedEpisode(NamedTuple):
 
 def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
     """
+    Write an episode to a file.
+
     :param path: The ``.npz`` file to write
-    :param episode: What to write
+    :param episode: The episode
     """
     arrays = episode._asdict()
     if isinstance(episode.observations, dict):
@@ -57,8 +59,10 @@ def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
 
 def load_episode(path: str | Path) -> RecordedEpisode:
     """
+    Read an episode from a file.
+
     :param path: A ``.npz`` file
-    :return: The episode in it
+    :return: The episode
     """
     with np.load(path, allow_pickle=False) as file:
         by_key = {name.partition("/")[2]: file[name] for name in file.files if name.startswith("observations/")}
@@ -68,9 +72,11 @@ def load_episode(path: str | Path) -> RecordedEpisode:
 
 def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
     """
+    Read episodes one after the other.
+
     :param source: A folder of ``.npz`` files, read in the order of their names, one such file, or episodes
-    :return: The episodes, one after the other
-    :raises ValueError: if the folder has no such files
+    :return: The episodes
+    :raises ValueError: If the folder has no such files
     """
     if not isinstance(source, str | Path):
         yield from source
@@ -82,10 +88,11 @@ def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
 
 
 class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
-    """Writes each episode of an environment into a folder, when it ends, or when the environment is reset or closed.
+    """
+    Write each episode of an environment into a folder, when it ends, or when the environment is reset or closed.
 
     :param env: The environment as the agent sees it
-    :param folder: Where to write; it is made if it is missing
+    :param folder: Folder for the files; it is made if it is missing
     """
 
     def __init__(self, env: gym.Env, folder: str | Path):
@@ -95,14 +102,16 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self._observations: list[Any] = []
         self._steps: list[Any] = []
-        # Names are in the order in which episodes are recorded, and of no two environments alike. A run that is resumed
-        # writes those that it plays again over what it had written.
+        # Names sort in the order of recording, and differ between environments. A resumed run writes the episodes that
+        # it plays again over those of before.
         self._number, self._token = len(list(Path(folder).glob("*.npz"))), uuid.uuid4().hex[:8]
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """
-        :param kwargs: As of Gymnasium
-        :return: The first observation, and the environment's information
+        Reset the environment and write the episode before.
+
+        :param kwargs: As in Gymnasium
+        :return: The first observation and the info
         """
         self._write()
         observation, info = self.env.reset(**kwargs)
@@ -111,19 +120,21 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """
+        Step the environment and record the step.
+
         :param action: The action
-        :return: What the environment returns
+        :return: Observation, reward, terminated, truncated and info of the environment
         """
-        given = np.array(action)  # the environment may change it
+        taken = np.array(action)  # the environment may change it
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._observations.append(copied(observation))
-        self._steps.append([given, float(reward), bool(terminated), bool(truncated)])
+        self._steps.append([taken, float(reward), bool(terminated), bool(truncated)])
         if terminated or truncated:
             self._write()
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Write an episode that has not come to its end, and close the environment."""
+        """Write an unfinished episode and close the environment."""
         self._write()
         super().close()
 
@@ -136,31 +147,26 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         self._observations, self._steps = [], []
 
 
-def fill(
-    buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]
-) -> int:  # fmt: skip
-    """Add episodes to a replay buffer as if they had been collected: those of several environments side by side.
+def fill(buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]) -> int:
+    """
+    Add episodes to a replay buffer as if they had been collected, those of several environments side by side.
+
+    Where no episode is left for an environment, it repeats the transitions of another one.
 
     :param buffer: A replay buffer
-    :param episodes: With the attributes of ``RecordedEpisode``
+    :param episodes: Episodes with the attributes of ``RecordedEpisode``
     :param scale_action: Scales actions to [-1, 1], as they are stored
-    :return: Number of transitions that were added
-    :raises ValueError: if episodes are of other spaces, or their ends cannot be filled up
+    :return: Number of transitions in the episodes
+    :raises ValueError: If episodes do not fit the spaces
     """
-    if buffer.n_envs > 1 and not isinstance(buffer, SkipsMarked):
-        raise ValueError(
-            f"episodes differ in length, which a {type(buffer).__name__} of {buffer.n_envs} environments cannot hold: "
-            "use one environment, or a SkippingReplayBuffer."
-        )
     source, n_added, n_rows = iter(episodes), 0, 0
-    # Each environment goes on with the next episode that is left, and in the end with transitions never sampled.
+    # Each environment takes the next episode that is left.
     lanes = [_transitions(source, buffer, scale_action) for _ in range(buffer.n_envs)]
     for row in itertools.zip_longest(*lanes):
-        n_rows, n_added = n_rows + 1, n_added + sum(each is not None for each in row)
-        blank = (*next(each for each in row if each is not None)[:-1], {"bad_transition": "no episode is left"})
-        obs, next_obs, actions, rewards, dones, infos = zip(*(each or blank for each in row), strict=True)
-        columns = (stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)))
-        buffer.add(*columns, list(infos))  # type: ignore[arg-type, call-arg]
+        present = [each for each in row if each is not None]
+        n_rows, n_added = n_rows + 1, n_added + len(present)
+        obs, next_obs, actions, rewards, dones, infos = zip(*(each or present[0] for each in row), strict=True)
+        buffer.add(stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)), list(infos))  # type: ignore[call-arg]
     if n_rows > buffer.buffer_size:
         side_by_side = f" (those of {buffer.n_envs} environments side by side)" if buffer.n_envs > 1 else ""
         warnings.warn(
@@ -172,8 +178,7 @@ def fill(
 
 
 def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Callable[[np.ndarray], np.ndarray]) -> Any:
-    """Transitions of the episodes that are left in a source, as ``ReplayBuffer.add`` takes them. An episode without an
-    end was stopped: nothing goes on from it to the next one."""
+    """Transitions of the remaining episodes, as ``add`` takes them; an episode without an end is truncated."""
     for episode in source:
         observations = _as_stored(episode.observations, buffer.observation_space)
         lengths = {name: len(getattr(episode, name)) for name in RecordedEpisode._fields[1:]}
@@ -197,7 +202,7 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
 
 
 def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:
-    """Observations with their channels first, if they are of the space."""
+    """Observations with their channels first; refuse those of another space."""
     if isinstance(space, spaces.Dict):
         return {key: _as_stored(observations[key], part) for key, part in space.spaces.items()}
     array = np.asarray(observations)

@@ -14,6 +14,8 @@ Observations = th.Tensor | dict[str, th.Tensor]
 
 def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
     """
+    Find the images in a space of observations.
+
     :param space: Space of observations
     :return: Spaces of the images among them by key; an observation that is itself an image has the key ``""``
     """
@@ -23,6 +25,8 @@ def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
 
 def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
     """
+    Pick the images out of observations.
+
     :param observations: Arrays or tensors, or dictionaries of them
     :param space: Their space
     :return: The images among them, by the keys of ``image_spaces``
@@ -32,15 +36,19 @@ def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
 
 def by_key(images: Any) -> dict[str, Any]:
     """
+    Name the parts of an observation.
+
     :param images: Images, or a dictionary of them
-    :return: The dictionary; images that are none have the key ``""``, as in ``image_spaces``
+    :return: The dictionary; a single image has the key ``""``, as in ``image_spaces``
     """
     return images if isinstance(images, dict) else {"": images}
 
 
 def copied(observation: Any) -> Any:
     """
-    :param observation: An observation, which the environment may write the next one into
+    Copy an observation, which the environment may write the next one into.
+
+    :param observation: An observation
     :return: A copy
     """
     if isinstance(observation, dict):
@@ -50,6 +58,8 @@ def copied(observation: Any) -> Any:
 
 def stacked(observations: Sequence[Any]) -> Any:
     """
+    Stack observations along a new first axis.
+
     :param observations: n observations
     :return: [n, *shape], or a dictionary of such
     """
@@ -61,6 +71,8 @@ def stacked(observations: Sequence[Any]) -> Any:
 
 def rows_of(observations: Any, rows: Any) -> Any:
     """
+    Index observations along their first axis.
+
     :param observations: [n, *shape], or a dictionary of such
     :param rows: An index, a slice or a mask
     :return: These rows, as a dictionary if the observations are one
@@ -72,6 +84,8 @@ def rows_of(observations: Any, rows: Any) -> Any:
 
 def len_of(observations: Any) -> int:
     """
+    Count observations.
+
     :param observations: [n, *shape], or a dictionary of such
     :return: n
     """
@@ -80,8 +94,10 @@ def len_of(observations: Any) -> int:
 
 def sensed_space(space: spaces.Space) -> spaces.Space:
     """
+    Space of observations as encoder, head and rewards get them: a dictionary without images is one vector.
+
     :param space: Space of observations as they are stored
-    :return: What encoder, head and rewards take it for: a dictionary without images is one vector
+    :return: The space
     """
     if not isinstance(space, spaces.Dict) or image_spaces(space):
         return space
@@ -90,9 +106,11 @@ def sensed_space(space: spaces.Space) -> spaces.Space:
 
 def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
     """
-    :param observations: Observations without images, as stored
+    Join a dictionary without images to one vector.
+
+    :param observations: Observations by key, as stored
     :param space: Their space
-    :return: One vector of all, discrete values one-hot, fp32, [B, n]
+    :return: Vectors with discrete values one-hot, fp32 [B, n]
     """
     parts = [preprocess_obs(observations[key], part) for key, part in space.spaces.items()]
     return th.cat([part.flatten(1) for part in parts], dim=1)  # type: ignore[union-attr]
@@ -100,6 +118,8 @@ def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
 
 def detached(features: Any) -> Any:
     """
+    Detach features from the graph.
+
     :param features: A tensor, or a tuple of tensors
     :return: The same without a graph
     """

@@ -5,6 +5,22 @@ from typing import NamedTuple
 import torch as th
 
 
+class NStep(NamedTuple):
+    """
+    Returns of n steps for the transitions of a batch, under the names that ``Samples`` has for one step.
+
+    :param rewards: Discounted sum of n rewards, fewer where the episode or the stored stream ends, float32 [B, 1]
+    :param next_observations: What the agent saw after these, [B, *shape]
+    :param dones: 1 where the episode terminated there, 0 elsewhere, timeouts included, float32 [B, 1]
+    :param discounts: gamma to the power of the number of rewards, float32 [B, 1]
+    """
+
+    rewards: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    discounts: th.Tensor
+
+
 class Samples(NamedTuple):
     """
     A batch of B transitions, as heads, intrinsic rewards and critics get it.
@@ -19,13 +35,9 @@ class Samples(NamedTuple):
         the first one of the next episode
     :param dones: 1 where the episode terminated, 0 elsewhere, timeouts included, float32 [B, 1]
     :param rewards: Reward of that one step, float32 [B, 1]
-    :param discounts: What a buffer of one's own says for gamma, float32 [B, 1]; None: the discount factor of the agent
+    :param discounts: Discounts of a custom buffer, float32 [B, 1]; None: the discount factor of the agent
     :param views: ``observations`` as the encoder saw them (shifted or cropped), in 0-255, [B, *view shape]
-    :param n_step_rewards: Discounted sum of n rewards (fewer where the episode ends), float32 [B, 1]. This and what
-        follows is for the task's critic alone, and None unless ``n_steps > 1``
-    :param n_step_next_observations: What the agent saw after these, [B, *shape]
-    :param n_step_dones: Whether the episode terminated there, float32 [B, 1]
-    :param n_step_discounts: gamma to the number of rewards, float32 [B, 1]
+    :param n_step: Returns of n steps, for the task's critic alone; None unless ``n_steps > 1``
     """
 
     observations: th.Tensor
@@ -35,15 +47,15 @@ class Samples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | None = None
     views: th.Tensor = None  # type: ignore[assignment]
-    n_step_rewards: th.Tensor | None = None
-    n_step_next_observations: th.Tensor | None = None
-    n_step_dones: th.Tensor | None = None
-    n_step_discounts: th.Tensor | None = None
+    n_step: NStep | None = None
 
     def of(self, key: str) -> "Samples":
         """
-        :param key: Of an image in dictionaries of observations
-        :return: The batch as it is for an agent that sees this image alone
+        The batch as an agent sees it that has this image alone.
+
+        :param key: Key of an image in dictionaries of observations
+        :return: The batch with the observations of that image, without ``n_step``
         """
         fields = self._asdict().items()
-        return Samples(**{name: value[key] if isinstance(value, dict) else value for name, value in fields})
+        parts = {name: value[key] if isinstance(value, dict) else value for name, value in fields}
+        return Samples(**{**parts, "n_step": None})

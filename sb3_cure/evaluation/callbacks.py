@@ -22,9 +22,9 @@ from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cure.metrics import frame_stack_of, newest_frames
+from sb3_cure.cure.metrics import newest_frames
 from sb3_cure.cure.policies import encoder_of
-from sb3_cure.data.buffers import transitions, unmarked
+from sb3_cure.data.buffers import infer_frame_stack, stored_places, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
@@ -364,7 +364,7 @@ class ReconstructionCallback(PeriodicCallback):
             decoders = [decoding.fit_decoder(model, self._sample, self.decoder_updates, key) for key in keys]
             pairs = [decoding.draw_latents(model, *each) for each in zip(decoders, repeat(observed), keys)]
             pair = tuple(dict(zip(keys, images, strict=True)) for images in zip(*pairs, strict=True))
-        frame_stack = self.frame_stack or frame_stack_of(self.training_env)
+        frame_stack = self.frame_stack or infer_frame_stack(self.training_env)
         seen, drawn = (
             {key: newest_frames(image, frame_stack).cpu().numpy() for key, image in images.items()}
             for images in map(by_key, pair)
@@ -407,7 +407,7 @@ class ReconstructionCallback(PeriodicCallback):
         if self._buffer is None:
             kept = np.array(self._latest)
             return kept[np.linspace(0, len(kept) - 1, n if len(kept) else 0).round().astype(int)]
-        rows, env_inds, _ = unmarked(self._buffer)
+        rows, env_inds, _ = stored_places(self._buffer)
         chosen = np.linspace(len(rows) - 1, 0, n if len(rows) else 0).round().astype(int)
         found: Any = transitions(self._buffer, rows[chosen], env_inds[chosen]).observations
         return {k: v.cpu().numpy() for k, v in found.items()} if isinstance(found, dict) else found.cpu().numpy()

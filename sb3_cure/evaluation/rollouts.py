@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.cure.policies import encoder_of
-from sb3_cure.data.buffers import transitions, unmarked
+from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import copied, images_of, len_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
@@ -249,9 +249,9 @@ def most_uncomfortable(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chun
     :raises ValueError: if there is nothing to measure in the replay buffer
     """
     buffer: Any = model.replay_buffer  # type: ignore[attr-defined]
-    rows, env_inds, ages = unmarked(buffer)
+    rows, env_inds, ages = stored_places(buffer)
     if len(rows) == 0:
-        raise ValueError("the replay buffer is empty, or all its transitions are marked as faulty.")
+        raise ValueError("the replay buffer is empty.")
 
     errors = np.zeros(len(rows), np.float32)
     for start in range(0, len(rows), chunk):

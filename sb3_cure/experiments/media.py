@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.cure.metrics import frame_stack_of
+from sb3_cure.data.buffers import infer_frame_stack
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
@@ -112,5 +112,5 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
 
 def _frames_per_observation(model: CuReSAC) -> int:
     """As the environments tell, if frames then are grey or in colour; else each channel counts as a frame."""
-    told, (channels, *_) = frame_stack_of(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
+    told, (channels, *_) = infer_frame_stack(model.env), model.observation_space.shape  # type: ignore[misc]
     return told if channels in (told, 3 * told) else channels

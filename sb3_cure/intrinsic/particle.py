@@ -11,7 +11,7 @@ from numpy import ndarray
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
-from sb3_cure.data.buffers import SkipsMarked
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.reward_networks import make_network, scaled
@@ -105,10 +105,10 @@ class Particle(IntrinsicReward):
         :param encode: The online encoder
         :raises ValueError: if the buffer does not tell which transitions it has drawn
         """
-        if not isinstance(replay_buffer, SkipsMarked) or replay_buffer.last_sampled is None:
+        if not isinstance(replay_buffer, FrameStackReplayBuffer) or replay_buffer.last_sampled is None:
             raise ValueError(
                 f"intrinsic='particle' needs to know the episodes of a batch, but {type(replay_buffer).__name__} does "
-                "not tell what it has drawn: leave out replay_buffer_class and optimize_memory_usage."
+                "not tell what it has drawn: leave out replay_buffer_class."
             )
         rows, env_inds = self.places.T
         size, pos, n_rows = replay_buffer.buffer_size, replay_buffer.pos, replay_buffer.size()
@@ -165,7 +165,7 @@ class Particle(IntrinsicReward):
             self.features[th.from_numpy(where).to(features.device)] = features[-n:]
         self.cursor = (self.cursor + n) % len(self.places)
 
-    def _follow_episodes(self, buffer: SkipsMarked) -> ndarray:
+    def _follow_episodes(self, buffer: FrameStackReplayBuffer) -> ndarray:
         """Number the rows that are new since the last update, at first all: another number wherever a stream breaks."""
         size, n_envs = buffer.buffer_size, buffer.n_envs
         n_new = (buffer.pos - self.last_pos) % size
@@ -174,7 +174,6 @@ class Particle(IntrinsicReward):
         for start in range(0, n_new, CHUNK):
             rows = (buffer.pos - n_new + np.arange(start, min(start + CHUNK, n_new))) % size
             before = (rows - 1) % size
-            goes_on = buffer._goes_on(*np.broadcast_arrays(before, rows, np.arange(n_envs)[:, None])).T
-            begins = ~goes_on | (buffer.dones[before] > 0)
+            begins = buffer.starts[rows] | (buffer.dones[before] > 0)
             self._episodes[rows] = self._episodes[before[:1]] + n_envs * begins.cumsum(axis=0)
         return self._episodes

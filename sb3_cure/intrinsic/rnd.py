@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
-from sb3_cure.data.buffers import unmarked
+from sb3_cure.data.buffers import stored_places
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic.base import IntrinsicReward, LookUp
 from sb3_cure.intrinsic.reward_networks import DITHER, make_network, scaled
@@ -85,7 +85,7 @@ class RND(IntrinsicReward):
             self._is_measured = bool(self.measured)
         if self._is_measured:
             return
-        rows, env_inds, _ = unmarked(replay_buffer)
+        rows, env_inds, _ = stored_places(replay_buffer)
         chosen = np.linspace(0, len(rows) - 1, min(len(rows), OBSERVATIONS)).astype(int)
         total, squares = th.zeros_like(self.mean, dtype=th.float64), th.zeros_like(self.mean, dtype=th.float64)
         for part in np.split(chosen, range(CHUNK, len(chosen), CHUNK)):

@@ -2,7 +2,6 @@
 
 import hashlib
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
 from sb3_cure.persistence.files import flush_to_disk
@@ -20,8 +19,6 @@ from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state,
 from sb3_cure.persistence.resume import Run, training_state
 
 MODEL, STATE, BUFFER = "model.zip", "state.safetensors", "replay_buffer.safetensors"
-#: Bytes of frames that are written at once
-CHUNK = 2**22
 
 
 class _Segment(NamedTuple):
@@ -42,8 +39,8 @@ class CheckpointWriter:
     def __init__(self, path: str | Path):
         self.generations = Generations(path)
         self._segments: dict[str, list[_Segment]] = {}
-        #: Identity of the frames that the segments hold, by ring
-        self._frame_numbers: dict[str, object] = {}
+        #: Rings with the frames that the segments hold
+        self._rings: dict[str, FrameRing] = {}
 
     def write(self, model: OffPolicyAlgorithm, run: Run, keep: int) -> dict[str, Any]:
         """Write a checkpoint.
@@ -63,7 +60,7 @@ class CheckpointWriter:
             model.save(folder / MODEL)
             if rings:
                 for place, (key, ring) in enumerate(rings.items()):
-                    segments[key] = self._write_frames(ring, key, f"{place}-{number:06d}")
+                    segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{number:06d}")
                 state["buffer"] = buffer_state(buffer, frames=False)
                 state["segments"] = {key: [list(each[:3]) for each in own] for key, own in segments.items()}
             else:
@@ -75,22 +72,21 @@ class CheckpointWriter:
         self.remember(rings, segments)
         return state
 
-    def remember(self, rings: dict[str, FrameStackReplayBuffer], segments: dict[str, list[_Segment]]) -> None:
+    def remember(self, rings: dict[str, FrameRing], segments: dict[str, list[_Segment]]) -> None:
         """Note which frames are in files, so that they are not written again."""
-        self._segments = segments
-        self._frame_numbers = {key: ring.frame_numbers for key, ring in rings.items()}
+        self._rings, self._segments = rings, segments
 
-    def _write_frames(self, ring: FrameStackReplayBuffer, key: str, suffix: str) -> list[_Segment]:
-        """Write new frames, and leave out segments that the ring has overwritten."""
-        oldest, last = max(ring._n_frames - ring.frame_capacity, 0), ring._n_frames
-        known = self._segments[key] if self._frame_numbers.get(key) is ring.frame_numbers else []
+    def _write_frames(self, ring: FrameRing, last: int, key: str, suffix: str) -> list[_Segment]:
+        """Write new frames up to number ``last``, and leave out segments that the ring has overwritten."""
+        oldest = max(last - ring.capacity, 0)
+        known = self._segments[key] if self._rings.get(key) is ring else []
         segments = [segment for segment in known if segment.last > oldest]
         first = max(segments[-1].last if segments else 0, oldest)
         if first < last:
             path = self.generations.segments / f"frames-{first}-{last}-{suffix}.bin"
             digest = hashlib.sha256()
             with path.open("wb") as file:
-                for piece in _frames(ring, first, last):
+                for piece in ring.pieces(first, last):
                     digest.update(piece)
                     file.write(piece)
             flush_to_disk(path)
@@ -98,25 +94,13 @@ class CheckpointWriter:
         return segments
 
 
-def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameStackReplayBuffer]:
+def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameRing]:
     """List the rings of frames of a replay buffer.
 
     :param buffer: Replay buffer
     :return: Rings by the key of their image; of observations that are no dictionary, under ``""``
     """
-    if isinstance(buffer, FrameStackReplayBuffer):
-        return {"": buffer}
-    return buffer.images if isinstance(buffer, DictFrameStackReplayBuffer) else {}
-
-
-def _frames(ring: FrameStackReplayBuffer, first: int, last: int) -> Iterator[memoryview]:
-    """Memory of frames in a ring, in pieces."""
-    at_once = max(CHUNK // int(np.prod(ring.frame_shape)), 1)
-    while first < last:
-        start = first % ring.frame_capacity
-        count = min(last - first, ring.frame_capacity - start, at_once)
-        yield ring.frames[start : start + count].reshape(-1).data
-        first += count
+    return buffer.rings if isinstance(buffer, FrameStackReplayBuffer) else {}
 
 
 def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter) -> dict[str, Any]:
@@ -146,10 +130,10 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
         for name, first, last, digest in segments[key]:
             if not digest:
                 raise CheckpointError(f"{folder} lacks the checksum of {name}")
-            kept = max(first, ring._n_frames - ring.frame_capacity)
+            kept = max(first, model.replay_buffer.counts[key] - ring.capacity)
             with (writer.generations.segments / name).open("rb") as file:
                 file.seek((kept - first) * int(np.prod(ring.frame_shape)))
-                for piece in _frames(ring, kept, last):
+                for piece in ring.pieces(kept, last):
                     file.readinto(piece)
     writer.remember(rings, segments)
     return state

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env.stacked_observations import StackedObserva
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 from torch.nn.modules import activation
 
-from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer, SkippingReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.intrinsic import INTRINSIC_REWARDS
 from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
@@ -89,10 +89,7 @@ def check_version(version: Any, name: str) -> None:
 # ---------------------------------------------------------------------- names
 
 #: Replay buffers that are written without pickle
-BUFFERS = (
-    *(FrameStackReplayBuffer, DictFrameStackReplayBuffer, SkippingReplayBuffer),
-    *(ReplayBuffer, DictReplayBuffer, NStepReplayBuffer),
-)
+BUFFERS = (FrameStackReplayBuffer, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
 #: Types of the numbers in arrays
 NUMBERS: tuple[type[np.generic], ...] = (
     *(np.bool_, np.float16, np.float32, np.float64),

@@ -3,71 +3,62 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from numpy import ndarray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.data.buffers import DictFrameStackReplayBuffer, FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer, copy_arrays
 from sb3_cure.persistence.encoding import BUFFERS, ArchiveError, is_state, read_state, refusing, write_state
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
-_FRAME_COUNTERS = ("_n_valid", "_n_frames")
-_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "marked")
+_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def can_be_kept(kind: type) -> bool:
     """
+    Whether replay buffers of a class are written without pickle, and so can be read back without trust.
+
     :param kind: Class of a replay buffer
-    :return: Whether it is written without pickle, and so can be read back without trust
+    :return: Whether they are
     """
     return kind in BUFFERS
 
 
-def buffer_state(buffer: ReplayBuffer, frames: bool = True, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
+def buffer_state(buffer: ReplayBuffer, frames: bool = True) -> dict[str, Any]:
     """
+    State of a replay buffer as plain values and views of the used part of its arrays.
+
     :param buffer: A replay buffer
     :param frames: Whether the frames of a ``FrameStackReplayBuffer`` are among its arrays
-    :param leave_out: Of these, arrays by row that another buffer has, too
-    :return: What of it was written to, as plain values and views of its arrays
+    :return: Class, size, number of environments, counters and arrays
     """
-    n_rows = buffer.buffer_size if buffer.full else buffer.pos
     state = {"class": type(buffer).__name__, "size": buffer.buffer_size, "n_envs": buffer.n_envs}
-    counters = {"pos": int(buffer.pos), "full": bool(buffer.full)}
     if isinstance(buffer, FrameStackReplayBuffer):
-        rows = [name for name in buffer._ROW_ARRAYS if name not in leave_out]
-        arrays = {name: getattr(buffer, name)[:n_rows] for name in rows} | {"_tails": buffer._tails}
-        counters |= {name: int(getattr(buffer, name)) for name in _FRAME_COUNTERS}
-        if frames:
-            arrays["frames"] = buffer.frames[: buffer._n_frames]
-        return {**state, "frame_capacity": buffer.frame_capacity, "counters": counters, "arrays": arrays}
-    if isinstance(buffer, DictFrameStackReplayBuffer):
-        state["images"] = {key: buffer_state(image, frames, buffer._ROW_ARRAYS) for key, image in buffer.images.items()}
-    # The memory-efficient variant keeps the next observation in the next row.
-    n_seen = min(n_rows + buffer.optimize_memory_usage, buffer.buffer_size)
-    arrays = {}
-    for name, array in _flat({name: getattr(buffer, name, None) for name in _ROWS}).items():
-        arrays[name] = array[: n_seen if name.startswith("observations") else n_rows]
-    return {**state, "counters": counters, "arrays": arrays}
+        return {**state, **buffer.state_dict(frames)}
+    return {**state, "counters": {"pos": buffer.pos, "full": buffer.full}, "arrays": _arrays_of(buffer)}
 
 
-def _flat(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays by name, those in dictionaries (of Dict observations) by both names."""
-    flat: dict[str, np.ndarray] = {}
-    for name, value in arrays.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}/{key}": part for key, part in value.items()}
-        elif isinstance(value, np.ndarray):
-            flat[name] = value
-    return flat
+def _arrays_of(buffer: ReplayBuffer) -> dict[str, ndarray]:
+    """Used part of the arrays of SB3's buffers; those of dictionaries by both names."""
+    arrays: dict[str, ndarray] = {}
+    for name in _ARRAYS:
+        value = getattr(buffer, name, {})  # `optimize_memory_usage` does without next observations
+        parts = {f"{name}/{key}": part for key, part in value.items()} if isinstance(value, dict) else {name: value}
+        # ... but keeps the latest one in the row at `pos`.
+        n_rows = buffer.size() + int(buffer.optimize_memory_usage and name == "observations")
+        arrays |= {each: array[:n_rows] for each, array in parts.items()}
+    return arrays
 
 
 def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: str) -> ReplayBuffer:
     """
+    A new replay buffer of a model with the state of another one.
+
     :param model: The model that the replay buffer is for
-    :param state: Of ``buffer_state``, with frames or without
-    :param name: What to call its file
+    :param state: From ``buffer_state``, with frames or without
+    :param name: Name of its file in messages
     :return: A replay buffer of the model's class, of the size that was saved; without frames, they have to follow
-    :raises ArchiveError: if it does not fit the model or is damaged
+    :raises ArchiveError: If it does not fit the model or is damaged
     """
     with refusing(name):
         kind = model.replay_buffer_class
@@ -86,50 +77,28 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
             optimize_memory_usage=model.optimize_memory_usage,
             **model.replay_buffer_kwargs,
         )
-        _restore(buffer, state, name)
+        try:
+            if isinstance(buffer, FrameStackReplayBuffer):
+                buffer.load_state_dict(state)
+            else:
+                buffer.pos, buffer.full = int(state["counters"]["pos"]), bool(state["counters"]["full"])
+                copy_arrays(_arrays_of(buffer), state["arrays"])
+        except ValueError as error:
+            fix = "load the replay buffer of a model with the same settings and environment"
+            raise ArchiveError(f"{name} does not fit this model ({error}): {fix}.") from error
         return buffer
-
-
-def _restore(buffer: Any, state: dict[str, Any], name: str, leave_out: tuple[str, ...] = ()) -> None:
-    """Put counters and arrays into a new buffer, and into those that it is made of."""
-    counters, images, given_images = state["counters"], getattr(buffer, "images", {}), state.get("images", {})
-    vars(buffer).update({key: type(vars(buffer)[key])(value) for key, value in counters.items()})
-    if images.keys() != given_images.keys():
-        raise ArchiveError(f"{name} has other images than this model: load the replay buffer of the same environment.")
-    for key, image in images.items():
-        if not counters.items() <= given_images[key]["counters"].items():
-            raise ArchiveError(f"{name} has images that do not belong together: it is damaged.")
-        _restore(image, given_images[key], name, buffer._ROW_ARRAYS)
-    if isinstance(buffer, FrameStackReplayBuffer) and buffer._n_frames > 0:
-        buffer.reserve_frames()
-    own_state = buffer_state(buffer, "frames" in state["arrays"], leave_out)
-    for key in ("frame_capacity", "counters"):
-        if state.get(key) != own_state.get(key):
-            raise ArchiveError(f"{name} has {key}={state.get(key)!s:.50}, not {own_state.get(key)}.")
-    own, given = own_state["arrays"], state["arrays"]
-    for key in sorted(own.keys() | given.keys()):
-        here, there = (_kind(arrays.get(key)) for arrays in (own, given))
-        if here != there:
-            raise ArchiveError(
-                f"{name} has {key:.50} as {there}, but this model's replay buffer needs {here}: load the replay "
-                "buffer of a model with the same settings and environment."
-            )
-        own[key][...] = given[key]
-
-
-def _kind(array: Any) -> str:
-    return f"{array.dtype} of shape {array.shape}" if isinstance(array, np.ndarray) else str(type(array).__name__)
 
 
 class SavesReplayBuffers(OffPolicyAlgorithm):
     """Mixin for an algorithm of SB3: replay buffers in files without pickle."""
 
     def save_replay_buffer(self, path: PathOrFile) -> None:
-        """Save the used part of the replay buffer, without pickle and without a copy in memory.
+        """
+        Save the used part of the replay buffer, without pickle and without a copy in memory.
 
         Buffers of classes that this package does not know, and ``HerReplayBuffer``, are pickled, as SB3 does.
 
-        :param path: Path, whose folder is made and which gets the suffix ``.pkl`` if it has none, or a binary file
+        :param path: Path, with a folder that is made and the suffix ``.pkl`` if it has none, or a binary file
         """
         buffer = self.replay_buffer
         if buffer is None or not can_be_kept(type(buffer)):
@@ -139,7 +108,8 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
             write_state(file, buffer_state(buffer))
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
-        """Load a replay buffer, also one from a stranger.
+        """
+        Load a replay buffer, also one from a stranger.
 
         :param path: Path with or without its suffix ``.pkl``, or a binary file
         :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3

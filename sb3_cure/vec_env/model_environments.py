@@ -8,7 +8,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.data.buffers import SkipsMarked, restarts_workers
 from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
 from sb3_cure.vec_env.finite_check import FiniteCheck
 
@@ -46,13 +45,6 @@ class ModelEnvironments(OffPolicyAlgorithm):
             self.env.get_attr("action_repeat")[0] if self.env is not None and self.env.has_attr("action_repeat") else 1
         )
         self._action_repeat = told if isinstance(told, int) else 1
-        may_be_marked = self.on_bad_transition == "skip" or restarts_workers(self.env)
-        if may_be_marked and not isinstance(self.replay_buffer, SkipsMarked):
-            raise ValueError(
-                f"a {type(self.replay_buffer).__name__} cannot promise that faulty transitions are never sampled: use "
-                "a SkippingReplayBuffer or a FrameStackReplayBuffer (DictFrameStackReplayBuffer of dictionaries), or "
-                "on_bad_transition='raise' and on_env_fault='raise'."
-            )
         return super()._setup_learn(*args, **kwargs)
 
     def learn(self, *args: Any, **kwargs: Any) -> Any:

@@ -38,7 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from benchmarks import faults
 from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.data.buffers import transitions
+from sb3_cure.data.buffers import FrameRing, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -123,20 +123,18 @@ def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallba
     return model
 
 
-def stored_in(buffer: Any) -> dict[str, Any]:
-    """Arrays and counters, of the images of a dictionary, too."""
-    stored = {name: value for name, value in vars(buffer).items() if isinstance(value, np.ndarray | int)}
-    for name in ("observations", "next_observations"):
-        parts = vars(buffer).get(name)
-        stored |= {f"{name}.{key}": value for key, value in parts.items()} if isinstance(parts, dict) else {}
-    return stored | {key: stored_in(image) for key, image in vars(buffer).get("images", {}).items()}
+def arrays_in(value: Any) -> dict[str, Any]:
+    """Arrays and counters of a replay buffer, and of its dictionaries and rings of frames."""
+    attributes = value if isinstance(value, dict) else vars(value)
+    inside = {k: arrays_in(part) for k, part in attributes.items() if isinstance(part, dict | FrameRing)}
+    return {**inside, **{k: part for k, part in attributes.items() if isinstance(part, np.ndarray | int)}}
 
 
 def outcome(model: CuReSAC) -> dict[str, Any]:
     """All that training leaves behind."""
     return {
         "networks": state_of(model),
-        "buffer": stored_in(model.replay_buffer),
+        "buffer": arrays_in(model.replay_buffer),
         "counters": (model.num_timesteps, model._n_updates, model._episode_num),
         "episodes": [(episode["r"], episode["l"]) for episode in model.ep_info_buffer or ()],
         "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),
@@ -438,14 +436,15 @@ def test_frames_are_written_once(tmp_path: Path) -> None:
     kept = Generations(tmp_path)
     numbers = kept.numbers()
     assert len(numbers) == 3 and numbers[-1] == 10
-    frame_bytes = int(np.prod(model.replay_buffer.frame_shape))
+    ring = model.replay_buffer.rings[""]
+    frame_bytes = int(np.prod(ring.frame_shape))
     segments = read_state(kept.folder(numbers[-1]) / "state.safetensors")["segments"][""]
     for name, first, last in segments:
         assert kept.segments.joinpath(name).stat().st_size == (last - first) * frame_bytes
     assert all(one[2] == other[1] for one, other in itertools.pairwise(segments))
     # No more is kept than the ring holds and what the older generations and the oldest segment need.
     frames = sum(path.stat().st_size for path in kept.segments.iterdir()) / frame_bytes
-    assert frames <= model.replay_buffer.frame_capacity + 4 * 15
+    assert frames <= ring.capacity + 4 * 15
     before = {path.name for path in kept.segments.iterdir()}
     CuReSAC.resume(tmp_path, pixels()()).learn(10, callback=ExactCheckpoint(10, tmp_path), reset_num_timesteps=False)
     assert len({path.name for path in kept.segments.iterdir()} - before) == 1
