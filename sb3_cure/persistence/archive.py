@@ -19,7 +19,16 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
-from sb3_cure.persistence.encoding import VERSION, ArchiveError, check_version, decode, encode, named_by, refusing, write_tensors
+from sb3_cure.persistence.encoding import (
+    VERSION,
+    ArchiveError,
+    check_version,
+    decode,
+    encode,
+    named_by,
+    refusing,
+    write_tensors,
+)
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
 Self = TypeVar("Self", bound="SavesModels")
@@ -40,13 +49,15 @@ class Stateful(Protocol):
     """A part of a model with a state beside tensors and settings."""
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: Its state: values that ``encode`` knows
+        """Get the state.
+
+        :return: Values that ``encode`` knows
         """
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Of ``state_dict``
+        """Set the state.
+
+        :param state: Result of ``state_dict``
         """
 
 
@@ -75,7 +86,8 @@ class ModelArchive:
             self.system_info = "" if self.is_pickled else archive.read(_SYSTEM_INFO).decode(errors="replace")
 
     def read(self, part: str) -> dict[str, Any]:
-        """
+        """Read states.
+
         :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"traits"``
         :return: States by name
         """
@@ -83,8 +95,9 @@ class ModelArchive:
             return decode(self.content[part], self._tensors.__getitem__)
 
     def settings(self, model_class: type, given: dict[str, Any], not_needed: Iterable[str]) -> dict[str, Any]:
-        """
-        :param model_class: The class that the settings are for
+        """Read the settings.
+
+        :param model_class: Class that the settings are for
         :param given: Settings in place of the archive's
         :param not_needed: Names of settings that may be missing
         :return: Settings by name
@@ -109,8 +122,9 @@ class ModelArchive:
 
 
 def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None, dict[str, Any]]:
-    """
-    :param path: A model's file
+    """Read the networks of a model, to transfer them to another one.
+
+    :param path: Model's file
     :return: The tensors of its policy by name; the logarithm of its curious agent's temperature, if it learns that; and
         the ``traits`` of its policy
     :raises ArchiveError: if it is damaged or pickled
@@ -139,16 +153,16 @@ class SavesModels(OffPolicyAlgorithm):
     ) -> None:
         """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
 
-        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
-        it was, and ``load`` asks for it as ``custom_objects``.
+        A function as ``learning_rate`` or a class of your own is saved as a placeholder with its name, and ``load``
+        needs it in ``custom_objects``.
 
         :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
         :param exclude: Names of settings that are not to be saved
-        :param include: Refused but for settings: an archive holds all of these, and no other part of a running model
+        :param include: Names of settings that are saved although they are in ``exclude``
         :raises ValueError: if ``include`` names parts of the running model
         """
-        included, state_dicts_and_variables = {*(include or ())}, sum(self._get_torch_save_params(), [])
-        left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in state_dicts_and_variables)}
+        included, (state_dicts, variables) = {*(include or ())}, self._get_torch_save_params()
+        left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in [*state_dicts, *variables])}
         if impossible := sorted(left_out & included):
             raise ValueError(f"save got include={impossible}, which an archive does not hold: leave it out.")
         left_out |= {*(exclude or ())} - included
@@ -164,7 +178,7 @@ class SavesModels(OffPolicyAlgorithm):
         content = {
             # Without the versions of modules, which an OrderedDict of torch carries
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
-            "variables": {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[1]},
+            "variables": {name: recursive_getattr(self, name) for name in variables},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
             "traits": getattr(self.policy, "traits", {}),  # of SB3's own policies: none
         }
@@ -190,17 +204,19 @@ class SavesModels(OffPolicyAlgorithm):
         trusted: bool = False,
         **kwargs: Any,
     ) -> Self:
-        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
-        imported. (Its settings may still ask for more memory than there is.)
+        """Load a model, also one from a stranger.
+
+        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still ask for
+        more memory than there is.) A temperature that is given replaces the saved one, whether fixed or learned.
 
         :param path: Path with or without its suffix ``.zip``, or a binary file
-        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
+        :param env: Environment, vectorised environment or Gymnasium id to learn in; not needed to predict
         :param device: Device of the networks
         :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
             ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
             archive does not have are ignored
         :param print_system_info: Whether to print of which system the model was saved, and of this one
-        :param force_reset: Whether to reset the environment before learning goes on
+        :param force_reset: Whether to reset the environment before learning
         :param trusted: Also load what SB3's ``save`` has pickled, which runs any code in it
         :param kwargs: Settings to change
         :return: The model
@@ -261,7 +277,9 @@ class SavesModels(OffPolicyAlgorithm):
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
+        """Load parameters into this model.
+
+        Of a file only the tensors are read, so that pickled archives are safe, too.
 
         :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
         :param exact_match: Whether all of the model's parameters have to be there, and no others

@@ -292,7 +292,7 @@ class ExactCheckpoint(BaseCallback):
             run.new_episode_said = True
             warnings.warn(
                 f"checkpoints cannot keep the state of the environments, as {reason}: a resumed training begins a new "
-                "episode.",
+                "episode (state_dict() and load_state_dict(state) avoid this).",
                 stacklevel=2,
             )
         missing = {name for own in state["callbacks"] for name in own["missing"]} - self._said

@@ -19,15 +19,14 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from safetensors import safe_open
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common import torch_layers
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
@@ -60,7 +59,7 @@ class ArchiveError(ValueError):
 
 @contextlib.contextmanager
 def refusing(name: str) -> Iterator[None]:
-    """Whatever goes wrong while a file is read becomes an ``ArchiveError``.
+    """Turn any error of reading a file into an ``ArchiveError``.
 
     :param name: What to call the file
     """
@@ -102,9 +101,10 @@ def _of_module(module: Any, base: type) -> list[type]:
 
 
 def name_of(value: Any) -> str:
-    """
-    :param value: A class, or a member of an enumeration
-    :return: What files call it
+    """Get the name by which files call a class or a member of an enumeration.
+
+    :param value: Class or member
+    :return: Name
     """
     if value in NUMBERS:
         return f"numpy.{np.dtype(value).name}"  # `bool` or `bool_`, by NumPy's version
@@ -122,9 +122,6 @@ NAMED: dict[str, Any] = {
         encoders.VectorEncoder,
         encoders.DictEncoder,
         torch_layers.FlattenExtractor,
-        torch_layers.NatureCNN,
-        torch_layers.CombinedExtractor,
-        RMSpropTFLike,
         *SRL_HEADS.values(),
         *INTRINSIC_REWARDS.values(),
         *_of_module(activation, th.nn.Module),
@@ -136,9 +133,10 @@ NAMED: dict[str, Any] = {
 
 
 def named_by(model_class: type) -> dict[str, Any]:
-    """
-    :param model_class: An algorithm
-    :return: What its archives may name: ``NAMED``, and the policies that it and its base classes register
+    """List what the archives of an algorithm may name: ``NAMED``, and the policies that its classes register.
+
+    :param model_class: Algorithm
+    :return: Classes by name
     """
     registered = [vars(base).get("policy_aliases", {}).values() for base in model_class.__mro__]
     policies = {base for policies in registered for policy in policies for base in policy.__mro__}
@@ -149,9 +147,10 @@ def named_by(model_class: type) -> dict[str, Any]:
 
 
 def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
-    """
-    :param value: None, bool, int, float, str, bytes, list, tuple, dict, deque, arrays, tensors, numbers of NumPy,
-        paths, spaces, SB3's schedules and noises, and what has a name
+    """Describe a value by JSON.
+
+    :param value: None, bool, int, float, str, bytes, list, tuple, dict, set, deque, arrays, tensors, NumPy's numbers
+        and generators, paths, spaces, SB3's schedules, noises and running statistics, and classes with a name
     :param path: Where it is, which names its tensors
     :param tensors: Takes the arrays and tensors, contiguous
     :param named: Classes by name
@@ -196,7 +195,8 @@ def _keep(tensor: th.Tensor, path: str, tensors: dict[str, th.Tensor]) -> str:
 
 
 def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
-    """
+    """Restore a value.
+
     :param node: JSON of ``encode``
     :param tensors: Gives a tensor by its name
     :param named: Classes by name
@@ -224,14 +224,14 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
 
 
 def _revived(kind: type, attributes: dict[str, Any]) -> Any:
-    """An object of a class whose state is its attributes."""
+    """Make an object of a class whose state is its attributes."""
     value: Any = object.__new__(kind)
     vars(value).update(attributes)
     return value
 
 
 def _arguments(names: str, space: Any) -> dict[str, Any]:
-    """Those that a space was made with."""
+    """Get the arguments that a space was made with."""
     return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
 
 
@@ -253,7 +253,7 @@ _BY_ATTRIBUTES = (
     *(ConstantSchedule, FloatSchedule, LinearSchedule),
     *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
 )
-#: By tag: the class, what a value is made of, and how it is made of that again
+#: By tag: class, function from an object to its parts, and back
 _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "tuple": (tuple, list, tuple),
     "dict": (dict, lambda value: [list(item) for item in value.items()], dict),
@@ -322,9 +322,10 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
 
 
 def is_state(file: BinaryIO) -> bool:
-    """
-    :param file: A binary file, at its start
-    :return: Whether it may be one of ``write_state``, rather than a pickle
+    """Check whether a file may be one of ``write_state``, rather than a pickle.
+
+    :param file: Binary file at its start
+    :return: Whether it may
     """
     return file.read(9)[8:] == b"{"
 

@@ -10,8 +10,8 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
    spaces must be the same in an environment that is built in the same way. State in class attributes, in module
    variables or on the side of a library is not seen.
 
-A layer with any other attribute, or with an object under two names (they would be two after loading), makes its environment begin a new episode; what the other layers keep, such as running
-statistics, is restored all the same.
+A layer with any other attribute, or with one object under two names (which would be two after loading), makes its
+environment begin a new episode; what the other layers keep, such as running statistics, is restored all the same.
 """
 
 import copy
@@ -205,10 +205,10 @@ def _layer_states(layers: list[Any]) -> list[dict[str, Any]]:
     for layer, state in zip(layers, states, strict=True):
         try:
             state |= _layer_state(layer, layers, kept)
-        except NotKept as error:
+        except (NotKept, TypeError) as error:  # TypeError: of a type that files do not hold
             state["error"] = str(error)
-        except Exception as error:  # in a user's state_dict, or of a type that files do not hold
-            state["error"] = f"the state of {type(layer).__name__} cannot be saved ({error})"
+        except Exception as error:
+            state["error"] = f"{type(layer).__name__}.state_dict() raised {error!r}"
     return states
 
 
@@ -245,7 +245,8 @@ def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, An
     spaces |= {key: getattr(layer, key) for key in _SPACES}
     drawn = {key: [part._np_random for part in _parts(space)] for key, space in spaces.items()}
     encode(own, f"{name}.state_dict()", {})
-    return {"own": own, "attributes": values, "functions": functions, "spaces": drawn}
+    # A copy, as the environment may write into its own
+    return copy.deepcopy({"own": own, "attributes": values, "functions": functions, "spaces": drawn})
 
 
 def _load_layers(layers: list[Any], states: list[dict[str, Any]]) -> str | None:
@@ -256,7 +257,7 @@ def _load_layers(layers: list[Any], states: list[dict[str, Any]]) -> str | None:
             if state["error"] is None:
                 _load_layer(layer, state)
         except Exception as failure:  # in a user's load_state_dict, or of attributes that differ
-            error = f"the state of {type(layer).__name__} cannot be restored ({type(failure).__name__}: {failure})"
+            error = f"the state of {type(layer).__name__} cannot be restored ({failure!r})"
     return error
 
 
@@ -301,9 +302,14 @@ def _identities(value: Any) -> Iterator[int]:
         value = value.untyped_storage()
     if not isinstance(value, tuple):
         yield value.data_ptr() if isinstance(value, th.UntypedStorage) else id(value)
-    inside = value.items() if isinstance(value, dict) else value
-    for part in inside if isinstance(value, dict | list | tuple | set | deque) else vars(value).values() if hasattr(value, "__dict__") else ():
+    for part in [*_inside(value), *getattr(value, "__dict__", {}).values()]:
         yield from _identities(part)
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return [*value, *value.values()]
+    return value if isinstance(value, list | tuple | set | deque) else ()
 
 
 def _stateless_name(value: Any) -> str:
@@ -322,9 +328,8 @@ def _parts(space: gym.Space) -> list[Any]:
     """List a space and all that it is composed of: each draws from a generator of its own."""
     spaces = [space]
     for each in spaces:  # grows meanwhile
-        for value in vars(each).values():
-            inside = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else [value]
-            spaces += [part for part in inside if isinstance(part, gym.Space)]
+        values = [part for value in vars(each).values() for part in (value, *_inside(value))]
+        spaces += [part for part in values if isinstance(part, gym.Space)]
     return spaces
 
 
@@ -338,7 +343,7 @@ def _is_dmc(layer: Any) -> bool:
 
 
 def _fingerprint(layer: Any) -> dict[str, str]:
-    """Class of a layer, id of its environment, and plain arguments of its constructor as far as Gymnasium knows them."""
+    """Describe how a layer was built: class, id, and plain arguments as far as Gymnasium knows them."""
     spec = layer.spec if isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper) else None
     arguments = {} if spec is None else {"id": spec.id}
     if isinstance(layer, RecordConstructorArgs):

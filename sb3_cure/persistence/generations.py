@@ -111,7 +111,9 @@ class Generations:
         :raises CheckpointError: if another training has written here since
         """
         if max(self.numbers(), default=-1) != self._newest:
-            raise CheckpointError(f"another training writes checkpoints to {self.path}: end it, or choose another path.")
+            raise CheckpointError(
+                f"another training writes checkpoints to {self.path}: end it, or choose another path."
+            )
         number = self._newest + 1
         draft = self.path / f".unfinished-{number}-{os.getpid()}"
         shutil.rmtree(draft, ignore_errors=True)

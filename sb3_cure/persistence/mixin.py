@@ -12,8 +12,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_cure.persistence.archive import SavesModels
-from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_generation
 from sb3_cure.persistence.callback_state import list_callbacks
+from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_generation
 from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
 from sb3_cure.persistence.resume import Resumption, Run
 
@@ -83,9 +83,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
         run.resumed = Resumption(model, state, model._stateful_parts())
         if run.resumed.restore_error is not None:
             run.new_episode_said = True
-            warnings.warn(
-                f"the training begins a new episode, as {run.resumed.restore_error}.", stacklevel=2
-            )
+            warnings.warn(f"the training begins a new episode, as {run.resumed.restore_error}.", stacklevel=2)
         if model.verbose >= 1:
             print(f"Resumed from {generation.folder}, after {model.num_timesteps} agent steps")
         return model

@@ -97,9 +97,9 @@ def test_schedules_noises_and_classes_come_back(schedule: Any, noise: Any, extra
     assert loaded.train_freq == model.train_freq and loaded.replay_buffer_class is model.replay_buffer_class
     for progress in (1.0, 0.7, 0.1):
         assert loaded.lr_schedule(progress) == model.lr_schedule(progress)
-    for copy in (model, loaded) if noise is not None else ():
+    for each in (model, loaded) if noise is not None else ():
         np.random.seed(0)
-        copy.drawn = [copy.action_noise() for _ in range(3)]
+        each.drawn = [each.action_noise() for _ in range(3)]
     assert differences(getattr(model, "drawn", 0), getattr(loaded, "drawn", 0)) == []
     assert differences(state_of(model), state_of(loaded)) == []
 

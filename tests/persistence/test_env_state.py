@@ -25,7 +25,13 @@ from sb3_cure.persistence import ResumableEnv, read_state, write_state
 from sb3_cure.persistence.env_state import load_vec_env_state, restore_error, vec_env_state
 
 #: Tasks that change terrain, targets, gains, weights, sizes and obstacles at reset
-TASKS = [("quadruped", "escape"), ("fish", "swim"), ("finger", "turn_hard"), ("manipulator", "insert_peg"), ("dog", "fetch")]
+TASKS = [
+    ("quadruped", "escape"),
+    ("fish", "swim"),
+    ("finger", "turn_hard"),
+    ("manipulator", "insert_peg"),
+    ("dog", "fetch"),
+]
 
 
 class Dot(gym.Env):

@@ -273,9 +273,7 @@ def test_learn_after_resume_ends_where_it_should(first: tuple[int, bool], tmp_pa
 def test_more_steps_can_be_interrupted_again(tmp_path: Path) -> None:
     """They are a call of their own: what is left of it is counted from its beginning."""
     with pytest.raises(Killed):
-        interrupted(tmp_path).learn(
-            30, callback=[ExactCheckpoint(10, tmp_path), KillAt(25)], reset_num_timesteps=False
-        )
+        interrupted(tmp_path).learn(30, callback=[ExactCheckpoint(10, tmp_path), KillAt(25)], reset_num_timesteps=False)
     again = CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
     assert again.num_timesteps == 40
     assert again.learn(30).num_timesteps == 50  # of which 20 were made

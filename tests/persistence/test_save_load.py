@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -163,7 +162,9 @@ def temperature(model: CuReSAC) -> tuple[float, bool]:
         (0.3, {}, (0.3, False)),
     ],
 )
-def test_temperature_given_to_load_applies(saved: Any, given: Any, expected: tuple[float, bool], tmp_path: Path) -> None:
+def test_temperature_given_to_load_applies(
+    saved: Any, given: Any, expected: tuple[float, bool], tmp_path: Path
+) -> None:
     tiny_model("MlpPolicy", VectorBox(), ent_coef=saved, curiosity_ent_coef="auto").learn(15).save(tmp_path / "model")
     loaded = CuReSAC.load(tmp_path / "model", env=VectorBox(), **given)
     assert temperature(loaded) == expected
