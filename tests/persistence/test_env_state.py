@@ -5,6 +5,7 @@ import functools
 import io
 import itertools
 import random
+import re
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -294,6 +295,9 @@ class Broken(Dot):
 class Simulator:
     """No Gymnasium environment."""
 
+    def run(self) -> None:
+        """Do something."""
+
 
 ARRAY, LIST = np.zeros(4), [0]
 NOT_KEPT: dict[str, Callable[[], gym.Env]] = {
@@ -303,7 +307,7 @@ NOT_KEPT: dict[str, Callable[[], gym.Env]] = {
     "keeps one object or memory under two names": holding(first=LIST, inside={"second": LIST}),
     "in the memory of another object": holding(mapped=np.frombuffer(bytearray(8), np.uint8)),
     "order in memory": holding(turned=np.ones((2, 3)).T),
-    "bound method": holding(bound=Simulator().__str__),
+    r"Dot\.bound is the function .*Simulator\.run": holding(bound=Simulator().run),
     "Broken.*'missing'": Broken,
 }
 
@@ -311,12 +315,11 @@ NOT_KEPT: dict[str, Callable[[], gym.Env]] = {
 @pytest.mark.parametrize("reason", NOT_KEPT)
 def test_other_states_are_reported(reason: str) -> None:
     """The reason is said, the other layers are restored, and the environment may be reset."""
-    reason_pattern = "is of the type" if reason == "bound method" else reason
     venv, other = (VecNormalize(DummyVecEnv([NOT_KEPT[reason]])) for _ in range(2))
     venv.reset()
     follow(venv, actions(venv, 3))
     error = load_vec_env_state(other, vec_env_state(venv))
-    assert error is not None and pytest.raises(ValueError, match=reason_pattern).matches(ValueError(error))
+    assert re.search(reason, str(error))
     assert other.obs_rms.count == venv.obs_rms.count > 3  # type: ignore[union-attr]
 
 

@@ -300,10 +300,20 @@ def test_learn_ends_interrupted_pretraining(tmp_path: Path) -> None:
     assert (model.num_timesteps, model.replay_buffer.size()) == (15, 15)
 
 
+class Unwilling(BaseCallback):
+    """Refuses the training at its beginning."""
+
+    def _init_callback(self) -> None:
+        raise Killed
+
+    def _on_step(self) -> bool:
+        return True
+
+
 def test_failed_learn_can_be_called_again(tmp_path: Path) -> None:
     model = interrupted(tmp_path)
-    with pytest.raises(ValueError, match="must be at least 1"):
-        model.learn(40, callback=ExactCheckpoint(0, tmp_path))
+    with pytest.raises(Killed):
+        model.learn(40, callback=Unwilling())
     whole = tiny_model("MlpPolicy", VectorBox()).learn(40)
     assert differences(state_of(whole), state_of(model.learn(40))) == []
 
