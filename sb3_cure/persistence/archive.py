@@ -270,8 +270,6 @@ class SavesModels(OffPolicyAlgorithm):
             for key, part in model._stateful_parts().items():
                 if key in states:
                     part.load_state_dict(states[key])
-        if model.use_sde:
-            model.policy.reset_noise()  # type: ignore[operator]
         return model
 
     def set_parameters(

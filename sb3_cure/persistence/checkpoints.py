@@ -246,9 +246,8 @@ class ExactCheckpoint(BaseCallback):
         self._run.before_rollout.append(self._before_rollout)
 
     def _on_training_start(self) -> None:
-        for setting in ("overlap", "use_sde"):
-            if getattr(self.model, setting, False):
-                warnings.warn(f"with {setting}=True a resumed training is not bit for bit the same", stacklevel=2)
+        if getattr(self.model, "overlap", False):
+            warnings.warn("with overlap=True a resumed training is not bit for bit the same.", stacklevel=2)
         self._last_saved = self._last_tried = self.num_timesteps
         if self._run.resumed is None:
             self._write()
@@ -269,7 +268,8 @@ class ExactCheckpoint(BaseCallback):
     def _save(self) -> None:
         model: Any = self.model
         self.num_timesteps = self._last_tried = model.num_timesteps
-        model._before_checkpoint()
+        # Finishes updates under way, and raises if parameters are not finite
+        getattr(model, "_before_checkpoint", lambda: None)()
         try:
             self._write()
         except OSError as error:

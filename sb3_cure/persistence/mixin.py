@@ -46,10 +46,6 @@ class Persistence(SavesModels, SavesReplayBuffers):
             vars(memo[id(wrapper)])["class_attributes"] = wrapper.class_attributes
         return _copy_attributes(self, "_run", memo)
 
-    def _before_checkpoint(self) -> None:
-        """Finish updates under way, and raise if parameters are not finite."""
-        getattr(super(), "_before_checkpoint", lambda: None)()
-
     @classmethod
     def resume(
         cls: type[Self],
