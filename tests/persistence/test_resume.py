@@ -372,7 +372,8 @@ def test_new_episode_is_said_once_with_its_reason(tmp_path: Path) -> None:
     assert [len(each) for each in said] == [1, 1]
     assert all("as NoState.lock is of the type" in each[0] or "NoState.lock" in each[0] for each in said)
     assert resumed.num_timesteps == 60
-    assert not np.array_equal(resumed.replay_buffer.observations[30], resumed.replay_buffer.observations[0])
+    rewards = resumed.replay_buffer.rewards
+    assert not np.array_equal(rewards[30:40], rewards[:10])
 
 
 # -------------------------------------------------------------------------------------------------- callbacks
@@ -424,14 +425,19 @@ def test_evaluations_continue(tmp_path: Path) -> None:
 
     def evaluation() -> EvalCallback:
         env = make_vec_env(VectorBox, 1, env_kwargs={"episode_length": 7})
-        return EvalCallback(env, callback_after_eval=Best(), eval_freq=9, n_eval_episodes=1, verbose=0, warn=False)
+        kwargs: Any = dict(eval_freq=9, n_eval_episodes=1, log_path=str(tmp_path / "log"), verbose=0, warn=False)
+        return EvalCallback(env, callback_after_eval=Best(), **kwargs)
 
     first, second = evaluation(), evaluation()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(Killed):
-            tiny_model("MlpPolicy", vectors()).learn(60, callback=[ExactCheckpoint(20, tmp_path), first, KillAt(50)])
-        CuReSAC.resume(tmp_path, vectors()).learn(60, callback=[ExactCheckpoint(20, tmp_path), second])
+            tiny_model("MlpPolicy", vectors()).learn(
+                60, callback=[ExactCheckpoint(20, tmp_path / "kept"), first, KillAt(50)]
+            )
+        CuReSAC.resume(tmp_path / "kept", vectors()).learn(
+            60, callback=[ExactCheckpoint(20, tmp_path / "kept"), second]
+        )
     assert second.evaluations_timesteps == [9, 18, 27, 36, 45, 54] and second.n_calls == 60
     assert second.callback._history == pytest.approx([0.9, 1.8, 2.7, 3.6, 4.5, 5.4])  # type: ignore[union-attr]
 
