@@ -13,7 +13,7 @@ import psutil
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-from sb3_cure.persistence.checkpoints import CHUNK, CheckpointWriter
+from sb3_cure.persistence.checkpoints import CheckpointWriter
 
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
@@ -31,7 +31,7 @@ def _collect(model: CuReSAC, steps: int) -> None:
 
 def _write_frames(model: CuReSAC, n_frames: int, at_once: int, folder: Path, number: int) -> float:
     """Seconds to write so many frames, to wait for the disk, and to keep three such files."""
-    content = cast(FrameStackReplayBuffer, model.replay_buffer).frames[:n_frames].reshape(-1).data
+    content = cast(FrameStackReplayBuffer, model.replay_buffer).rings[""].frames[:n_frames].reshape(-1).data
     start = time.perf_counter()
     with (folder / f"bare-{at_once}-{number}").open("wb") as file:
         for first in range(0, len(content), at_once):
@@ -65,27 +65,28 @@ def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
         _collect(model, BUFFER_SIZE)
         with tempfile.TemporaryDirectory(dir=directory) as folder:
             writer = CheckpointWriter(folder)
-            generation = writer.write(model, model._run, KEEP)
+            writer.write(model, model._run, KEEP)
             times: dict[str, list[float]] = {name: [] for name in ("at once", "in pieces", "checkpoint")}
             extra = []
             for number in range(repeats + KEEP):
-                before = model.replay_buffer._n_frames
+                before = model.replay_buffer.counts[""]
                 _collect(model, NEW_STEPS)
-                n_frames = model.replay_buffer._n_frames - before
+                n_frames = model.replay_buffer.counts[""] - before
                 # Each is the first one in turn: what comes first finds other free memory for the disk's cache.
                 for name in np.roll(list(times), number):
                     if name == "checkpoint":
                         resident = _peak_mb(reset=True)
                         start = time.perf_counter()
-                        generation = writer.write(model, model._run, KEEP)
+                        writer.write(model, model._run, KEEP)
                         times[name].append(time.perf_counter() - start)
                         extra.append(_peak_mb() - resident)
                     else:
-                        at_once = 2**40 if name == "at once" else CHUNK
+                        at_once = 2**40 if name == "at once" else 2**22
                         times[name].append(_write_frames(model, n_frames, at_once, Path(folder), number))
             times = {name: values[KEEP:] for name, values in times.items()}  # from when files are also removed
             newest = max((Path(folder) / "segments").iterdir(), key=lambda path: path.stat().st_mtime).stat().st_size
-            new_mb = (newest + sum(path.stat().st_size for path in generation.folder.iterdir())) / 1e6
+            generation = writer.generations.folder(writer.generations.numbers()[-1])
+            new_mb = (newest + sum(path.stat().st_size for path in generation.iterdir())) / 1e6
         results[networks] = {
             "new_frames_mb": round(newest / 1e6),
             "all_that_is_written_mb": round(new_mb),

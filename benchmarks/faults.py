@@ -33,6 +33,7 @@ from stable_baselines3.common.logger import Logger
 from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import transitions
 from sb3_cure.evaluation.result_files import describe_run, write_json
+from sb3_cure.persistence import CheckpointError, write_state
 from sb3_cure.persistence.checkpoints import CheckpointWriter
 from sb3_cure.persistence.resume import load_random_state, random_state
 
@@ -61,7 +62,7 @@ class Outcome(NamedTuple):
     """What came of a fault.
 
     :param fault: What went wrong
-    :param resumed: ``"newest"``, ``"former"`` or ``"without some frames"``; else what is wrong with it
+    :param resumed: ``"newest"``, ``"former"`` or ``"nothing"`` (if both need the file); else what is wrong with it
     :param expected: Whether that is the best that the fault allows
     """
 
@@ -141,7 +142,8 @@ def _digest(model: CuReSAC) -> str:
     rows = (buffer.pos - 1 - np.arange(buffer.size())) % buffer.buffer_size
     take([np.asarray(each) for each in transitions(buffer, rows, np.zeros(len(rows), int))[:5] if each is not None])
     take([model.num_timesteps, model._n_updates, model._last_obs])
-    take([resumed.state["random"], resumed.state["environments"]])
+    write_state(file := io.BytesIO(), {name: resumed.state[name] for name in ("random", "environments")})
+    digest.update(file.getvalue())
     return digest.hexdigest()
 
 
@@ -229,28 +231,24 @@ class Site:
             shutil.copytree(self.after, self.work)
             file = str(fault.file)
             _damage(self.work / file, fault.kind)
-            newest = max(path.name for path in self.work.glob("generation-*"))
-            own = file.startswith(newest) or self._only_of_newest(file)
-            shared = file.startswith("segments") and not own
-            # No row may be left that needs the frames of a shared file
-            allowed = {"former"} if own else {"without some frames", "newest"} if shared else {"newest"}
+            former, newest = (path.parent.name for path in sorted(self.after.glob("generation-*/SHA256SUMS")))
+            users = [name for name in (former, newest) if file.startswith(name) or self._needs(name, file)]
+            allowed = {"newest" if newest not in users else "former" if former not in users else "nothing"}
         try:
             resumed = self._what_resumes()
+        except CheckpointError as error:
+            resumed = "nothing" if "is whole" in str(error) else str(error)
         except Exception as error:
             resumed = f"{type(error).__name__}: {error}"
         return Outcome(fault, resumed, resumed in allowed)
 
-    def _only_of_newest(self, file: str) -> bool:
-        checksums = sorted(self.after.glob("generation-*/SHA256SUMS"))
-        users = [path for path in checksums if Path(file).name in path.read_text()]
-        return users == checksums[-1:]
+    def _needs(self, generation: str, file: str) -> bool:
+        return file.startswith("segments") and Path(file).name in (self.after / generation / "SHA256SUMS").read_text()
 
     def _what_resumes(self) -> str:
-        digest, steps, said = _resume(self.work)
+        digest, steps, _ = _resume(self.work)
         names = {self.former: "former", self.newest: "newest"}
         resumed = names.get(digest, "another state")
-        if resumed == "another state" and any("are lost with their frames" in sentence for sentence in said):
-            resumed = "without some frames"
         # It goes on from there as from any other: the next checkpoint is whole.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -19,10 +19,11 @@ from sb3_cure.cure.critics import LatentCritic
 from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
+from sb3_cure.envs import check_observation_space
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
-from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments
+from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments, restarts_workers
 
 Self = TypeVar("Self", bound="CuReBase")
 
@@ -204,6 +205,7 @@ class CuReBase(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         check_arguments(self)
+        check_observation_space(self.observation_space, self.policy_class)
         self._guard = FiniteGuard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
         if self.replay_buffer_class is None:
@@ -268,6 +270,7 @@ class CuReBase(OffPolicyAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        check_observation_space(env.observation_space)
         return check_environments(OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
 
     def get_env(self) -> VecEnv | None:
@@ -319,6 +322,11 @@ class CuReBase(OffPolicyAlgorithm):
         # SB3 does so after each step: the first one would see where the former call ended.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         env: Any = self.env
+        if restarts_workers(env) and not isinstance(self.replay_buffer, FrameStackReplayBuffer):
+            raise ValueError(
+                f"a {type(self.replay_buffer).__name__} cannot leave out the steps of workers that died: use "
+                "on_env_fault='raise', or leave replay_buffer_class out."
+            )
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
         return total, callback

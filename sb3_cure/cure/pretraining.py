@@ -176,6 +176,11 @@ class Pretraining(CuRe):
             self._end_pretraining()
         return self
 
+    @property
+    def is_pretraining(self) -> bool:
+        """Whether ``pretrain`` runs, or ran when the checkpoint was written that this model was resumed from."""
+        return self._before_pretraining is not None
+
     def _prepare_learn(self) -> None:
         if self._pretrains:
             return

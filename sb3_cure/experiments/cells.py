@@ -97,7 +97,9 @@ class _CellRun:
         self.checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
         self.record = _Record(cell, folder)
         write_json(folder / "config.json", {**cell.config(), "action_repeat": self.record.action_repeat})
-        self.model = self._resume() or cell.make_model(self._make_env())
+        resumed = self._resume()
+        self.pretrains = cell.pretrain is not None and (resumed is None or resumed.is_pretraining)
+        self.model = resumed or cell.make_model(self._make_env())
 
     def finish(self) -> None:
         try:
@@ -112,7 +114,7 @@ class _CellRun:
         """The same calls whether the cell begins or goes on: a resumed model does what is left of them."""
         cell, record = self.cell, self.record
         callbacks = [record, self.checkpoints]
-        if cell.pretrain is not None:
+        if cell.pretrain is not None and self.pretrains:
             steps = record.agent_steps(cell.pretrain.budget)
             self.model.pretrain(steps, cell.pretrain.collector, callback=callbacks)
         record.evaluates = True
@@ -209,6 +211,21 @@ class _Record(BaseCallback):
         self.rewards_met = 0.0
         self._now, self._reported_at = time.monotonic(), -np.inf
         self._is_known = False
+
+    def state_dict(self) -> dict[str, Any]:
+        """Get what a resumed cell continues from.
+
+        :return: Records, but not clocks
+        """
+        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", "loss_sum", "n_losses", "rewards_met")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from these records.
+
+        :param state: Result of ``state_dict``
+        """
+        vars(self).update(state)
 
     def agent_steps(self, environment_steps: int) -> int:
         return -(-environment_steps // self.action_repeat)

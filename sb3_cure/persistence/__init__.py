@@ -1,8 +1,8 @@
-"""Files that can be loaded from strangers, and trainings that go on where they were killed."""
+"""Files that run no code when loaded, and trainings that continue where they were killed."""
 
-from sb3_cure.persistence.archive import ObjectsMissing, is_pickled_model
 from sb3_cure.persistence.checkpoints import ExactCheckpoint
 from sb3_cure.persistence.encoding import ArchiveError, read_state, write_state
+from sb3_cure.persistence.env_state import ResumableEnv
 from sb3_cure.persistence.generations import CheckpointError
 from sb3_cure.persistence.mixin import Persistence
 
@@ -10,9 +10,8 @@ __all__ = [
     "ArchiveError",
     "CheckpointError",
     "ExactCheckpoint",
-    "ObjectsMissing",
     "Persistence",
-    "is_pickled_model",
+    "ResumableEnv",
     "read_state",
     "write_state",
 ]

@@ -14,13 +14,21 @@ import stable_baselines3
 import torch as th
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
-from sb3_cure.persistence.encoding import VERSION, ArchiveError, decode, encode, named_by, refusing, write_tensors
+from sb3_cure.persistence.encoding import (
+    VERSION,
+    ArchiveError,
+    check_version,
+    decode,
+    encode,
+    named_by,
+    refusing,
+    write_tensors,
+)
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
 Self = TypeVar("Self", bound="SavesModels")
@@ -30,36 +38,27 @@ _PLACEHOLDER = "!not saved"
 #: What torch's optimisers keep as one number for each parameter
 _COUNTS = ("step", "eta", "mu", "mu_product")
 
+#: Tensors and optimizers of each temperature, by the setting that chooses between fixed and learned
+_TEMPERATURES = {
+    setting: [prefix + name for name in ("log_ent_coef", "ent_coef_tensor", "ent_coef_optimizer")]
+    for setting, prefix in (("ent_coef", ""), ("curiosity_ent_coef", "policy.curious."))
+}
+
 
 class Stateful(Protocol):
     """A part of a model with a state beside tensors and settings."""
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: Its state: values that ``encode`` knows
+        """Get the state.
+
+        :return: Values that ``encode`` knows
         """
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Set the state.
+
+        :param state: Result of ``state_dict``
         """
-        :param state: Of ``state_dict``
-        """
-
-
-class ObjectsMissing(ArchiveError):
-    """What no archive holds, such as a head of the user's own, was not given to ``load``.
-
-    :param name: What to call the file
-    :param missing: What each of the settings was
-    """
-
-    def __init__(self, name: str, missing: dict[str, str]):
-        needed = ", ".join(f"{key!r}: ..." for key in missing)
-        super().__init__(
-            f"{name} was saved with what no archive holds ({'; '.join(missing.values())}): give it to load with "
-            f"custom_objects={{{needed}}}."
-        )
-        self.name = name
-        self.missing = missing
 
 
 class ModelArchive:
@@ -81,13 +80,14 @@ class ModelArchive:
                 raise ArchiveError(f"{name} declares more bytes than it has: it is damaged, or hostile.")
             self.content = json.loads(archive.read(_DATA))
             self.is_pickled = "format" not in self.content  # but attributes of the model, as SB3 writes them
-            if not self.is_pickled and self.content["format"] != VERSION:
-                raise ArchiveError(f"{name} has the format {self.content['format']!r:.20}, not {VERSION}.")
+            if not self.is_pickled:
+                check_version(self.content["format"], name)
             self._tensors = {} if self.is_pickled else load_tensors(archive.read(_TENSORS))
             self.system_info = "" if self.is_pickled else archive.read(_SYSTEM_INFO).decode(errors="replace")
 
     def read(self, part: str) -> dict[str, Any]:
-        """
+        """Read states.
+
         :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"traits"``
         :return: States by name
         """
@@ -95,12 +95,13 @@ class ModelArchive:
             return decode(self.content[part], self._tensors.__getitem__)
 
     def settings(self, model_class: type, given: dict[str, Any], not_needed: Iterable[str]) -> dict[str, Any]:
-        """
-        :param model_class: The class that the settings are for
+        """Read the settings.
+
+        :param model_class: Class that the settings are for
         :param given: Settings in place of the archive's
         :param not_needed: Names of settings that may be missing
         :return: Settings by name
-        :raises ObjectsMissing: if there are placeholders that nothing was given for
+        :raises ArchiveError: if there are placeholders that nothing was given for
         """
         with refusing(self.name):
             nodes = self.content["settings"]
@@ -112,22 +113,18 @@ class ModelArchive:
                 elif key not in settings:
                     settings[key] = decode(node, self._tensors.__getitem__, named)
             if needed := {key: what for key, what in missing.items() if key not in not_needed}:
-                raise ObjectsMissing(self.name, needed)
+                objects = ", ".join(f"{key!r}: ..." for key in needed)
+                raise ArchiveError(
+                    f"{self.name} was saved with objects that no archive holds ({'; '.join(needed.values())}): give "
+                    f"load custom_objects={{{objects}}}."
+                )
             return settings
 
 
-def is_pickled_model(path: PathOrFile) -> bool:
-    """
-    :param path: A model's file
-    :return: Whether SB3's own ``save`` wrote it, so that its settings are pickled
-    """
-    with reading(path, "zip") as (file, name):
-        return ModelArchive(file, name).is_pickled
-
-
 def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor | None, dict[str, Any]]:
-    """
-    :param path: A model's file
+    """Read the networks of a model, to transfer them to another one.
+
+    :param path: Model's file
     :return: The tensors of its policy by name; the logarithm of its curious agent's temperature, if it learns that; and
         the ``traits`` of its policy
     :raises ArchiveError: if it is damaged or pickled
@@ -156,21 +153,19 @@ class SavesModels(OffPolicyAlgorithm):
     ) -> None:
         """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
 
-        What is no data (a function as ``learning_rate``, a class of your own) is saved as a placeholder that tells what
-        it was, and ``load`` asks for it as ``custom_objects``.
+        A function as ``learning_rate`` or a class of your own is saved as a placeholder with its name, and ``load``
+        needs it in ``custom_objects``.
 
         :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
         :param exclude: Names of settings that are not to be saved
-        :param include: Refused but for settings: an archive holds all of these, and no other part of a running model
+        :param include: Names of settings that are saved although they are in ``exclude``
         :raises ValueError: if ``include`` names parts of the running model
         """
-        excluded = {*self._excluded_save_params()}
-        if impossible := sorted(excluded & {*(include or ())}):
-            raise ValueError(
-                f"save was called with include={impossible}, which an archive does not hold: leave it out."
-            )
-        state_dicts, variables = self._get_torch_save_params()
-        left_out = excluded | {*(exclude or ())} | {name.split(".")[0] for name in [*state_dicts, *variables]}
+        included, (state_dicts, variables) = {*(include or ())}, self._get_torch_save_params()
+        left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in [*state_dicts, *variables])}
+        if impossible := sorted(left_out & included):
+            raise ValueError(f"save got include={impossible}, which an archive does not hold: leave it out.")
+        left_out |= {*(exclude or ())} - included
         tensors: dict[str, th.Tensor] = {}
         named = named_by(type(self))
         settings = {}
@@ -209,17 +204,19 @@ class SavesModels(OffPolicyAlgorithm):
         trusted: bool = False,
         **kwargs: Any,
     ) -> Self:
-        """Load a model, also one from a stranger: no code that an archive holds is run, and nothing that it names is
-        imported. (Its settings may still ask for more memory than there is.)
+        """Load a model, also one from a stranger.
+
+        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still ask for
+        more memory than there is.) A temperature that is given replaces the saved one, whether fixed or learned.
 
         :param path: Path with or without its suffix ``.zip``, or a binary file
-        :param env: Environment, vectorised environment or Gymnasium id to go on learning in; not needed to predict
+        :param env: Environment, vectorised environment or Gymnasium id to learn in; not needed to predict
         :param device: Device of the networks
         :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
             ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
             archive does not have are ignored
         :param print_system_info: Whether to print of which system the model was saved, and of this one
-        :param force_reset: Whether to reset the environment before learning goes on
+        :param force_reset: Whether to reset the environment before learning
         :param trusted: Also load what SB3's ``save`` has pickled, which runs any code in it
         :param kwargs: Settings to change
         :return: The model
@@ -241,12 +238,6 @@ class SavesModels(OffPolicyAlgorithm):
         settings = archive.settings(cls, custom_objects or {}, kwargs)
         if kwargs.get("policy_kwargs", settings.get("policy_kwargs")) != settings.get("policy_kwargs"):
             raise ValueError(f"the policy kwargs do not equal those that {name} was saved with: leave them out.")
-        chosen = {key: settings.get(key) for key in ("n_steps", "gamma")}
-        arguments = settings.get("replay_buffer_kwargs", {})
-        if settings.get("replay_buffer_class") is NStepReplayBuffer and chosen.items() <= arguments.items():
-            # SB3 chose it for these, and does so anew: `load` may be given others.
-            arguments = {key: value for key, value in arguments.items() if key not in chosen}
-            settings |= {"replay_buffer_class": None, "replay_buffer_kwargs": arguments}
         if env is not None:
             env = cls._wrap_env(env, settings.get("verbose", 0))
             check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
@@ -263,22 +254,30 @@ class SavesModels(OffPolicyAlgorithm):
             raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
         vars(model).update(kwargs)
         model._setup_model()
-        model.set_parameters(archive.read("parameters"), exact_match=True, device=device)
+        # A temperature that was given stays as it was set up.
+        given = {key for key in _TEMPERATURES if key in kwargs and kwargs[key] != settings.get(key)}
+        if "ent_coef" in given and getattr(model, "curiosity_ent_coef", None) is None:
+            given.add("curiosity_ent_coef")
+        fresh = {name for key in given for name in _TEMPERATURES[key]}
+        saved, own = archive.read("parameters"), model.get_parameters()
+        parameters = {key: state for key, state in saved.items() if key not in fresh}
+        parameters |= {key: state for key, state in own.items() if key in fresh}
+        model.set_parameters(parameters, exact_match=True, device=device)
         variables, states = archive.read("variables"), archive.read("parts")
         with refusing(name):
-            for key in model._get_torch_save_params()[1]:
+            for key in {*model._get_torch_save_params()[1]} - fresh:
                 recursive_getattr(model, key).data.copy_(variables[key])
             for key, part in model._stateful_parts().items():
                 if key in states:
                     part.load_state_dict(states[key])
-        if model.use_sde:
-            model.policy.reset_noise()  # type: ignore[operator]
         return model
 
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"
     ) -> None:
-        """Load parameters into this model. Of a file only the tensors are read, so that pickled archives are safe, too.
+        """Load parameters into this model.
+
+        Of a file only the tensors are read, so that pickled archives are safe, too.
 
         :param load_path_or_dict: An archive's path or file, or state dicts by name (see ``get_parameters``)
         :param exact_match: Whether all of the model's parameters have to be there, and no others

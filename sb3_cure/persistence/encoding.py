@@ -9,7 +9,7 @@ import contextlib
 import json
 import math
 import struct
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from functools import partial
@@ -19,15 +19,17 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from safetensors import safe_open
 from safetensors.torch import load as load_tensors
 from stable_baselines3.common import torch_layers
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 from stable_baselines3.her import GoalSelectionStrategy, HerReplayBuffer
 from torch.nn.modules import activation
 
@@ -37,7 +39,7 @@ from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
 #: Of the format of what is written
-VERSION = 3
+VERSION = 4
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
     **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64"},
@@ -57,7 +59,7 @@ class ArchiveError(ValueError):
 
 @contextlib.contextmanager
 def refusing(name: str) -> Iterator[None]:
-    """Whatever goes wrong while a file is read becomes an ``ArchiveError``.
+    """Turn any error of reading a file into an ``ArchiveError``.
 
     :param name: What to call the file
     """
@@ -68,6 +70,19 @@ def refusing(name: str) -> Iterator[None]:
     except Exception as error:  # hostile bytes fail in many ways
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".rstrip(".")
         raise ArchiveError(f"{name} is damaged, or was not written by this package ({reason}).") from error
+
+
+def check_version(version: Any, name: str) -> None:
+    """Refuse files of other versions of this package.
+
+    :param version: Format of the file
+    :param name: What to call it
+    :raises ArchiveError: if it is not ``VERSION``
+    """
+    if version != VERSION:
+        raise ArchiveError(
+            f"{name} has format {version!r:.20} of another version of sb3_cure, and this one reads format {VERSION}."
+        )
 
 
 # ---------------------------------------------------------------------- names
@@ -86,9 +101,10 @@ def _of_module(module: Any, base: type) -> list[type]:
 
 
 def name_of(value: Any) -> str:
-    """
-    :param value: A class, or a member of an enumeration
-    :return: What files call it
+    """Get the name by which files call a class or a member of an enumeration.
+
+    :param value: Class or member
+    :return: Name
     """
     if value in NUMBERS:
         return f"numpy.{np.dtype(value).name}"  # `bool` or `bool_`, by NumPy's version
@@ -106,9 +122,6 @@ NAMED: dict[str, Any] = {
         encoders.VectorEncoder,
         encoders.DictEncoder,
         torch_layers.FlattenExtractor,
-        torch_layers.NatureCNN,
-        torch_layers.CombinedExtractor,
-        RMSpropTFLike,
         *SRL_HEADS.values(),
         *INTRINSIC_REWARDS.values(),
         *_of_module(activation, th.nn.Module),
@@ -120,9 +133,10 @@ NAMED: dict[str, Any] = {
 
 
 def named_by(model_class: type) -> dict[str, Any]:
-    """
-    :param model_class: An algorithm
-    :return: What its archives may name: ``NAMED``, and the policies that it and its base classes register
+    """List what the archives of an algorithm may name: ``NAMED``, and the policies that its classes register.
+
+    :param model_class: Algorithm
+    :return: Classes by name
     """
     registered = [vars(base).get("policy_aliases", {}).values() for base in model_class.__mro__]
     policies = {base for policies in registered for policy in policies for base in policy.__mro__}
@@ -133,9 +147,10 @@ def named_by(model_class: type) -> dict[str, Any]:
 
 
 def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
-    """
-    :param value: None, bool, int, float, str, bytes, list, tuple, dict, deque, arrays, tensors, numbers of NumPy,
-        paths, spaces, SB3's schedules and noises, and what has a name
+    """Describe a value by JSON.
+
+    :param value: None, bool, int, float, str, bytes, list, tuple, dict, set, deque, arrays, tensors, NumPy's numbers
+        and generators, paths, spaces, SB3's schedules, noises and running statistics, and classes with a name
     :param path: Where it is, which names its tensors
     :param tensors: Takes the arrays and tensors, contiguous
     :param named: Classes by name
@@ -180,7 +195,8 @@ def _keep(tensor: th.Tensor, path: str, tensors: dict[str, th.Tensor]) -> str:
 
 
 def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, Any] = NAMED) -> Any:
-    """
+    """Restore a value.
+
     :param node: JSON of ``encode``
     :param tensors: Gives a tensor by its name
     :param named: Classes by name
@@ -208,22 +224,36 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
 
 
 def _revived(kind: type, attributes: dict[str, Any]) -> Any:
-    """An object of a class whose state is its attributes."""
+    """Make an object of a class whose state is its attributes."""
     value: Any = object.__new__(kind)
     vars(value).update(attributes)
     return value
 
 
 def _arguments(names: str, space: Any) -> dict[str, Any]:
-    """Those that a space was made with."""
+    """Get the arguments that a space was made with."""
     return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
 
 
+def _generator(state: dict[str, Any]) -> np.random.Generator:
+    kinds = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64)
+    generator = np.random.Generator({kind.__name__: kind for kind in kinds}[state["bit_generator"]]())
+    generator.bit_generator.state = state
+    return generator
+
+
+def _random_state(state: dict[str, Any]) -> np.random.RandomState:
+    random = np.random.RandomState()
+    random.set_state(state)
+    return random
+
+
 _BY_ATTRIBUTES = (
+    *(RunningMeanStd, GymRunningMeanStd, StackedObservations),
     *(ConstantSchedule, FloatSchedule, LinearSchedule),
     *(NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise),
 )
-#: By tag: the class, what a value is made of, and how it is made of that again
+#: By tag: class, function from an object to its parts, and back
 _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "tuple": (tuple, list, tuple),
     "dict": (dict, lambda value: [list(item) for item in value.items()], dict),
@@ -243,7 +273,11 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     # Its items in this order, where a dict would be sorted
     "Dict": (spaces.Dict, lambda space: OrderedDict(space.spaces), spaces.Dict),
     "Tuple": (spaces.Tuple, lambda space: space.spaces, spaces.Tuple),
-    **{kind.__name__: (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
+    "set": (set, list, set),
+    "Counter": (Counter, lambda value: [list(item) for item in value.items()], lambda items: Counter(dict(items))),
+    "Generator": (np.random.Generator, lambda generator: generator.bit_generator.state, _generator),
+    "RandomState": (np.random.RandomState, lambda random: random.get_state(legacy=False), _random_state),
+    **{name_of(kind): (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
 }
 _TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()}
 
@@ -282,15 +316,16 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
     :raises TypeError: for anything else; the file is not touched then
     """
     tensors: dict[str, th.Tensor] = {}
-    metadata = {"format": f"sb3_cure {VERSION}", "state": json.dumps(encode(state, "state", tensors))}
+    metadata = {"format": str(VERSION), "state": json.dumps(encode(state, "state", tensors))}
     with open(file, "wb") if isinstance(file, str | Path) else contextlib.nullcontext(file) as stream:
         write_tensors(stream, tensors, metadata)
 
 
 def is_state(file: BinaryIO) -> bool:
-    """
-    :param file: A binary file, at its start
-    :return: Whether it may be one of ``write_state``, rather than a pickle
+    """Check whether a file may be one of ``write_state``, rather than a pickle.
+
+    :param file: Binary file at its start
+    :return: Whether it may
     """
     return file.read(9)[8:] == b"{"
 
@@ -316,7 +351,6 @@ def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]
         return _decoded(metadata, tensors.__getitem__)
 
 
-def _decoded(metadata: dict[str, str] | None, tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
-    if metadata is None or metadata.get("format") != f"sb3_cure {VERSION}":
-        raise ArchiveError(f"the file holds no state of version {VERSION}: another version of this package wrote it.")
+def _decoded(metadata: dict[str, str], tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
+    check_version(int(metadata["format"].removeprefix("sb3_cure ")), "the file")
     return decode(json.loads(metadata["state"]), tensors)

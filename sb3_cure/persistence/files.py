@@ -16,7 +16,7 @@ PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Write a file beside another, which it replaces in one go when all of it is on the disk.
+    """Write a file next to another, which it replaces at once when all of it is on the disk.
 
     Killed, out of disk space or with an exception in between, the old file stays as it was.
 
@@ -25,19 +25,20 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     # Another name for each thread, process and machine: several may write the same file.
-    beside = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}.{threading.get_ident()}")
+    draft = path.with_name(f".{path.name}.{platform.node()}.{os.getpid()}.{threading.get_ident()}")
     try:
-        yield beside
-        flush_to_disk(beside)
-        beside.replace(path)
+        yield draft
+        flush_to_disk(draft)
+        draft.replace(path)
         flush_to_disk(path.parent)
     finally:
-        beside.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
 
 
 def flush_to_disk(path: Path) -> None:
-    """
-    :param path: File or folder: what was written to it is on the disk after this call
+    """Flush a file, or the entries of a folder, to the disk.
+
+    :param path: File or folder
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -60,14 +61,15 @@ def writing(path: PathOrFile, suffix: str) -> Iterator[BinaryIO]:
     path = Path(path) if Path(path).suffix else Path(f"{path}.{suffix}")
     path = path.resolve() if path.is_symlink() else path  # what a link leads to is written, not the link
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as beside, beside.open("wb") as file:
+    with replacing(path) as draft, draft.open("wb") as file:
         yield file
         file.flush()
 
 
 @contextlib.contextmanager
 def reading(path: PathOrFile, suffix: str) -> Iterator[tuple[BinaryIO, str]]:
-    """
+    """Open a file for reading.
+
     :param path: Path, with or without its suffix, or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: The open file, at its start, and what to call it in messages

@@ -1,4 +1,4 @@
-"""A folder of checkpoints that a kill, a full disk or a damaged file cannot cost more than the last one of.
+"""Folder of checkpoints, of which a kill, a full disk or a damaged file costs the last one at most.
 
 Layout::
 
@@ -6,7 +6,6 @@ Layout::
         generation-000003/     one checkpoint: its own files, and SHA256SUMS, which lists all files that it needs
         generation-000004/
         segments/              files that several generations share and that are never changed
-        .lock                  held while a process writes
 
 A generation is written under another name, flushed to the disk file by file, and renamed when all of it is there. It is
 whole if its files have the checksums of ``SHA256SUMS`` (which ``sha256sum -c`` understands).
@@ -14,13 +13,12 @@ whole if its files have the checksums of ``SHA256SUMS`` (which ``sha256sum -c`` 
 
 import contextlib
 import hashlib
+import os
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
-
-from filelock import FileLock, Timeout
 
 from sb3_cure.persistence.encoding import ArchiveError
 from sb3_cure.persistence.files import flush_to_disk
@@ -46,8 +44,9 @@ class Generation(NamedTuple):
     sums: dict[str, str]
 
     def damaged(self) -> list[Path]:
-        """
-        :return: The files that are not as they were written
+        """List the files that are not as they were written.
+
+        :return: Their paths
         """
         return [self.folder / name for name, digest in self.sums.items() if _digest(self.folder / name) != digest]
 
@@ -61,10 +60,12 @@ class Generations:
     def __init__(self, path: str | Path):
         self.path = Path(path)
         self.segments = self.path / "segments"
+        self._newest = max(self.numbers(), default=-1)
 
     def numbers(self) -> list[int]:
-        """
-        :return: Numbers of the generations that were finished, whole or damaged since, oldest first
+        """List the generations that were finished, whole or damaged since.
+
+        :return: Their numbers, oldest first
         """
         if not self.path.is_dir():
             return []
@@ -72,16 +73,18 @@ class Generations:
         return sorted(int(match[1]) for match in matches if match)
 
     def folder(self, number: int) -> Path:
-        """
-        :param number: Number of a generation
-        :return: Its folder
+        """Get the folder of a generation.
+
+        :param number: Number of the generation
+        :return: Its path
         """
         return self.path / f"generation-{number:06d}"
 
     def read(self, number: int) -> Generation:
-        """
-        :param number: Number of a generation
-        :return: It, its files unread
+        """Read the checksums of a generation.
+
+        :param number: Number of the generation
+        :return: Generation, its files unread
         :raises CheckpointError: if its checksums are missing or damaged
         """
         path = self.folder(number) / _SUMS
@@ -97,20 +100,6 @@ class Generations:
             raise CheckpointError(f"{path} is damaged")
         return Generation(path.parent, sums)
 
-    def lock(self) -> FileLock:
-        """
-        :return: A lock that this process holds until it is released, or the process ends, however that happens
-        :raises CheckpointError: if another process writes here
-        """
-        lock = FileLock(self.path / ".lock", timeout=0)
-        try:
-            lock.acquire()
-        except Timeout:
-            raise CheckpointError(
-                f"another process writes checkpoints to {self.path}: wait for it, or choose another path."
-            ) from None
-        return lock
-
     def write(self, fill: Callable[[Path, int], dict[str, str]], keep: int) -> Generation:
         """Write the next generation, then remove what is no longer needed.
 
@@ -119,10 +108,14 @@ class Generations:
         :param keep: Number of latest generations to keep
         :return: What was written
         :raises OSError: if it could not be written; the generations are then as before
+        :raises CheckpointError: if another training has written here since
         """
-        numbers = self.numbers()
-        number = numbers[-1] + 1 if numbers else 0
-        draft = self.path / f".unfinished-{number}"
+        if max(self.numbers(), default=-1) != self._newest:
+            raise CheckpointError(
+                f"another training writes checkpoints to {self.path}: end it, or choose another path."
+            )
+        number = self._newest + 1
+        draft = self.path / f".unfinished-{number}-{os.getpid()}"
         shutil.rmtree(draft, ignore_errors=True)
         try:
             self.segments.mkdir(exist_ok=True)
@@ -135,6 +128,7 @@ class Generations:
             for path in (*own, draft / _SUMS, draft, self.segments):
                 flush_to_disk(path)
             draft.rename(self.folder(number))
+            self._newest = number
             flush_to_disk(self.path)
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)

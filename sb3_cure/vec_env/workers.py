@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper, Ve
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as sb3_worker
 
+from sb3_cure.persistence.env_state import ResumableEnv
 from sb3_cure.vec_env.frame_watch import FrameFaultError, FrameWatch, FrozenFramesError
 
 #: Seconds in which workers may leave when the environments are closed, and after SIGKILL or the end of their parent
@@ -94,7 +95,7 @@ class _Worker:
     def __init__(self, owner: "FaultTolerantSubprocVecEnv", index: int, env_fn: Callable[[], gym.Env]) -> None:
         self.owner, self.index = owner, index
         watch = owner.watch  # not the owner, which cannot be sent to a process
-        self.make_env = CloudpickleWrapper(lambda: FrameWatch(_patch_env(env_fn()), **watch))
+        self.make_env = CloudpickleWrapper(lambda: ResumableEnv(FrameWatch(_patch_env(env_fn()), **watch)))
         # What a new process gets: attributes that were set, options of the last reset, the last seed that was given
         self.attributes: dict[str, Any] = {}
         self.seed: int | None = None

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.envs import DMC_TASKS, StackFrames, physics_state, physics_state_names
 from sb3_cure.envs.physics import Proprioception
-from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state, why_not_restorable
+from sb3_cure.persistence.env_state import load_vec_env_state, restore_error, vec_env_state
 
 SMALL: dict[str, Any] = dict(image_size=24, renderer="fast")
 
@@ -127,7 +127,7 @@ def test_state_is_restored_exactly() -> None:
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 1, 2)).astype(np.float32)
     for action in actions[:4]:
         env.step(action)
-    assert why_not_restorable(env) is None
+    assert restore_error(env) is None
     load_vec_env_state(other, vec_env_state(env))
     for action in actions[4:]:
         ours, theirs = env.step(action), other.step(action)

@@ -1,0 +1,545 @@
+"""A training that is killed and resumed equals one that was never killed, bit for bit; no fault costs more than one
+checkpoint."""
+
+import collections
+import hashlib
+import itertools
+import os
+import pickle
+import random
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from dictionaries_for_tests import Goal, SensorBox
+from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from gymnasium.wrappers import NormalizeReward
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import TD3
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
+
+from benchmarks import faults
+from benchmarks.fuzz import watching
+from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.data.buffers import FrameRing, transitions
+from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
+from sb3_cure.persistence.generations import Generations
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kill of the process, unlike a loss of power, does not need it."""
+    for module in ("files", "generations", "checkpoints"):
+        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
+
+
+@dataclass
+class Case:
+    """A training: how it is set up and how long it is."""
+
+    make_env: Callable[[], Any]
+    arguments: dict[str, Any] = field(default_factory=dict)
+    policy: str = "CnnPolicy"
+    algorithm: type[CuReSAC | CuReTQC] = CuReSAC
+    steps: int = 60
+    save_freq: int = 12
+    pretrain: bool = False
+
+
+def pixels(n_envs: int = 1) -> Callable[[], VecEnv]:
+    return lambda: make_vec_env(PixelBox, n_envs, env_kwargs={"episode_length": 7})
+
+
+def vectors() -> VecEnv:
+    return make_vec_env(VectorBox, 1, env_kwargs={"episode_length": 7})
+
+
+def workers(vec_env_class: Any, **kwargs: Any) -> VecEnv:
+    return vec_env_class([lambda: ResumableEnv(Monitor(PixelBox(episode_length=7)))] * 2, start_method="fork", **kwargs)
+
+
+CASES = {
+    "rae, joint": Case(pixels()),
+    "curl, sequential, four environments, small ring": Case(
+        pixels(4), {"srl": "curl", "update": "sequential", "buffer_size": 60}, steps=120
+    ),
+    "vectors": Case(vectors, policy="MlpPolicy"),
+    "schedules, noise, alternating": Case(
+        pixels(),
+        {
+            "learning_rate": LinearSchedule(1e-3, 1e-4, 1.0),
+            "curiosity_prob": LinearSchedule(0.9, 0.1, 1.0),
+            "action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(2), 0.1 * np.ones(2)),
+            "srl_schedule": "alternating",
+            "srl_period": 5,
+        },
+    ),
+    "bouts of two environments": Case(pixels(2), {"curiosity_prob": 0.5, "curiosity_bout": 6}),
+    "normalized rewards": Case(lambda: VecNormalize(pixels(2)(), norm_obs=False), {"curiosity": "bonus"}),
+    "pretraining": Case(pixels(), {"curiosity": None}, pretrain=True),
+    "quantile critics": Case(pixels(), {"srl": "spr"}, algorithm=CuReTQC),
+    "workers": Case(lambda: workers(SubprocVecEnv)),
+    "watched workers": Case(lambda: workers(FaultTolerantSubprocVecEnv, on_env_fault="restart")),
+    "dictionaries, small rings": Case(
+        lambda: make_vec_env(SensorBox, 2, env_kwargs={"episode_length": 7}),
+        {"buffer_size": 40, "srl": "curl"},
+        policy="MultiInputPolicy",
+        steps=80,
+    ),
+    "dictionaries without images": Case(lambda: make_vec_env(Goal, 1), policy="MultiInputPolicy"),
+}
+
+
+def train(case: Case, folder: Path, resume: bool = False, *callbacks: BaseCallback) -> CuReSAC:
+    """The script of a user, which is started again with ``resume=True``."""
+    env = case.make_env()
+    if resume:
+        model = case.algorithm.resume(folder, env, device="cpu")
+    else:
+        model = tiny_model(case.policy, env, case.algorithm, **case.arguments)
+    call = model.pretrain if case.pretrain else model.learn
+    try:
+        call(case.steps, callback=[ExactCheckpoint(case.save_freq, folder), *callbacks])
+    finally:
+        model.env.close()
+    return model
+
+
+def arrays_in(value: Any) -> dict[str, Any]:
+    """Arrays and counters of a replay buffer, and of its dictionaries and rings of frames."""
+    attributes = value if isinstance(value, dict) else vars(value)
+    inside = {k: arrays_in(part) for k, part in attributes.items() if isinstance(part, dict | FrameRing)}
+    return {**inside, **{k: part for k, part in attributes.items() if isinstance(part, np.ndarray | int)}}
+
+
+def outcome(model: CuReSAC) -> dict[str, Any]:
+    """All that training leaves behind."""
+    return {
+        "networks": state_of(model),
+        "buffer": arrays_in(model.replay_buffer),
+        "counters": (model.num_timesteps, model._n_updates, model._episode_num),
+        "episodes": [(episode["r"], episode["l"]) for episode in model.ep_info_buffer or ()],
+        "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),
+    }
+
+
+class Killed(Exception):
+    """Stands in for a kill where the process is to live on: nothing is written after it."""
+
+
+class KillAt(BaseCallback):
+    """Raises at its n-th call."""
+
+    def __init__(self, calls: int):
+        super().__init__()
+        self.left = calls
+
+    def _on_step(self) -> bool:
+        self.left -= 1
+        if self.left == 0:
+            raise Killed
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing."""
+
+
+_REFERENCE: dict[str, dict[str, Any]] = {}
+
+
+@pytest.mark.parametrize(
+    ("name", "calls"), [*((name, 31) for name in CASES), ("rae, joint", 1), ("rae, joint", 57), ("pretraining", 57)]
+)
+def test_interrupted_training_continues_bit_for_bit(
+    name: str, calls: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    case = CASES[name]
+    if name not in _REFERENCE:
+        _REFERENCE[name] = outcome(train(case, tmp_path_factory.mktemp("reference")))
+    n_envs = 4 if "four" in name else 2 if name not in ("rae, joint", "pretraining") else 1
+    with pytest.raises(Killed):
+        train(case, tmp_path, False, KillAt(max(calls // n_envs, 1)))
+    np.random.seed(99)  # whatever another process begins with
+    th.manual_seed(99)
+    assert differences(_REFERENCE[name], outcome(train(case, tmp_path, True))) == []
+
+
+@settings(max_examples=5, deadline=None)
+@given(kills=st.lists(st.integers(1, 25), min_size=1, max_size=4), save_freq=st.integers(1, 30))
+def test_any_kills_at_any_steps(kills: list[int], save_freq: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    case = Case(vectors, policy="MlpPolicy", save_freq=save_freq, steps=40)
+    if "kills" not in _REFERENCE:
+        _REFERENCE["kills"] = outcome(train(case, tmp_path_factory.mktemp("reference")))
+    folder = tmp_path_factory.mktemp("killed")
+    for attempt, calls in enumerate(kills):
+        try:
+            train(case, folder, attempt > 0, KillAt(calls))
+        except Killed:
+            continue
+    assert differences(_REFERENCE["kills"], outcome(train(case, folder, True))) == []
+
+
+SCRIPT = textwrap.dedent(
+    """
+    import sys
+    from pathlib import Path
+    import torch
+    from sb3_cure import CuReSAC, make_dmc_env
+    from sb3_cure.persistence import ExactCheckpoint
+
+    torch.set_num_threads(1)
+    folder = Path(sys.argv[1])
+    env = make_dmc_env("cartpole", "swingup", image_size=24, renderer="fast")
+    if ExactCheckpoint.exists(folder / "checkpoints"):
+        model = CuReSAC.resume(folder / "checkpoints", env)
+    else:
+        model = CuReSAC(
+            "CnnPolicy", env, learning_starts=20, batch_size=8, buffer_size=150, warmup_updates=5, precision="fp32",
+            seed=0, device="cpu",
+            policy_kwargs=dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4, n_layers=2)),
+        )
+    model.learn(130, callback=ExactCheckpoint(10, folder / "checkpoints"))
+    model.save(folder / "final")
+    """
+)
+
+
+def run_script(folder: Path) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(folder)])
+
+
+def test_kill_9_of_dmc_training_loses_nothing(tmp_path: Path) -> None:
+    """The whole story in a user's words: the same script, started again."""
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    whole, killed = run_script(tmp_path / "whole"), run_script(tmp_path / "killed")
+    while max(Generations(tmp_path / "killed" / "checkpoints").numbers(), default=-1) < 4:
+        assert killed.poll() is None
+        time.sleep(0.002)
+    killed.kill()
+    killed.wait()
+    assert not (tmp_path / "killed" / "final.zip").exists()
+    assert run_script(tmp_path / "killed").wait() == whole.wait() == 0
+    models = [CuReSAC.load(tmp_path / name / "final", device="cpu") for name in ("whole", "killed")]
+    assert models[0]._n_updates == models[1]._n_updates > 0
+    assert differences(*map(state_of, models)) == []
+
+
+# ------------------------------------------------------------------------------------------ learn after resume
+
+
+def interrupted(folder: Path, env: Any = None) -> CuReSAC:
+    """A model as resumed after 20 of the 40 steps of a ``learn``."""
+    with pytest.raises(Killed):
+        tiny_model("MlpPolicy", VectorBox()).learn(40, callback=[ExactCheckpoint(10, folder), KillAt(25)])
+    return CuReSAC.resume(folder, env or VectorBox(), device="cpu")
+
+
+@pytest.mark.parametrize("first", [(40, True), (20, False)], ids=["what was left", "more steps"])
+def test_learn_after_resume_ends_where_it_should(first: tuple[int, bool], tmp_path: Path) -> None:
+    """Either way 20 steps more, which are those of the interrupted training."""
+    model = interrupted(tmp_path)
+    assert model.num_timesteps == 20
+    model.learn(first[0], reset_num_timesteps=first[1])
+    assert model.num_timesteps == 40
+    whole = tiny_model("MlpPolicy", VectorBox()).learn(40)
+    assert differences(state_of(whole), state_of(model)) == []
+    assert model.learn(5, reset_num_timesteps=False).num_timesteps == 45
+    assert model.learn(7).num_timesteps == 7
+
+
+def test_more_steps_can_be_interrupted_again(tmp_path: Path) -> None:
+    """They are a call of their own: what is left of it is counted from its beginning."""
+    with pytest.raises(Killed):
+        interrupted(tmp_path).learn(30, callback=[ExactCheckpoint(10, tmp_path), KillAt(25)], reset_num_timesteps=False)
+    again = CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
+    assert again.num_timesteps == 40
+    assert again.learn(30).num_timesteps == 50  # of which 20 were made
+
+
+def test_finished_training_is_continued(tmp_path: Path) -> None:
+    results = []
+    for resumes in (False, True):
+        model = train(CASES["vectors"], tmp_path / str(resumes))
+        if resumes:
+            model = CuReSAC.resume(tmp_path / "True", vectors(), device="cpu").learn(60)
+        assert model.num_timesteps == 60
+        results.append(outcome(model.learn(20, reset_num_timesteps=False)))
+    assert differences(*results) == []
+
+
+def test_learn_ends_interrupted_pretraining(tmp_path: Path) -> None:
+    """``is_pretraining`` tells which call was interrupted; ``learn`` then begins as after any pretraining."""
+    with pytest.raises(Killed):
+        train(CASES["pretraining"], tmp_path, False, KillAt(31))
+    model = CuReSAC.resume(tmp_path, pixels()(), device="cpu")
+    assert model.is_pretraining and model.num_timesteps == 24
+    assert not model.learn(15).is_pretraining
+    assert (model.num_timesteps, model.replay_buffer.size()) == (15, 15)
+
+
+class Unwilling(BaseCallback):
+    """Refuses the training at its beginning."""
+
+    def _init_callback(self) -> None:
+        raise Killed
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_failed_learn_can_be_called_again(tmp_path: Path) -> None:
+    model = interrupted(tmp_path)
+    with pytest.raises(Killed):
+        model.learn(40, callback=Unwilling())
+    whole = tiny_model("MlpPolicy", VectorBox()).learn(40)
+    assert differences(state_of(whole), state_of(model.learn(40))) == []
+
+
+class SafeTD3(Persistence, TD3):
+    """An algorithm of SB3 that can be resumed."""
+
+
+def test_other_algorithms_continue_bit_for_bit(tmp_path: Path) -> None:
+    """The mixin needs nothing of CuReSAC."""
+    arguments: Any = dict(learning_starts=5, buffer_size=60, seed=0, device="cpu", policy_kwargs=dict(net_arch=[4]))
+    results = []
+    for name in ("whole", "killed"):
+        model = SafeTD3("MlpPolicy", vectors(), **arguments)
+        if name == "killed":
+            with pytest.raises(Killed):
+                model.learn(40, callback=[ExactCheckpoint(8, tmp_path), KillAt(21)])
+            model = SafeTD3.resume(tmp_path, vectors(), device="cpu")
+        results.append(state_of(model.learn(40)))
+    assert differences(*results) == []
+
+
+# ---------------------------------------------------------------------------------------- a new episode, said
+
+
+class NoState(gym.Wrapper):
+    """Keeps what no file holds."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.lock = threading.Lock()
+
+
+def test_new_episode_is_said_once_with_its_reason(tmp_path: Path) -> None:
+    """In the training and when it is resumed; statistics of all wrappers go on, and the first states are others."""
+
+    def make() -> VecNormalize:
+        return VecNormalize(DummyVecEnv([lambda: Monitor(NormalizeReward(NoState(VectorBox(99))))]))
+
+    def counts(env: Any) -> list[float]:
+        return [env.obs_rms.count, env.ret_rms.count, float(env.get_attr("return_rms")[0].count)]
+
+    env, said = make(), []
+    for begins in (True, False):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            if begins:
+                first = tiny_model("MlpPolicy", env)
+                with pytest.raises(Killed):
+                    first.learn(60, callback=[KillAt(31), ExactCheckpoint(10, tmp_path)])
+            else:
+                resumed = CuReSAC.resume(tmp_path, make(), device="cpu")
+                assert counts(resumed.get_vec_normalize_env()) == pytest.approx([each - 1 for each in counts(env)])
+                resumed.learn(60, callback=ExactCheckpoint(10, tmp_path))
+        said.append([str(each.message) for each in caught if "episode" in str(each.message)])
+    assert [len(each) for each in said] == [1, 1]
+    assert all("as NoState.lock is of the type" in each[0] or "NoState.lock" in each[0] for each in said)
+    assert resumed.num_timesteps == 60
+    rewards = resumed.replay_buffer.rewards
+    assert not np.array_equal(rewards[30:40], rewards[:10])
+
+
+# -------------------------------------------------------------------------------------------------- callbacks
+
+
+class Best(BaseCallback):
+    """Attributes of many kinds, public and private."""
+
+    def __init__(self, setting: str = "first") -> None:
+        super().__init__()
+        self._best, self.found, self.setting = -np.inf, False, setting
+        self.seen: dict[str, int] = collections.Counter()
+        self._history: list[float] = []
+        self.loss = th.zeros(())
+        self.file = sys.stdout
+
+    def _on_rollout_start(self) -> None:
+        self.seen["rollouts"] += 1
+
+    def _on_step(self) -> bool:
+        self._best, self.found = np.float32(self.num_timesteps), np.bool_(True)
+        self._history.append(0.1 * self.num_timesteps)
+        self.loss = self.loss + 1
+        return True
+
+
+@pytest.mark.parametrize("place", ["before", "after", "inside"])
+def test_callbacks_continue_from_the_checkpoint(place: str, tmp_path: Path) -> None:
+    """With all that has changed in them, wherever the checkpoint stands; what cannot be kept is said once."""
+
+    def callbacks(setting: str) -> tuple[Best, list[BaseCallback]]:
+        best, keep = Best(setting), ExactCheckpoint(12, tmp_path)
+        places = {"before": [keep, best], "after": [best, keep], "inside": [best, EveryNTimesteps(50, keep)]}
+        return best, places[place]  # type: ignore[return-value]
+
+    with pytest.warns(UserWarning, match=r"checkpoints do not keep Best\.file") as said, pytest.raises(Killed):
+        tiny_model("MlpPolicy", vectors()).learn(60, callback=[*callbacks("first")[1], KillAt(33)])
+    assert len([each for each in said if "do not keep" in str(each.message)]) == 1
+    best, all_callbacks = callbacks("second")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        CuReSAC.resume(tmp_path, vectors()).learn(60, callback=all_callbacks)
+    assert (best._best, best.found, best.seen, best.loss, best.setting) == (60, True, {"rollouts": 60}, 60, "second")
+    assert type(best.seen) is collections.Counter and len(best._history) == 60
+
+
+def test_evaluations_continue(tmp_path: Path) -> None:
+    """SB3's callback, and the one inside it."""
+
+    def evaluation() -> EvalCallback:
+        env = make_vec_env(VectorBox, 1, env_kwargs={"episode_length": 7})
+        kwargs: Any = dict(eval_freq=9, n_eval_episodes=1, log_path=str(tmp_path / "log"), verbose=0, warn=False)
+        return EvalCallback(env, callback_after_eval=Best(), **kwargs)
+
+    first, second = evaluation(), evaluation()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(Killed):
+            tiny_model("MlpPolicy", vectors()).learn(
+                60, callback=[ExactCheckpoint(20, tmp_path / "kept"), first, KillAt(50)]
+            )
+        CuReSAC.resume(tmp_path / "kept", vectors()).learn(
+            60, callback=[ExactCheckpoint(20, tmp_path / "kept"), second]
+        )
+    assert second.evaluations_timesteps == [9, 18, 27, 36, 45, 54] and second.n_calls == 60
+    assert second.callback._history == pytest.approx([0.9, 1.8, 2.7, 3.6, 4.5, 5.4])  # type: ignore[union-attr]
+
+
+# -------------------------------------------------------------------------------------------------- contents
+
+
+def test_frames_are_written_once(tmp_path: Path) -> None:
+    model = train(Case(pixels(), {"buffer_size": 40}, steps=100, save_freq=10), tmp_path)
+    kept = Generations(tmp_path)
+    numbers = kept.numbers()
+    assert len(numbers) == 3 and numbers[-1] == 10
+    ring = model.replay_buffer.rings[""]
+    frame_bytes = int(np.prod(ring.frame_shape))
+    segments = read_state(kept.folder(numbers[-1]) / "state.safetensors")["segments"][""]
+    for name, first, last in segments:
+        assert kept.segments.joinpath(name).stat().st_size == (last - first) * frame_bytes
+    assert all(one[2] == other[1] for one, other in itertools.pairwise(segments))
+    # No more is kept than the ring holds and what the older generations and the oldest segment need.
+    frames = sum(path.stat().st_size for path in kept.segments.iterdir()) / frame_bytes
+    assert frames <= ring.capacity + 4 * 15
+    before = {path.name for path in kept.segments.iterdir()}
+    CuReSAC.resume(tmp_path, pixels()()).learn(10, callback=ExactCheckpoint(10, tmp_path), reset_num_timesteps=False)
+    assert len({path.name for path in kept.segments.iterdir()} - before) == 1
+
+
+def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
+    """Its frames, which no former checkpoint has, and its size."""
+    other = tiny_model("CnnPolicy", PixelBox(), seed=5, buffer_size=70).learn(60)
+    other.save_replay_buffer(tmp_path / "other.pkl")
+    model = tiny_model("CnnPolicy", PixelBox(), buffer_size=500)
+    model.learn(40, callback=ExactCheckpoint(20, tmp_path / "kept"))
+    model.load_replay_buffer(tmp_path / "other.pkl")
+    model.learn(20, callback=ExactCheckpoint(20, tmp_path / "kept"), reset_num_timesteps=False)
+    ours, theirs = model.replay_buffer, CuReSAC.resume(tmp_path / "kept", PixelBox()).replay_buffer
+    assert theirs.buffer_size == 70
+    rows = np.arange(theirs.size())
+    for name in ("observations", "next_observations", "rewards"):
+        kept, read = (getattr(transitions(each, rows, 0 * rows), name) for each in (ours, theirs))
+        assert th.equal(kept, read), name
+
+
+class Payload:
+    """Unpickled, it would write a file."""
+
+    def __reduce__(self) -> tuple:
+        return os.system, (f"touch {Path(__file__).parent}/executed",)
+
+
+@pytest.mark.parametrize("name", ["model.zip", "state.safetensors"])
+def test_hostile_checkpoint_runs_no_code(name: str, tmp_path: Path) -> None:
+    """Its checksums are those of the author's files."""
+    train(CASES["vectors"], tmp_path)
+    kept = Generations(tmp_path)
+    folder = kept.folder(kept.numbers()[-1])
+    (folder / name).write_bytes(pickle.dumps(Payload()))
+    digest = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+    lines = [line for line in (folder / "SHA256SUMS").read_text().splitlines() if not line.endswith(name)]
+    (folder / "SHA256SUMS").write_text("\n".join([*lines, f"{digest}  {name}"]) + "\n")
+    with watching() as events, pytest.raises(ArchiveError):
+        CuReSAC.resume(tmp_path, vectors(), device="cpu")
+    assert events == [] and not (Path(__file__).parent / "executed").exists()
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_other_trainings_checkpoints_are_kept(tmp_path: Path) -> None:
+    """Whether they were there before, or come meanwhile; a link to the folder is the same folder."""
+    (tmp_path / "link").symlink_to(tmp_path / "kept")
+    train(CASES["vectors"], tmp_path / "kept")
+    before = sorted(path.name for path in (tmp_path / "kept").iterdir())
+    with pytest.raises(CheckpointError, match=r"holds checkpoints of another training.*CuReSAC\.resume"):
+        train(CASES["vectors"], tmp_path / "link")
+    assert sorted(path.name for path in (tmp_path / "kept").iterdir()) == before
+    first, second = (CuReSAC.resume(tmp_path / name, vectors(), device="cpu") for name in ("kept", "link"))
+    first.learn(20, callback=ExactCheckpoint(10, tmp_path / "link"), reset_num_timesteps=False)
+    with pytest.raises(CheckpointError, match="another training writes checkpoints"):
+        second.learn(20, callback=ExactCheckpoint(10, tmp_path / "kept"), reset_num_timesteps=False)
+
+
+def test_unwritable_folder_is_known_before_training(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    model = tiny_model("MlpPolicy", VectorBox())
+    with pytest.raises(OSError):
+        model.learn(5, callback=ExactCheckpoint(5, tmp_path / "file" / "below"))
+    assert model.num_timesteps == 0
+
+
+def test_checkpoints_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    train(CASES["vectors"], tmp_path)
+    with pytest.raises(CheckpointError, match=r"got 4 environments, but .* was written with 1"):
+        CuReSAC.resume(tmp_path, make_vec_env(VectorBox, 4))
+    with pytest.raises(ValueError, match=r"the saved state is of .*Monitor around VectorBox"):
+        CuReSAC.resume(tmp_path, DummyVecEnv([lambda: Monitor(NoState(VectorBox()))]))
+    with pytest.raises(CheckpointError, match="there is no checkpoint in"):
+        CuReSAC.resume(tmp_path / "nothing", VectorBox())
+
+
+def test_faults_cost_one_checkpoint_at_most(tmp_path: Path) -> None:
+    """The campaign of benchmarks/faults.py, with a part of its failing writes."""
+    outcomes = faults.campaign(tmp_path, points=15)
+    assert [outcome for outcome in outcomes if not outcome.expected] == []
+    assert len(outcomes) >= 90
+    assert {outcome.resumed for outcome in outcomes} == {"newest", "former", "nothing"}
