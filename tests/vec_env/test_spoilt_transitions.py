@@ -17,7 +17,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_cure.data.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, transitions
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
-from sb3_cure.evaluation.rollouts import most_uncomfortable
+from sb3_cure.evaluation.rollouts import highest_errors
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 pytestmark = pytest.mark.filterwarnings("ignore:Environment [0-9]+ :RuntimeWarning", "ignore:.*fork:DeprecationWarning")
@@ -130,18 +130,18 @@ def test_pictures_and_measurements_leave_out_marked_ones(tmp_path: Path, monkeyp
 
     for module in ("callbacks", "rollouts"):
         monkeypatch.setattr(f"sb3_cure.evaluation.{module}.transitions", look)
-    picture = ReconstructionCallback(tmp_path)
+    picture = ReconstructionCallback(tmp_path, columns=10)
     picture.init_callback(model)
     buffer.marked[0, 0] = True  # one that a picture from the first to the last would begin with
-    assert len(picture._spread(10)) == 10
-    most_uncomfortable(model, k=40)
+    assert len(picture._spread()) == 10
+    highest_errors(model, k=40)
     assert len(looked_at) > 1 and not np.concatenate(looked_at).any()
     buffer.marked[:, 0] = True
-    assert len(picture._spread(10)) == 10 and not looked_at[-1].any(), "those of the other environment"
+    assert len(picture._spread()) == 10 and not looked_at[-1].any(), "those of the other environment"
     buffer.marked[:] = True
-    assert len(picture._spread(10)) == 0
-    with pytest.raises(ValueError, match="all its transitions are marked as faulty"):
-        most_uncomfortable(model, k=40)
+    assert picture._spread() is None
+    with pytest.raises(ValueError, match="the replay buffer is empty"):
+        highest_errors(model, k=40)
 
 
 def test_buffer_that_samples_faults_is_refused() -> None:
