@@ -26,6 +26,7 @@ from sb3_cure.data.buffers import frame_stack_of, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
+from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import decoding, diagnostics
 from sb3_cure.evaluation.encoding import encoder_of
@@ -156,7 +157,7 @@ class RolloutCallback(PeriodicCallback):
                 "eval_env must be one gymnasium.Env, not a VecEnv "
                 "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks frames as VecFrameStack does)."
             )
-        if _layers(self.eval_env) & _layers(model.get_env()):
+        if share_environment(self.eval_env, model.get_env()):
             raise ValueError(
                 "eval_env must not share an environment with training, which would store transitions that never "
                 "happened: make another one."
@@ -183,19 +184,6 @@ class RolloutCallback(PeriodicCallback):
     @property
     def _actions(self) -> str:
         return "deterministic actions" if self.deterministic else "sampled actions"
-
-
-def _layers(env: Any) -> set[int]:
-    """Ids of an environment and of all environments and simulators that it wraps or holds."""
-    found: set[int] = set()
-    queue = [env]
-    while queue:
-        layer = queue.pop()
-        if hasattr(layer, "step") and hasattr(layer, "reset") and id(layer) not in found:
-            found.add(id(layer))
-            held = getattr(layer, "__dict__", {})
-            queue += [*held.values(), *(layer.envs if isinstance(held.get("envs"), list) else ())]
-    return found
 
 
 class EvalBothCallback(RolloutCallback):
