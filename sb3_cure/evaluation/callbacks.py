@@ -512,7 +512,7 @@ class StateProbeCallback(RolloutCallback):
         positions and velocities of the joints, see ``sb3_cure.envs.physics_state``
     :param names: Names of what ``state`` returns, [d], required with it; none of them counts as an angle
     :param seed: Seed of the first reset and of the random actions each time
-    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``, whose episodes are taken together
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; their episodes are taken together
     :param kwargs: ``deterministic``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the names of the files
     :raises ValueError: if the environment's state is unknown, or ``state`` comes without ``names``
     :raises ImportError: if matplotlib is not installed
@@ -619,7 +619,11 @@ class DiagnosticsCallback(PeriodicCallback):
 
     def on_period(self) -> None:
         """Look, log and warn."""
-        findings = [*self._rendering, *diagnostics.look(self.model, self._reward_std, *self._arguments)]
+        findings = list(self._rendering)
+        for finding in filter(None, diagnostics.look(self.model, self._reward_std, *self._arguments)):
+            findings.append(finding)
+            if finding.problem is not None:
+                break
         self._report(findings)
         if self.verbose >= 1:
             print(", ".join(f"{finding.name} {finding.value:.3g}" for finding in findings))

@@ -71,30 +71,23 @@ class Temperature(NamedTuple):
     log_prob: th.Tensor
 
 
-def look(model: Any, reward_std: Any, *arguments: Any) -> Iterator[Finding]:
+@th.no_grad()
+def look(
+    model: Any, reward_std: Any, n_samples: int, min_updates: int, autoencoder_updates: int, bounds: Sequence[float]
+) -> Iterator[Finding | None]:
     """
-    Look at a model in training, from cause to effect.
+    Look at a model in training, from cause to effect: a problem may explain those that follow.
 
-    Stops at the first problem, which may explain what follows: behind a constant image all latents are alike, next to a
-    huge temperature no reward counts.
+    Behind a constant image all latents are alike, and next to a huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or of this package
     :param reward_std: Standard deviation of the curious reward, last logged; None before the first update
-    :param arguments: ``n_samples``, ``min_updates``, ``autoencoder_updates`` and ``temperature_bounds`` of
-        ``DiagnosticsCallback``
-    :return: Findings of the checks that apply
+    :param n_samples: Observations to look at
+    :param min_updates: Updates before networks and temperatures are judged
+    :param autoencoder_updates: Updates before the autoencoder is judged
+    :param bounds: Least and greatest temperature
+    :return: Findings; None for checks that do not apply
     """
-    for finding in _checks(model, reward_std, *arguments):
-        if finding is not None:
-            yield finding
-            if finding.problem is not None:
-                return
-
-
-@th.no_grad()
-def _checks(
-    model: Any, reward_std: Any, n_samples: int, min_updates: int, autoencoder_updates: int, bounds: Sequence[float]
-) -> Iterator[Finding | None]:
     yield constant_image(model, n_samples)
     if model._n_updates < max(min_updates, 1):
         return

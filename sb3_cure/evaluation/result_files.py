@@ -117,7 +117,7 @@ def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     if any(None in row or None in row.values() for row in rows):
         raise ValueError("has a row that is shorter or longer than its header")
     if not text.endswith("\n"):
-        raise ValueError("ends within a line, whose last number may have lost digits")
+        raise ValueError("ends within a line, so that its last number may have lost digits")
     return [{key: _number(value) for key, value in row.items()} for row in rows]
 
 

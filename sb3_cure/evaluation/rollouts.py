@@ -310,7 +310,7 @@ def binned_errors(
     :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
     :param errors: SRL error of each visited state, [n], or empty
     :param edges: Edges of the bins of both coordinates, increasing, [a + 1] and [b + 1]
-    :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN where there is none
+    :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN without visits
     """
     x, y = (np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1))
     visits = np.histogram2d(x, y, bins=edges)[0]  # type: ignore[call-overload]

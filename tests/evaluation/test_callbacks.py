@@ -30,7 +30,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sb3_cure import CuReSAC, evaluation, make_dmc_env
+from sb3_cure import evaluation, make_dmc_env
 from sb3_cure.data.buffers import transitions
 from sb3_cure.envs import StackFrames
 from sb3_cure.evaluation import callbacks, plots
@@ -45,7 +45,6 @@ from sb3_cure.evaluation.callbacks import (
 )
 from sb3_cure.evaluation.rollouts import Episode, binned_errors, run_episodes, state_probe
 from sb3_cure.evaluation.video import annotated_frames
-from sb3_cure.persistence import ExactCheckpoint
 
 
 class Filmed(gym.Wrapper):
@@ -75,7 +74,7 @@ MAP: dict[str, Any] = dict(state=position, names=["x", "y"])
 
 
 def test_periods_are_counted_in_agent_steps() -> None:
-    """With three environments the steps go by threes: multiples of ten are reached or passed; another learn goes on."""
+    """Three environments count three steps at a time: multiples of ten are reached or passed, also in another learn."""
     seen: list[int] = []
 
     class Note(PeriodicCallback):
@@ -92,14 +91,23 @@ def test_periods_are_counted_in_agent_steps() -> None:
         model.learn(5, callback=PeriodicCallback(every=1))
 
 
+class Careless(Filmed):
+    """Uses the global random number generators."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        random.random(), np.random.random(), th.rand(1)
+        return super().reset(**kwargs)
+
+
 def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
-    """All callbacks, with stochastic policies, decoders and CURL's negatives chosen anew: equal bits afterwards."""
+    """All callbacks, with stochastic policies, decoders, new negatives and careless environments: equal bits."""
     models = []
     for watched in (False, True):
         callbacks: list[BaseCallback] = []
         if watched:
-            env = Filmed(PixelBox())
+            env = Careless(PixelBox())
             callbacks = [
+                EvalBothCallback(env, 15, n_episodes=1),
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
                 ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
@@ -113,30 +121,6 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
         + ["reconstructions.png", "state_probe.csv", "state_probe.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
-
-
-class Careless(Filmed):
-    """Uses the global random number generators."""
-
-    def reset(self, **kwargs: Any) -> Any:
-        random.random(), np.random.random(), th.rand(1)
-        return super().reset(**kwargs)
-
-
-def test_watched_environments_may_draw_from_common_generators(tmp_path: Path) -> None:
-    """The training draws from them as if nobody watched."""
-    drawn = []
-    for watched in (False, True):
-        env, callbacks = Careless(PixelBox()), []
-        if watched:
-            callbacks = [
-                EvalBothCallback(env, 15, n_episodes=1),
-                PolicyVideoCallback(env, tmp_path, 15),
-                CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, **MAP),
-            ]
-        tiny_model("CnnPolicy", PixelBox()).learn(20, callback=callbacks)
-        drawn.append((random.random(), np.random.random(), float(th.rand(1))))
-    assert drawn[0] == drawn[1]
 
 
 @pytest.mark.parametrize(
@@ -225,39 +209,11 @@ def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_pa
     assert heights[0] < heights[4] < heights[8] == heights[-1]
 
 
-def test_a_resumed_training_draws_no_more_rows(tmp_path: Path) -> None:
-    """With a head that needs a decoder there is no row of the untrained model, nor one of the moment of resuming."""
-    env = PixelBox()
-    observations = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
-
-    class Stop(BaseCallback):
-        def _on_step(self) -> bool:
-            if self.num_timesteps == 13:
-                raise InterruptedError
-            return True
-
-    def watching(folder: str) -> ReconstructionCallback:
-        return ReconstructionCallback(tmp_path / folder, 15, observations, decoder_updates=1)
-
-    def checkpoints() -> ExactCheckpoint:
-        return ExactCheckpoint(save_freq=5, path=tmp_path / "checkpoints")
-
-    curl: dict[str, Any] = dict(srl="curl", srl_kwargs=dict(bank_size=12))
-    whole, first, second = watching("whole"), watching("parts"), watching("parts")
-    tiny_model("CnnPolicy", PixelBox(), **curl).learn(31, callback=whole)
-    with pytest.raises(InterruptedError):
-        tiny_model("CnnPolicy", PixelBox(), **curl).learn(31, callback=[checkpoints(), first, Stop()])
-    CuReSAC.resume(tmp_path / "checkpoints", PixelBox()).learn(31, callback=[checkpoints(), second])
-    assert [steps for steps, _ in second.rows] == [steps for steps, _ in whole.rows] == [15, 30]
-    for (_, drawn), (_, other) in zip(whole.rows, second.rows, strict=True):
-        np.testing.assert_array_equal(drawn, other)
-
-
 PPO_ARGUMENTS: dict[str, Any] = dict(n_steps=16, batch_size=16, n_epochs=1, seed=0)
 
 
 def test_the_newest_frame_of_a_stack_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In colour, where SB3 stacks, and around environments that stack."""
+    """In colour, with SB3's stacks of environments that stack."""
     shown: list[np.ndarray] = []
     monkeypatch.setattr(plots, "reconstructions_over_training", lambda _, observed, *__: shown.append(observed))
     env = VecFrameStack(DummyVecEnv([lambda: PixelBox(frame_stack=2)]), 3)
@@ -323,7 +279,7 @@ def test_stacked_by_sb3_watched_in_one_environment() -> None:
 
 
 def test_one_callback_serves_pretraining_and_learning() -> None:
-    """By default whom each of them trains."""
+    """By default it evaluates the policies that each of them trains."""
     evaluation = EvalBothCallback(PixelBox(), eval_freq=10, n_episodes=1)
     tiny_model("CnnPolicy", PixelBox()).pretrain(10, callback=evaluation).learn(10, callback=evaluation)
     assert [{name for name in row if name.endswith("_reward")} for row in evaluation.history] == [

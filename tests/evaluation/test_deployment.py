@@ -49,7 +49,7 @@ def test_actions_are_those_of_predict(name: str) -> None:
 
 
 def test_onnx_of_a_dictionary(tmp_path: Path) -> None:
-    """Another runtime acts as ``predict`` does, on inputs of the names that the guide tells."""
+    """Another runtime acts as ``predict`` does, with the guide's names of inputs."""
     model, file = sensor_model(srl="curl").learn(14), tmp_path / "policy.onnx"
     observation: Any = model.observation_space.sample()
     batch = {key: part[None] for key, part in observation.items()}
@@ -59,7 +59,7 @@ def test_onnx_of_a_dictionary(tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, model.predict(batch, deterministic=True)[0], atol=1e-5)
 
 
-def test_what_acts_is_all_that_leaves() -> None:
+def test_only_acting_networks_are_exported() -> None:
     """No critics, decoder or target networks; and the networks stay the model's own."""
     model = tiny_model("CnnPolicy", PixelBox())
     module = DeterministicActor(model)
@@ -69,7 +69,7 @@ def test_what_acts_is_all_that_leaves() -> None:
     assert sum(value.numel() for value in exported.state_dict.values()) == sum(map(th.numel, parts)) + 4  # two bounds
 
 
-def test_training_goes_on_after_it_was_made() -> None:
+def test_actions_follow_further_training() -> None:
     """Actions are still those of ``predict``, though training leaves the networks in another mode."""
     model = tiny_model("CnnPolicy", PixelBox())
     model.policy.encoder.trunk.append(th.nn.Dropout())

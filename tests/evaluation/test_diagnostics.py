@@ -83,7 +83,7 @@ def watch(model: BaseAlgorithm, steps: int, **arguments: Any) -> tuple[list[str]
 
 @pytest.mark.parametrize("curiosity", ["separate", "bonus"])
 @pytest.mark.parametrize("srl", ["rae", "curl"])
-def test_a_good_run_is_warned_of_nothing(srl: str, curiosity: str) -> None:
+def test_good_runs_give_no_warning(srl: str, curiosity: str) -> None:
     """All checks look, none of them warns; they look only after ``min_updates``."""
     warned, logged = watch(tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity), 200)
     assert warned == []
@@ -95,7 +95,7 @@ def test_a_good_run_is_warned_of_nothing(srl: str, curiosity: str) -> None:
 
 
 @pytest.mark.parametrize("srl, min_updates", [("rae", 200), pytest.param("curl", 580, marks=pytest.mark.long)])
-def test_real_pixels_are_warned_of_nothing(srl: str, min_updates: int) -> None:
+def test_real_pixels_give_no_warning(srl: str, min_updates: int) -> None:
     """Some hundred updates on DeepMind Control, judged when the latents have unfolded, which takes CURL longer.
 
     With four filters, as in the other tests, some seeds need longer still.
@@ -110,7 +110,7 @@ def test_real_pixels_are_warned_of_nothing(srl: str, min_updates: int) -> None:
 
 
 def test_an_autoencoder_that_learns_is_better_than_the_mean_image() -> None:
-    """What it explains rises from below 0 to more than is asked of it."""
+    """What it explains rises from below 0 beyond the threshold."""
     kwargs = dict(features_extractor_kwargs=dict(n_filters=8, n_layers=2))
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=None, learning_rate=3e-3, policy_kwargs=kwargs)
     _, early = watch(model, 100, min_updates=1)
@@ -218,8 +218,8 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_warned_of_once(fault: str) -> None:
-    """And of nothing else; the number that tells it is logged, at each look."""
+def test_each_problem_is_warned_of_once(fault: str) -> None:
+    """And of nothing else; its number is logged at each look."""
     make, name, sentence = FAULTS[fault]
     warned, logged = watch(make(), 110, **({"autoencoder_updates": 40} if fault == "drawings" else {}))
     assert len(warned) == 2, warned
@@ -239,7 +239,7 @@ def test_equal_latents_count_at_any_scale() -> None:
 
 
 def test_small_rewards_need_a_small_temperature() -> None:
-    """A learned temperature beyond its bounds is well where the policy meets its target."""
+    """A learned temperature beyond its bounds is fine if the policy meets its target."""
     assert watch(box(PixelBox(), ent_coef=0.0), 80)[0] == [], "no entropy term at all"
     model = box(PixelBox())
     log_prob = th.full((8,), float(-model.target_entropy))  # type: ignore[arg-type]
@@ -250,7 +250,7 @@ def test_small_rewards_need_a_small_temperature() -> None:
 
 @pytest.mark.parametrize("software", [True, False])
 def test_software_rendering_on_a_gpu_machine(software: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Said when training starts; not where the GPU draws."""
+    """It is warned of when training starts, but not if the GPU renders."""
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
     monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(th.cuda, "get_device_name", lambda index: "NVIDIA H200")
@@ -321,7 +321,7 @@ def test_rl_zoo_makes_it_from_yaml() -> None:
 
 
 def test_images_of_dictionaries_are_looked_at() -> None:
-    """A camera that stands still beside one that does not, and drawings that hold nothing of one image."""
+    """One of two cameras stands still; reconstructions that hold nothing of one image."""
 
     class HalfStill(SensorBox):
         def observe(self, first: bool = False) -> Any:
@@ -341,7 +341,7 @@ def test_images_of_dictionaries_are_looked_at() -> None:
     assert explained is not None and explained < 0.01
 
 
-def test_what_other_callbacks_write_hides_nothing() -> None:
+def test_logs_written_by_other_callbacks_are_seen() -> None:
     """The logger forgets what it has written, as it is when an evaluation comes first."""
     model = tiny_model("CnnPolicy", PixelBox(), normalize_curiosity=False, ent_coef=1.0)
     looking = DiagnosticsCallback(25, 16, min_updates=10)

@@ -1,6 +1,7 @@
 """Both policies are evaluated in rollouts of their own, with the noise-free SRL error of what they see."""
 
 import itertools
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def test_episodes_of_dictionaries_are_measured(srl: str) -> None:
 
 
 @pytest.mark.parametrize("actor", ["task", "curious", "random"])
-def test_each_episode_is_acted_by_the_policy_that_was_asked_for(actor: str) -> None:
+def test_the_requested_policy_acts(actor: str) -> None:
     """Actions are that policy's, rewards the environment's, errors those of the observations before each step."""
     model = tiny_model("CnnPolicy", PixelBox()).learn(20)
     env = Recorder(low=-2.0, high=3.0)
@@ -124,7 +125,7 @@ def test_each_episode_is_acted_by_the_policy_that_was_asked_for(actor: str) -> N
     np.testing.assert_allclose(episode.srl_errors, (drawn - target).square().flatten(1).mean(1), rtol=1e-4)
 
 
-def test_true_states_are_kept_when_asked_for() -> None:
+def test_true_states_are_kept_on_request() -> None:
     """Those before each step, as a function of the environment says; for dm_control that of its physics."""
     model = tiny_model("CnnPolicy", PixelBox()).learn(20)
     (episode,) = run_episodes(model, Recorder(), 1, "curious", seed=5)
@@ -184,23 +185,27 @@ def test_callback_logs_both_policies_at_its_interval() -> None:
         assert last[f"eval/{actor}_srl_error"] == pytest.approx(errors.mean())
 
 
-@pytest.mark.parametrize("make", [tiny_model, sensor_model])
-def test_strips_show_newest_frames_above_their_reconstructions(make: Any) -> None:
-    """Left to right the samples, of each image."""
-    model = make("CnnPolicy", PixelBox()) if make is tiny_model else sensor_model()
-    model.learn(14)
+@pytest.mark.parametrize(
+    ("make", "shapes"),
+    [
+        (partial(tiny_model, "CnnPolicy", PixelBox()), {"": (3, 72, 108)}),
+        (sensor_model, {"front": (3, 72, 108), "wrist": (3, 56, 84)}),
+    ],
+    ids=["image", "dictionary"],
+)
+def test_strips_show_newest_frames_above_their_reconstructions(make: Any, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Left to right the samples, of each image; heads that do not reconstruct have none."""
+    model = make().learn(14)
     batch = model.policy.samples(model.replay_buffer.sample(8), random=False)
     strips = reconstruction_strips(model.policy, batch, frame_stack=2, columns=3)
+    assert {key: strip.shape for key, strip in strips.items()} == shapes
     seen, drawn = map(by_key, model.policy.reconstruct(batch.observations))
-    assert {key: strip.shape for key, strip in strips.items()} == (
-        {"": (3, 72, 108)} if make is tiny_model else {"front": (3, 72, 108), "wrist": (3, 56, 84)}
-    )
-    np.testing.assert_array_equal(reconstruction_strip(model.policy, batch, 2, 3), next(iter(strips.values())))
     for key, strip in strips.items():
         above, below = (images[key][:3, 3:].permute(1, 2, 0, 3).flatten(2).detach() for images in (seen, drawn))
         np.testing.assert_array_equal(strip, np.concatenate([above, below], axis=1))
+    np.testing.assert_array_equal(reconstruction_strip(model.policy, batch, 2, 3), next(iter(strips.values())))
+    assert reconstruction_strip(make(srl="curl").policy, batch, 2) is None
     assert reconstruction_strips(tiny_model("MlpPolicy", VectorBox()).policy, batch, 2) == {}
-    assert reconstruction_strip(sensor_model(srl="curl").policy, batch, 2) is None or make is tiny_model
 
 
 def test_decoder_draws_what_a_frozen_encoder_sees() -> None:
@@ -281,7 +286,7 @@ def test_observations_are_normalised_as_in_training() -> None:
     np.testing.assert_allclose(episode.observations[1], moved, atol=1e-6)
 
 
-# ---------------------------------------------------------------- what the latents tell of the true state
+# ---------------------------------------------------------------- state probe
 
 
 def probed(latents: list[np.ndarray], states: list[np.ndarray], **kwargs: Any) -> dict[str, float]:
@@ -338,7 +343,7 @@ def test_state_probe_of_known_maps() -> None:
 
 
 def test_state_probe_does_not_know_an_episode_from_itself() -> None:
-    """Latents that only tell which episode it is tell nothing of another one, however alike its own steps are."""
+    """Latents that identify the episode predict nothing of another one, however similar its own steps are."""
     rng = np.random.default_rng(0)
     latents = [np.eye(8)[[index] * 50] for index in range(8)]
     states = [np.full((50, 1), rng.normal()) + rng.normal(0, 0.01, (50, 1)) for _ in range(8)]
