@@ -105,7 +105,7 @@ def balance_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = Non
         head.set_bank(th.as_tensor(frames[: len(head.bank)]))
 
 
-def _heads_with_negatives(model: BaseAlgorithm) -> dict[str, CURL]:
+def _heads_with_negatives(model: BaseAlgorithm) -> dict[str, Any]:
     heads = heads_by_key(getattr(model.policy, "srl", None))
     return {key: head for key, head in heads.items() if isinstance(head, CURL)}
 
@@ -182,7 +182,8 @@ def run_episodes(
         observation, _ = env.reset(seed=seed if index == 0 else None)
         # Copies: environments may reuse their arrays for observations, and change actions
         observations = [_own_keys(observation, model.observation_space)]
-        actions, rewards, dones, frames, true_states = [], [], [], [], []  # type: ignore[var-annotated]
+        actions, true_states, frames = list[np.ndarray](), list[np.ndarray](), list[Any]()
+        rewards, dones = list[float](), list[bool]()
         finished, memory = False, None  # memory of recurrent policies
         while not finished:
             if actor == "random":
