@@ -454,10 +454,10 @@ def test_long_names_that_begin_alike_are_logged(tmp_path: Path) -> None:
 )
 def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], tmp_path: Path) -> None:
     """A decoder fitted to them draws another picture for each observation; 0 updates draw nothing."""
-    callback = ReconstructionCallback(tmp_path, every=20, columns=5, decoder_updates=30)
-    none = ReconstructionCallback(tmp_path / "none", every=20, decoder_updates=0)
-    make().learn(40, callback=[callback, none])
-    assert [steps for steps, _ in callback.rows] == [20, 40] and names(tmp_path) == ["reconstructions.png"]
+    callback = ReconstructionCallback(tmp_path, every=32, columns=5, decoder_updates=30)
+    none = ReconstructionCallback(tmp_path / "none", every=32, decoder_updates=0)
+    make().learn(32, callback=[callback, none])
+    assert [steps for steps, _ in callback.rows] == [32] and names(tmp_path) == ["reconstructions.png"]
     observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1]  # type: ignore[index, call-overload]
     different = len(np.unique(callback.observations, axis=0))  # type: ignore[arg-type]
     assert different >= 3, "of different times"
