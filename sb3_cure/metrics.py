@@ -1,5 +1,5 @@
-"""Public names of :mod:`sb3_cure.cure.metrics`."""
+"""Public names of :mod:`sb3_cure.cure.reconstructions`."""
 
-from sb3_cure.cure.metrics import reconstruction_strip, reconstruction_strips
+from sb3_cure.cure.reconstructions import reconstruction_strip, reconstruction_strips
 
 __all__ = ["reconstruction_strip", "reconstruction_strips"]

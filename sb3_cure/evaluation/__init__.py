@@ -2,10 +2,11 @@
 
 from sb3_cure.evaluation.rollouts import (
     Episode,
-    Uncomfortable,
+    HighestErrors,
+    balance_negatives,
     binned_errors,
     evenly_measured,
-    most_uncomfortable,
+    highest_errors,
     run_episodes,
     srl_errors,
     state_probe,
@@ -14,10 +15,11 @@ from sb3_cure.evaluation.rollouts import (
 
 __all__ = [
     "Episode",
-    "Uncomfortable",
+    "HighestErrors",
+    "balance_negatives",
     "binned_errors",
     "evenly_measured",
-    "most_uncomfortable",
+    "highest_errors",
     "run_episodes",
     "srl_errors",
     "state_probe",

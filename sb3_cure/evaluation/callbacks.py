@@ -1,37 +1,46 @@
 """Callbacks for ``learn``: evaluation, videos, pictures and warnings.
 
-All serve any SB3 algorithm (``DiagnosticsCallback``: any off-policy one), but for the SRL errors in them.
+All work with any SB3 algorithm (``DiagnosticsCallback``: any off-policy one); without SRL head there are no SRL errors.
 """
 
 import contextlib
 import random
+import re
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.preprocessing import maybe_transpose
-from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
+from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cure.metrics import newest_frames
-from sb3_cure.cure.policies import encoder_of
-from sb3_cure.data.buffers import infer_frame_stack, stored_places, transitions
+from sb3_cure.cure.reconstructions import newest_frames
+from sb3_cure.data.buffers import frame_stack_of, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
+from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation import diagnostics
+from sb3_cure.evaluation import decoding, diagnostics
+from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.evaluation.result_files import write_csv
-from sb3_cure.evaluation.rollouts import Episode, as_trained, evenly_measured, run_episodes, state_probe, trained_actors
+from sb3_cure.evaluation.rollouts import (
+    Episode,
+    as_arrays,
+    as_trained,
+    evenly_measured,
+    run_episodes,
+    state_probe,
+    stored_places,
+    trained_actors,
+)
 
 __all__ = [
     "CuriosityMapCallback",
@@ -45,16 +54,18 @@ __all__ = [
     "untouched_randomness",
 ]
 
-#: Observations that ``ReconstructionCallback`` keeps where there is no replay buffer: 64 MB of three frames of 84 x 84
+#: Observations that ``ReconstructionCallback`` keeps without a replay buffer: 64 MB of three frames of 84 x 84
 LATEST = 1000
+#: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
+PRINTED_NAME = 33
 
 
 class PeriodicCallback(BaseCallback):
     """
-    Does something every so many agent steps: subclass it and implement ``on_period``.
+    Base class for callbacks that do something every so many agent steps: implement ``on_period``.
 
-    It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random streams of
-    Python, NumPy and PyTorch are set aside meanwhile: watching a training does not change it.
+    It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random number generators
+    of Python, NumPy and PyTorch are restored afterwards, so that training is the same with and without the callback.
 
     :param every: Agent steps between two calls (of all environments together)
     :param verbose: Verbosity level
@@ -77,17 +88,24 @@ class PeriodicCallback(BaseCallback):
         return True
 
     def on_period(self) -> None:
-        """What to do; ``self.model``, ``self.num_timesteps`` and ``self.logger`` are there, as in any callback."""
+        """Do it; ``self.model``, ``self.num_timesteps`` and ``self.logger`` are there, as in any callback."""
         raise NotImplementedError(f"{type(self).__name__} must implement on_period()")
+
+    def _path(self, folder: Path, name: str) -> Path:
+        """Path of a file to write, in a folder that is made with the first file."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if self.verbose >= 1:
+            print(f"{type(self).__name__}: {folder / name}")
+        return folder / name
 
 
 @contextlib.contextmanager
 def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator[None]:
     """
-    Set the random streams of Python, NumPy and PyTorch aside for a while.
+    Restore the random number generators of Python, NumPy and PyTorch afterwards.
 
-    :param device: Device whose stream is meant, besides the CPU's
-    :param seed: What they begin with meanwhile; None: they go on from where they are
+    :param device: Device whose generator is restored besides the CPU's
+    :param seed: Seed of all of them meanwhile; None: they continue from their state
     """
     python_state, numpy_state = random.getstate(), np.random.get_state()
     with th.random.fork_rng([device] if device.type == "cuda" else []):
@@ -102,9 +120,9 @@ def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator
 
 class RolloutCallback(PeriodicCallback):
     """
-    Rolls out policies alone in an environment of its own every so many agent steps.
+    Base class for callbacks that roll out policies alone, in an environment of its own, every so many agent steps.
 
-    :param eval_env: One (not vectorised) environment made as the training environment, not that one itself. Where
+    :param eval_env: One (not vectorised) environment made as the training environment, but not that one itself. If
         SB3's ``VecFrameStack`` stacks frames for training, wrap it in
         ``sb3_cure.envs.StackFrames(env, n, padding="zeros")``
     :param every: Agent steps between two calls
@@ -129,32 +147,36 @@ class RolloutCallback(PeriodicCallback):
         self.eval_env, self.n_episodes = eval_env, n_episodes
         self.deterministic, self.seed = deterministic, seed
         self._chosen = actors
-        #: Whom it rolls out in the call that runs
+        #: Policies that are rolled out in the current call of ``learn``
         self.actors: list[str] = []
 
     def _init_callback(self) -> None:
-        """Refuse now what would end the training when the callback is due."""
+        model = self.model
         if isinstance(self.eval_env, VecEnv):
             raise ValueError(
-                "eval_env is a VecEnv, but policies are rolled out in one environment: give a gymnasium.Env "
+                "eval_env must be one gymnasium.Env, not a VecEnv "
                 "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks frames as VecFrameStack does)."
             )
-        model, space = self.model, self.eval_env.observation_space
-        if self.eval_env.action_space != model.action_space or not _same_shapes(space, model.observation_space):
+        if share_environment(self.eval_env, model.get_env()):
             raise ValueError(
-                f"eval_env has {space} and {self.eval_env.action_space}, but the model was made for "
-                f"{model.observation_space} and {model.action_space}: make it as the training environment."
+                "eval_env must not share an environment with training, which would store transitions that never "
+                "happened: make another one."
             )
+        # As SB3 wraps training environments: images channels first
+        wrapped = model._wrap_env(self.eval_env, monitor_wrapper=False)
+        check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
         trained = trained_actors(model)
         self.actors = trained if self._chosen is None else list(self._chosen)
         if not set(self.actors) <= {*trained, "random"}:
-            raise ValueError(f"actors are {self.actors}, but this model has {', '.join([*trained, 'random'])}.")
+            raise ValueError(f"actors must be of {', '.join([*trained, 'random'])} for this model, not {self.actors}.")
 
     def run(self, actor: str, **kwargs: Any) -> Iterator[Episode]:
         """
-        :param actor: Whose actions
+        Roll out one policy.
+
+        :param actor: Who acts
         :param kwargs: Further arguments of ``run_episodes``
-        :return: Episodes of this policy alone
+        :return: Its episodes
         """
         arguments = dict(deterministic=self.deterministic, seed=self.seed, **kwargs)
         return run_episodes(self.model, self.eval_env, self.n_episodes, actor, **arguments)
@@ -162,16 +184,6 @@ class RolloutCallback(PeriodicCallback):
     @property
     def _actions(self) -> str:
         return "deterministic actions" if self.deterministic else "sampled actions"
-
-
-def _same_shapes(space: spaces.Space, trained: spaces.Space) -> bool:
-    """Whether observations have the shapes of those of training, in which SB3 may have moved the channels of images to
-    the front."""
-    if isinstance(space, spaces.Dict) and isinstance(trained, spaces.Dict):
-        same_keys = space.spaces.keys() == trained.spaces.keys()
-        return same_keys and all(_same_shapes(space[key], trained[key]) for key in space.spaces)
-    shape = space.shape
-    return trained.shape in (shape, (shape[2], *shape[:2]) if shape is not None and len(shape) == 3 else shape)
 
 
 class EvalBothCallback(RolloutCallback):
@@ -204,7 +216,7 @@ class EvalBothCallback(RolloutCallback):
         :return: Agent steps and the logged values
         """
         row: dict[str, float] = {}
-        for actor in self.actors or ():
+        for actor in self.actors:
             results = [(episode.total_reward, episode.srl_errors) for episode in self.run(actor)]
             row[f"eval/{actor}_reward"] = float(np.mean([reward for reward, _ in results]))
             errors = np.concatenate([errors for _, errors in results])
@@ -221,25 +233,17 @@ class EvalBothCallback(RolloutCallback):
         return row
 
 
-def _file(callback: BaseCallback, folder: Path, name: str) -> Path:
-    """Where to write; the folder is made when the first file is written."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if callback.verbose >= 1:
-        print(f"{type(callback).__name__}: {folder / name}")
-    return folder / name
-
-
 class PolicyVideoCallback(RolloutCallback):
     """
     Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
 
-    Below the camera's picture stand the return so far and, where the model has an SRL head, the SRL error of the
-    observation as a number and as a curve. Works with every SB3 algorithm.
+    Below the camera's picture stand the return so far and, if the model has an SRL head, the SRL error of the
+    observation as a number and as a curve.
 
     :param eval_env: One (not vectorised) environment made with ``render_mode="rgb_array"``, not the training one
     :param folder: Where to write
     :param every: Agent steps between two videos
-    :param fps: Pictures per second, one per agent step; by default as the environment tells, else 30
+    :param fps: Pictures per second, one per agent step; by default the environment's ``render_fps``, or 30
     :param kwargs: ``actors``, ``deterministic``, ``seed``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the
         name of each video
     :raises ValueError: if the environment does not render RGB frames
@@ -249,44 +253,43 @@ class PolicyVideoCallback(RolloutCallback):
     def __init__(self, eval_env: gym.Env, folder: str | Path, every: int = 5000, fps: int | None = None, **kwargs: Any):
         super().__init__(eval_env, every, n_episodes=1, **kwargs)
         if eval_env.render_mode != "rgb_array":
-            raise ValueError(f"eval_env has render_mode={eval_env.render_mode!r}: make it with 'rgb_array'.")
+            raise ValueError(f"eval_env must have render_mode='rgb_array', not {eval_env.render_mode!r}.")
         self.folder = Path(folder)
         self.fps = fps or max(round(eval_env.metadata.get("render_fps") or 30), 1)
         from sb3_cure.evaluation import video  # noqa: F401  (fail before training if a package is missing)
 
     def on_period(self) -> None:
         """Film an episode of each policy."""
-        steps, repeat = self.num_timesteps, action_repeat_of(self.eval_env)
-        for actor in self.actors or ():
-            (episode,) = self.run(actor, render=True)
-            path = _file(self, self.folder, f"{actor}_policy_{steps}_steps.mp4")
-            title = f"{actor} policy, {self._actions}, after {steps:,} agent steps"
-            from sb3_cure.evaluation import video
+        from sb3_cure.evaluation import video
 
+        steps, repeat = self.num_timesteps, action_repeat_of(self.eval_env)
+        for actor in self.actors:
+            (episode,) = self.run(actor, render=True)
+            path = self._path(self.folder, f"{actor}_policy_{steps}_steps.mp4")
+            title = f"{actor} policy, {self._actions}, after {steps:,} agent steps"
             video.write_video(path, episode, self.fps, repeat, title)
 
 
 class ReconstructionCallback(PeriodicCallback):
     """
-    Watch reconstructions become sharp: ``reconstructions.png`` has one row per time, of the same observations. Each
-    image of dictionaries has a picture ``reconstructions_<key>.png``.
+    Draw reconstructions of the same observations over training: ``reconstructions.png``, one row per time.
 
-    Where neither head nor intrinsic reward draws, and for SB3's own algorithms, a decoder is fitted to the latents
-    for each row, anew so that rows can be compared; the agent does not learn from it. It is fitted to what the replay
-    buffer holds, or without one (PPO, A2C) to the latest ``LATEST`` observations. The file is rewritten with each row.
+    Each image of dictionaries has a picture ``reconstructions_<key>.png``. If neither head nor intrinsic reward
+    reconstructs, and for SB3's own algorithms, a new decoder is fitted to the latents for each row, from which the
+    agent does not learn. It is fitted to the replay buffer, or without one (PPO, A2C) to the latest ``LATEST``
+    observations. The file is rewritten with each row.
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; where the head
-        itself draws, the first row is then that of the untrained model. By default ``columns`` of those that the
-        decoder would be fitted to, spread over the time that they span when the first row is drawn
+    :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; the first row is
+        then that of the untrained model, if the head itself reconstructs. By default ``columns`` of those that the
+        decoder would be fitted to, spread over their time when the first row is drawn
     :param columns: How many observations to take
-    :param frame_stack: Frames per observation, of which the newest is shown; by default as the environment or
-        ``VecFrameStack`` tells
-    :param decoder_updates: Updates of the decoder for heads that do not draw; 0: only warn that the head does not draw
-    :param max_rows: Where there are more times, rows are left out evenly
+    :param frame_stack: Frames per observation, of which the newest is shown; by default that of the environment
+    :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
+    :param max_rows: Most rows of the picture; further times are left out evenly
     :param verbose: 1 prints the file's name
-    :param title: Put before the picture's title, such as the names of task and method
+    :param title: Added to the picture's title, such as the names of task and method
     :raises ValueError: if the model does not learn from images with an encoder, or from other images
     :raises ImportError: if matplotlib is not installed
     """
@@ -307,23 +310,21 @@ class ReconstructionCallback(PeriodicCallback):
         self.folder, self.observations, self.columns = Path(folder), observations, columns
         self.frame_stack, self.decoder_updates, self.max_rows = frame_stack, decoder_updates, max_rows
         self.title = title
-        #: Agent steps and what was drawn then, the newest frames, uint8 [n, C, H, W], or such by key
+        #: Agent steps and the reconstructions then, their newest frames, uint8 [n, C, H, W], or such by key
         self.rows: list[tuple[int, Any]] = []
         self._latest: deque[np.ndarray] = deque(maxlen=LATEST)
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _init_callback(self) -> None:
-        space = self.model.observation_space
+        space, given = self.model.observation_space, self.observations
         if encoder_of(self.model.policy) is None or not image_spaces(space):
-            raise ValueError(
-                "ReconstructionCallback needs a policy of images of uint8, or of dictionaries with such: it draws from "
-                "their latents."
-            )
-        if self.observations is not None:
-            if isinstance(self.observations, np.ndarray) and self.observations.shape[1:] != space.shape:
-                self.observations = maybe_transpose(self.observations, space)
-            if not all(space.contains(rows_of(self.observations, i)) for i in range(len_of(self.observations))):
-                raise ValueError(f"observations must be n of {space}, as the model learns from them.")
+            raise ValueError("ReconstructionCallback needs a policy with an encoder of uint8 images, which it draws.")
+        if given is None:
+            return
+        if isinstance(given, np.ndarray) and given.shape[1:] != space.shape:
+            self.observations = given = maybe_transpose(given, space)
+        if not all(space.contains(rows_of(given, i)) for i in range(len_of(given))):
+            raise ValueError(f"observations must be n of {space}, as the model learns from them.")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -333,90 +334,92 @@ class ReconstructionCallback(PeriodicCallback):
 
     def _on_step(self) -> bool:
         if self._buffer is None and self.decoder_updates > 0:
-            # Not `new_obs` of the locals: the rollouts of third parties' algorithms may call it otherwise
+            # Not `new_obs` of the locals, which rollouts of third parties' algorithms may name otherwise
             self._latest.extend(np.array(self.model._last_obs))
         return super()._on_step()
 
     def on_period(self) -> None:
         """Add a row."""
-        model: Any = self.model
-        model.policy.set_training_mode(False)
-        if self.observations is None:
-            self.observations = self._spread(self.columns)
-        if len_of(self.observations) == 0:  # nothing good has been seen so far
-            self.observations = None
-            return
-        observed = obs_as_tensor(as_trained(model, self.observations), model.device)
-        keys = list(image_spaces(model.observation_space))
-        title = "What the agent sees, and what its latents hold of it"
-        reconstruct = getattr(model.policy, "reconstruct", lambda observations: None)
-        with th.no_grad():
-            pair = reconstruct(observed)
-        if pair is None:
-            if self.decoder_updates == 0:
-                head = getattr(model.policy, "srl", None)
-                warnings.warn(f"{type(head).__name__} does not reconstruct: give decoder_updates=500.", stacklevel=2)
-            if self.decoder_updates == 0 or len_of(self._spread(1)) == 0:
-                return
-            title = "What a decoder fitted afterwards draws from the latents"
-            from sb3_cure.evaluation import decoding
+        from sb3_cure.evaluation import plots
 
-            decoders = [decoding.fit_decoder(model, self._sample, self.decoder_updates, key) for key in keys]
-            pairs = [decoding.draw_latents(model, *each) for each in zip(decoders, repeat(observed), keys)]
-            pair = tuple(dict(zip(keys, images, strict=True)) for images in zip(*pairs, strict=True))
-        frame_stack = self.frame_stack or infer_frame_stack(self.training_env)
-        seen, drawn = (
-            {key: newest_frames(image, frame_stack).cpu().numpy() for key, image in images.items()}
-            for images in map(by_key, pair)
-        )
-        self.rows.append((self.num_timesteps, drawn.get("", drawn)))
+        self.model.policy.set_training_mode(False)
+        if self.observations is None:
+            self.observations = self._spread()
+        drawn = None if self.observations is None else self._reconstruct(self.observations)
+        if drawn is None:
+            return
+        title, *pair = drawn
+        frame_stack = self.frame_stack or frame_stack_of(self.training_env)
+        seen, row = ({key: as_arrays(newest_frames(each[key], frame_stack)) for key in pair[1]} for each in pair)
+        self.rows.append((self.num_timesteps, row.get("", row)))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
         for key, images in seen.items():
-            from sb3_cure.evaluation import plots
-
+            # Keys such as dm_control's "walker/egocentric_camera"
+            name = re.sub(r"[^\w.-]", "_", f"reconstructions_{key}" if key else "reconstructions")
             plots.reconstructions_over_training(
-                _file(self, self.folder, f"reconstructions_{key}.png" if key else "reconstructions.png"),
+                self._path(self.folder, f"{name}.png"),
                 images,
-                [(steps, row[key] if key else row) for steps, row in (self.rows[index] for index in shown)],
+                [(steps, by_key(row)[key]) for steps, row in (self.rows[index] for index in shown)],
                 "\n".join(filter(None, (f"{title}: {key}" if key else title, self.title))),
             )
 
     def draw(self, model: BaseAlgorithm) -> None:
-        """Add a row now, outside of a training.
+        """
+        Add a row now, outside of training.
 
-        :param model: A model that has been trained, or loaded with a replay buffer
+        :param model: A trained model, or one loaded with a replay buffer
         """
         self.init_callback(model)
         self.num_timesteps = model.num_timesteps
         self.on_period()
 
+    def _reconstruct(self, observations: Any) -> tuple[str, dict[str, th.Tensor], dict[str, th.Tensor]] | None:
+        """Title, images and reconstructions by key; None if there is nothing that reconstructs."""
+        model: Any = self.model
+        observed = obs_as_tensor(as_trained(model, observations), model.device)
+        if hasattr(model.policy, "reconstruct"):
+            with th.no_grad():
+                pair = model.policy.reconstruct(observed)
+            if pair is not None:
+                return "What the agent sees, and what its latents hold of it", by_key(pair[0]), by_key(pair[1])
+        if self.decoder_updates == 0 or self._count == 0:
+            return None
+        seen, drawn = {}, {}
+        for key in image_spaces(model.observation_space):
+            decoder = decoding.fit_decoder(model, self._sample, self.decoder_updates, key)
+            seen[key], drawn[key] = decoding.draw_latents(model, decoder, observed, key)
+        return "What a decoder fitted afterwards draws from the latents", seen, drawn
+
     @property
     def _buffer(self) -> Any:
         return getattr(self.model, "replay_buffer", None)
 
+    @property
+    def _count(self) -> int:
+        return len(self._latest) if self._buffer is None else len(stored_places(self._buffer)[0])
+
     def _sample(self, n: int) -> Any:
-        """Observations that the model has seen, at random, on its device, [n, *shape] or such by key."""
+        """Draw random observations that the model has seen, [n, *shape] or such by key, on its device."""
         if self._buffer is not None:
             return self._buffer.sample(n, env=self.model.get_vec_normalize_env()).observations
         chosen = np.random.randint(len(self._latest), size=n)
         return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
 
-    def _spread(self, n: int) -> Any:
-        """Observations that the model has seen, spread over the time that they span, oldest first, [n, *shape] or such
-        by key; [0] if it has seen none."""
+    def _spread(self) -> Any:
+        """Choose observations that the model has seen, evenly over their time, oldest first; None if there are none."""
+        if self._count == 0:
+            return None
+        chosen = np.linspace(0, self._count - 1, self.columns).round().astype(int)
         if self._buffer is None:
-            kept = np.array(self._latest)
-            return kept[np.linspace(0, len(kept) - 1, n if len(kept) else 0).round().astype(int)]
-        rows, env_inds, _ = stored_places(self._buffer)
-        chosen = np.linspace(len(rows) - 1, 0, n if len(rows) else 0).round().astype(int)
-        found: Any = transitions(self._buffer, rows[chosen], env_inds[chosen]).observations
-        return {k: v.cpu().numpy() for k, v in found.items()} if isinstance(found, dict) else found.cpu().numpy()
+            return np.array(self._latest)[chosen]
+        rows, env_inds, _ = (part[::-1][chosen] for part in stored_places(self._buffer))
+        return as_arrays(transitions(self._buffer, rows, env_inds).observations)
 
 
 def _true_state(
     eval_env: gym.Env, state: Callable[[gym.Env], np.ndarray] | None, names: Sequence[str] | None
 ) -> tuple[Callable[[gym.Env], np.ndarray], list[str], list[str] | None]:
-    """What tells the true state, its names and its units: what was given, or else dm_control's."""
+    """State function, names and units: those given, or dm_control's."""
     if (state is None) != (names is None):
         raise ValueError("state and names belong together: a function of the environment, and what it returns.")
     if state is None or names is None:
@@ -426,11 +429,11 @@ def _true_state(
 
 class CuriosityMapCallback(RolloutCallback):
     """
-    Map where each policy goes and what SRL error it meets there: ``curiosity_map_<steps>_steps.png``.
+    Map where each policy goes and its SRL error there: ``curiosity_map_<steps>_steps.png``.
 
     Each policy acts alone for some episodes; the map is drawn over two coordinates of the environment's true state,
     which the agent does not see. Without an SRL head only visits are drawn. CURL's error is measured against an even
-    mix of what the policies see (``sb3_cure.evaluation.rollouts.even_negatives``).
+    mix of what the policies see (``sb3_cure.evaluation.rollouts.balance_negatives``).
 
     :param eval_env: One (not vectorised) environment, not the training one
     :param folder: Where to write
@@ -438,7 +441,7 @@ class CuriosityMapCallback(RolloutCallback):
     :param coordinates: Names of the two coordinates; by default two that suit the domain, or the first two
     :param state: Function of the environment that returns its true state, [d]; by default that of dm_control:
         positions and velocities of the joints, see ``sb3_cure.envs.physics_state``
-    :param names: Names of what ``state`` returns, [d], to be given with it
+    :param names: Names of what ``state`` returns, [d], required with it
     :param bins: Bins along each axis
     :param kwargs: ``actors``, ``n_episodes``, ``deterministic``, ``seed``, ``verbose`` of ``RolloutCallback``;
         verbose=1 prints the name of each map
@@ -468,44 +471,38 @@ class CuriosityMapCallback(RolloutCallback):
 
     def on_period(self) -> None:
         """Roll out each policy and draw."""
-        self.visits = {}
-        with evenly_measured(self.model, self.eval_env, self.seed):
-            for actor in self.actors or ():
-                pairs = [(episode.states, episode.srl_errors) for episode in self.run(actor, states=self.state)]
-                states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-                self.visits[actor] = self._finite(actor, states, errors)
-        if not any(len(states) for states, _ in self.visits.values()):
-            return
-        steps = self.num_timesteps
         from sb3_cure.evaluation import plots
 
-        plots.curiosity_map(
-            _file(self, self.folder, f"curiosity_map_{steps}_steps.png"),
-            self.visits,
-            self.names,
-            f"Where policies go with {self._actions} after {steps:,} agent steps",
-            coordinates=self.coordinates,
-            units=self.units,
-            bins=self.bins,
-        )
-
-    def _finite(self, actor: str, states: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Without the states that have no place on a map: that is no reason to end a training."""
-        good = np.isfinite(states).all(axis=1)
-        if not good.all():
-            left_out = f"{np.count_nonzero(~good)} of {len(states)} states of the {actor} policy"
-            warnings.warn(f"CuriosityMapCallback leaves out {left_out}, which are not finite.", stacklevel=2)
-        return states[good], errors[good] if len(errors) else errors
+        self.visits = {}
+        with evenly_measured(self.model, self.eval_env, self.seed):
+            for actor in self.actors:
+                pairs = [(episode.states, episode.srl_errors) for episode in self.run(actor, states=self.state)]
+                states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+                finite = np.isfinite(states).all(axis=1)
+                if not finite.all():
+                    left_out = f"{np.count_nonzero(~finite)} of {len(states)} states of the {actor} policy"
+                    warnings.warn(f"CuriosityMapCallback leaves out {left_out}, which are not finite.", stacklevel=2)
+                self.visits[actor] = states[finite], errors[finite] if len(errors) else errors
+        if any(len(states) for states, _ in self.visits.values()):
+            plots.curiosity_map(
+                self._path(self.folder, f"curiosity_map_{self.num_timesteps}_steps.png"),
+                self.visits,
+                self.names,
+                f"Where policies go with {self._actions} after {self.num_timesteps:,} agent steps",
+                coordinates=self.coordinates,
+                units=self.units,
+                bins=self.bins,
+            )
 
 
 class StateProbeCallback(RolloutCallback):
     """
-    Measure what the latents tell of the true state, which the agent does not see: R² of each coordinate by a linear map
-    (``sb3_cure.evaluation.rollouts.state_probe``).
+    Measure how well a linear map of the latents predicts the true state, which the agent does not see.
 
-    Logs ``probe/<name>`` and their mean ``probe/mean``, and writes ``state_probe.csv``, a row per time, and
-    ``state_probe.png``, bars of the first and of the latest time. In a new training the first row is that of the
-    untrained encoder. By default all rows are of the same episodes of random actions, so that they can be compared.
+    Logs R² of each coordinate, ``probe/<name>`` (``sb3_cure.evaluation.rollouts.state_probe``), and their mean,
+    ``probe/mean``; long names are not printed. Writes ``state_probe.csv``, a row per time, and ``state_probe.png``,
+    bars of the first and of the latest time. In a new training the first row is that of the untrained encoder. By
+    default all rows are of the same episodes of random actions, so that they can be compared.
 
     :param eval_env: One (not vectorised) environment, not the training one
     :param folder: Where to write
@@ -513,9 +510,9 @@ class StateProbeCallback(RolloutCallback):
     :param n_episodes: Episodes per policy, two at least
     :param state: Function of the environment that returns its true state, [d]; by default that of dm_control:
         positions and velocities of the joints, see ``sb3_cure.envs.physics_state``
-    :param names: Names of what ``state`` returns, [d], to be given with it; none of it is then taken for an angle
+    :param names: Names of what ``state`` returns, [d], required with it; none of them counts as an angle
     :param seed: Seed of the first reset and of the random actions each time
-    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``, whose episodes are read together
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; their episodes are taken together
     :param kwargs: ``deterministic``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the names of the files
     :raises ValueError: if the environment's state is unknown, or ``state`` comes without ``names``
     :raises ImportError: if matplotlib is not installed
@@ -548,25 +545,25 @@ class StateProbeCallback(RolloutCallback):
 
     def on_period(self) -> None:
         """Measure, log and draw."""
-        episodes = (episode for actor in self.actors or () for episode in self.run(actor, states=self.state))
-        found = state_probe(self.model, episodes, self.names, self.units)
-        for name, value in {**found, "mean": float(np.nanmean(list(found.values())))}.items():
-            self.logger.record(f"probe/{name}", value)
-        self.rows.append({"timesteps": self.num_timesteps, **found})
-        write_csv(_file(self, self.folder, "state_probe.csv"), list(self.rows[0]), self.rows)
-        shown = {f"{row['timesteps']:,} agent steps": row for row in (self.rows[0], self.rows[-1])}
         from sb3_cure.evaluation import plots
 
+        episodes = (episode for actor in self.actors for episode in self.run(actor, states=self.state))
+        found = state_probe(self.model, episodes, self.names, self.units)
+        for name, value in {**found, "mean": float(np.nanmean(list(found.values())))}.items():
+            self.logger.record(f"probe/{name}", value, exclude=("stdout", "log") if len(name) > PRINTED_NAME else ())
+        self.rows.append({"timesteps": self.num_timesteps, **found})
+        write_csv(self._path(self.folder, "state_probe.csv"), list(self.rows[0]), self.rows)
+        first, last = self.rows[0], self.rows[-1]
         plots.state_probe_bars(
-            _file(self, self.folder, "state_probe.png"),
-            {label: {name: row[name] for name in self.names} for label, row in shown.items()},
-            "What a linear map reads of the true state in the latents",
+            self._path(self.folder, "state_probe.png"),
+            {f"{row['timesteps']:,} agent steps": {name: row[name] for name in self.names} for row in (first, last)},
+            "R² of the true state, predicted from the latents by a linear map",
         )
 
 
 class DiagnosticsCallback(PeriodicCallback):
     """
-    Warns, once each, of what spoils training from pixels without an error.
+    Warn, once each, of problems that spoil training from pixels without an error.
 
     ========================  ============================================================================
     ``constant_image``        All recent observations of an environment are equal
@@ -578,15 +575,14 @@ class DiagnosticsCallback(PeriodicCallback):
     ``software_rendering``    The CPU draws the frames although there is a GPU
     ========================  ============================================================================
 
-    Works with every off-policy algorithm of SB3; what does not apply is left out. Each number is logged as
-    ``diagnostics/<name>``; what they are and why the thresholds lie where they do: see
-    ``sb3_cure.evaluation.diagnostics``.
+    Works with every off-policy algorithm of SB3; checks that do not apply are left out. Each number is logged as
+    ``diagnostics/<name>``; ``sb3_cure.evaluation.diagnostics`` defines them and gives reasons for the thresholds.
     A look takes less time than one update with a batch of ``n_samples``.
 
     :param every: Agent steps between two looks
     :param n_samples: Observations of the replay buffer to look at
     :param min_updates: Updates before networks, temperatures and the curious reward are judged: in the first hundreds
-        latents may collapse and come back
+        latents may collapse and recover
     :param autoencoder_updates: Updates before the autoencoder is judged: before a few thousand it is no better than
         the mean image in good runs either
     :param temperature_bounds: Least and greatest temperature that can still weigh entropy against reward
@@ -603,11 +599,12 @@ class DiagnosticsCallback(PeriodicCallback):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        low, high = map(float, temperature_bounds)  # of texts, too, as YAML reads 1e-4
+        low, high = map(float, temperature_bounds)  # also of strings, as YAML reads 1e-4
         self._arguments = n_samples, min_updates, autoencoder_updates, (low, high)
-        #: What was warned of
+        #: Names of the problems that were warned of
         self.warned: list[str] = []
         self._rendering: list[diagnostics.Finding] = []
+        self._reward_std: Any = None
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -615,14 +612,18 @@ class DiagnosticsCallback(PeriodicCallback):
         self._rendering = [] if rendering is None else [rendering]
         self._report(self._rendering)
 
+    def _on_step(self) -> bool:
+        # At each step, as the logger forgets what it has written
+        self._reward_std = self.logger.name_to_value.get("train/curious_reward_std", self._reward_std)
+        return super()._on_step()
+
     def on_period(self) -> None:
         """Look, log and warn."""
         findings = list(self._rendering)
-        for finding in diagnostics.look(self.model, *self._arguments):
-            if finding is not None:
-                findings.append(finding)
-                if finding.problem:
-                    break
+        for finding in filter(None, diagnostics.look(self.model, self._reward_std, *self._arguments)):
+            findings.append(finding)
+            if finding.problem is not None:
+                break
         self._report(findings)
         if self.verbose >= 1:
             print(", ".join(f"{finding.name} {finding.value:.3g}" for finding in findings))

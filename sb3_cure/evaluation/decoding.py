@@ -1,4 +1,4 @@
-"""What do the latents know of the image? A decoder fitted afterwards, on a frozen encoder."""
+"""Decoders fitted afterwards to the latents of a frozen encoder, to see what these hold of the image."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,18 +8,21 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.cure.policies import CuRePolicy, encoder_of
+from sb3_cure.cure.policies import CuRePolicy
+from sb3_cure.data.observations import by_key
+from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.networks.decoders import PixelDecoder
 
 
 def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int = 1000, key: str = "") -> nn.Module:
-    """A decoder that draws the encoder's inputs from its latents; the encoder is not trained by it.
+    """
+    Fit a decoder of the encoder's inputs to its latents; the encoder is not trained.
 
-    :param model: A model of any SB3 algorithm that learns from images with an encoder (``policies.encoder_of``)
+    :param model: A model of any SB3 algorithm that learns from images with an encoder (``encoder_of``)
     :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W] or such by key, on the
         model's device
     :param updates: Updates of the decoder, of 64 observations each
-    :param key: Of the image that is drawn, where observations are dictionaries
+    :param key: Key of the image to reconstruct, if observations are dictionaries
     :return: The decoder: latents -> images in [-0.5, 0.5]
     :raises ValueError: if the model has no encoder
     """
@@ -42,11 +45,13 @@ def draw_latents(
     model: BaseAlgorithm, decoder: nn.Module, observations: Any, key: str = ""
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    :param model: The model whose latents are drawn
+    Reconstruct observations from their latents.
+
+    :param model: The model that makes the latents
     :param decoder: Its decoder, of ``fit_decoder``
     :param observations: Observations as stored, 0-255, [B, C, H, W] or such by key
-    :param key: As of ``fit_decoder``
-    :return: What the encoder sees of them (a crop, say) and what is drawn from its latents, both 0-255, [B, C, h, w]
+    :param key: As for ``fit_decoder``
+    :return: What the encoder sees of them (a crop, say) and its reconstruction, both 0-255, [B, C, h, w]
     """
     images, latents = _images_and_latents(model, observations, key)
     return images * 255, (decoder(latents) + 0.5).clamp(0, 1) * 255
@@ -54,12 +59,10 @@ def draw_latents(
 
 @th.no_grad()
 def _images_and_latents(model: BaseAlgorithm, observations: Any, key: str) -> tuple[th.Tensor, th.Tensor]:
-    """What the encoder sees of observations, in [0, 1], and what it makes of that."""
+    """What the encoder sees of observations, in [0, 1], and its latents."""
     policy: Any = model.policy
-    if isinstance(policy, CuRePolicy):
-        views = policy.center(observations)
-        return (views[key] if key else views).float() / 255, policy.encoder(views)
     found = encoder_of(policy)
     if found is None:
-        raise ValueError(f"the {type(policy).__name__} has no encoder to draw from: use 'CnnPolicy'.")
-    return observations.float() / 255, found[1](observations)
+        raise ValueError(f"decoders need a policy with an encoder, which {type(policy).__name__} does not have.")
+    views = policy.augmentation.center(observations) if isinstance(policy, CuRePolicy) else observations
+    return by_key(views)[key].float() / 255, found[1](observations)

@@ -1,4 +1,4 @@
-"""A trained policy as a plain module, for ONNX, TorchScript and what else runs on a robot."""
+"""A trained policy as a plain module, for ONNX, TorchScript and other runtimes on a robot."""
 
 from typing import Any
 
@@ -13,9 +13,11 @@ from sb3_cure.evaluation.rollouts import trained_actors
 
 class DeterministicActor(nn.Module):
     """
-    What ``predict(observation, deterministic=True)`` computes, from a batch of observations to actions of the
-    environment, without random numbers and branches, so that ``torch.onnx.export``, ``torch.export`` and
-    ``torch.jit.trace`` can follow it. The networks are the model's own: train on, and it changes with them.
+    The deterministic policy of a model, from a batch of observations to actions of the environment.
+
+    Computes what ``predict(observation, deterministic=True)`` does without random numbers and branches, so that
+    ``torch.onnx.export``, ``torch.export`` and ``torch.jit.trace`` can follow it. It shares the model's networks, and
+    changes with them in further training.
 
     :param model: A trained model of this package, or of SB3's SAC or TQC
     :param actor: ``"task"`` or ``"curious"``; by default that of ``predict``
@@ -30,7 +32,7 @@ class DeterministicActor(nn.Module):
         trained = trained_actors(model)
         actor = trained[0] if actor is None else actor
         if actor not in trained:
-            raise ValueError(f"actor is {actor!r}, but this model has {' and '.join(map(repr, trained))}.")
+            raise ValueError(f"actor must be {' or '.join(map(repr, trained))} for this model, not {actor!r}.")
         policy: Any = model.policy
         self.actor: Any = policy.curious.actor if actor == "curious" else policy.actor
         # In a tuple, so that critics and decoder are no part of what is exported
@@ -45,15 +47,17 @@ class DeterministicActor(nn.Module):
     @th.no_grad()
     def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """
+        Compute actions.
+
         :param observations: As the agent sees them, [B, *shape], or a dictionary: images uint8, channels first
         :return: Actions within the environment's bounds, [B, *action shape]
         :raises ValueError: for images that are not uint8
         """
         for image in images_of(observations, self._observation_space).values():
             if image.dtype != th.uint8:
-                raise ValueError(f"observations are {image.dtype}, but images must be uint8: do not divide by 255.")
+                raise ValueError(f"images must be uint8, not {image.dtype}: do not divide them by 255.")
         (policy,) = self._policy
-        policy.set_training_mode(False)  # as `predict` does: the model may have trained on
+        policy.set_training_mode(False)  # as `predict` does, also after further training
         inputs: Any = observations if self.trunk is None else self.trunk(policy.center(observations))
         mean, *_ = self.actor.get_action_dist_params(inputs)
         scaled = 0.5 * (th.tanh(mean).view(-1, *self.low.shape) + 1)

@@ -1,7 +1,7 @@
-"""What goes wrong silently in training from pixels: criteria and thresholds of ``DiagnosticsCallback``.
+"""Silent failures of training from pixels: criteria and thresholds of ``DiagnosticsCallback``.
 
-Each check measures one number on observations that the agent has seen, and says in a sentence what is wrong if it is
-out of bounds. A check that does not apply to a model (no images, no autoencoder, no temperature) yields nothing.
+Each check measures one number on observations that the agent has seen, and describes the problem in a sentence if it
+is out of bounds. Checks that do not apply to a model (no images, no autoencoder, no temperature) return None.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,19 +13,21 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_cure.cure.policies import CuRePolicy, encoder_of
+from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import transitions
 from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.envs import render_check
+from sb3_cure.evaluation.encoding import encoder_of
+from sb3_cure.evaluation.rollouts import stored_places
 from sb3_cure.networks.layers import Conv2dReLU
 from sb3_cure.srl import RAE, DictHead
 
-#: Transitions, of all environments together, within which a constant image is looked for
+#: Latest transitions, of all environments together, that are checked for a constant image
 RECENT = 1000
-#: Observations of an environment that must be alike to count as constant: a robot may well lie still for a moment
+#: Observations of an environment that must be equal to count as constant: a robot may lie still for a moment
 MIN_ALIKE = 30
-#: Share of a layer's units that never fire. Half of them and more are silent in runs that learn well: where all
-#: pixels are positive and of few colours, many random filters are negative everywhere
+#: Share of a layer's units that never fire. Half of them and more are silent in runs that learn well: as pixels are
+#: positive and of few colours, many random filters are negative everywhere
 DEAD_SHARE = 0.9
 #: Deviation of the latents between observations, as a share of their root mean square. Runs that learn well were
 #: measured at 0.3 to 0.5 after 1000 updates; in their first 500 some fell to 0.004 and came back
@@ -41,7 +43,9 @@ CURIOUS_SHARE = 0.01
 
 class Finding(NamedTuple):
     """
-    :param name: What was looked for
+    Result of a check.
+
+    :param name: Name of the check
     :param value: The number that was measured
     :param problem: A sentence if the number is out of bounds, else None
     """
@@ -53,7 +57,9 @@ class Finding(NamedTuple):
 
 class Temperature(NamedTuple):
     """
-    :param agent: Whose it is: ``"task"`` or ``"curious"``
+    Temperature of an agent.
+
+    :param agent: ``"task"`` or ``"curious"``
     :param value: The entropy coefficient
     :param learned: Whether it is adjusted to an entropy
     :param log_prob: Log-probabilities of actions that the agent drew, [n]
@@ -67,18 +73,20 @@ class Temperature(NamedTuple):
 
 @th.no_grad()
 def look(
-    model: Any, n_samples: int, min_updates: int, autoencoder_updates: int, temperature_bounds: Sequence[float]
+    model: Any, reward_std: Any, n_samples: int, min_updates: int, autoencoder_updates: int, bounds: Sequence[float]
 ) -> Iterator[Finding | None]:
     """
-    Look at a model in training, from cause to effect. Stop at the first problem, which may explain what follows: behind
-    a constant image all latents are alike, beside a huge temperature no reward counts.
+    Look at a model in training, from cause to effect: a problem may explain those that follow.
+
+    Behind a constant image all latents are alike, and next to a huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or of this package
+    :param reward_std: Standard deviation of the curious reward, last logged; None before the first update
     :param n_samples: Observations to look at
     :param min_updates: Updates before networks and temperatures are judged
-    :param autoencoder_updates: Updates before the autoencoder is judged; its number is given from the start
-    :param temperature_bounds: Least and greatest temperature
-    :return: What was found; None where a check does not apply
+    :param autoencoder_updates: Updates before the autoencoder is judged
+    :param bounds: Least and greatest temperature
+    :return: Findings; None for checks that do not apply
     """
     yield constant_image(model, n_samples)
     if model._n_updates < max(min_updates, 1):
@@ -86,7 +94,7 @@ def look(
     model.policy.set_training_mode(False)
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    yield temperature_at_bound(temperatures, model, temperature_bounds)
+    yield temperature_at_bound(temperatures, model, bounds)
     encoded = _encode(model, batch)
     if encoded is not None:
         latents, silent = encoded
@@ -94,7 +102,7 @@ def look(
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
         yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
-    yield curious_reward(model, temperatures)
+    yield None if reward_std is None else curious_reward(float(reward_std), temperatures)
 
 
 # ------------------------------------------------------------------------ checks
@@ -102,36 +110,36 @@ def look(
 
 def constant_image(model: Any, n_samples: int) -> Finding | None:
     """
-    Environments whose latest images are equal in every bit, while nothing moves or the camera sees nothing.
+    Environments whose latest images are all equal, as nothing moves or the camera sees nothing.
 
-    Value: number of such environments, of dictionaries of their images. Expected: 0.
+    Value: number of such environments, or of their images for dictionaries. Expected: 0.
 
     :param model: The model
     :param n_samples: Observations to look at, of all environments together
     :return: None without images, or with fewer than ``MIN_ALIKE`` observations of each environment
     """
     buffer = model.replay_buffer
-    rows = min(buffer.size(), max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
-    if not image_spaces(model.observation_space) or rows < MIN_ALIKE:
+    rows, env_inds, _ = stored_places(buffer)
+    count = min(len(rows) // buffer.n_envs, max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
+    if not image_spaces(model.observation_space) or count < MIN_ALIKE:
         return None
-    chosen = np.linspace(0, rows - 1, min(rows, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
-    positions = (buffer.pos - 1 - chosen) % buffer.buffer_size
+    chosen = np.linspace(0, count - 1, min(count, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
     constant: list[str] = []
     for env in range(buffer.n_envs):
-        seen = transitions(buffer, positions, np.full(len(chosen), env)).observations
+        seen = transitions(buffer, rows[env_inds == env][chosen], np.full(len(chosen), env)).observations
         for key, images in images_of(seen, model.observation_space).items():
             if bool((images == images[:1]).all()):
                 constant.append(f"{env} ({key})" if key else f"{env}")
     problem = (
-        f"the last {rows} observations of environment {', '.join(constant)} are one and the same image: look at what "
-        "env.render() shows, and at camera_id."
+        f"the last {count} observations of environment {', '.join(constant)} are the same image: check what "
+        "env.render() shows, and camera_id."
     )
     return Finding("constant_image", len(constant), problem if constant else None)
 
 
 def dead_units(silent: dict[str, float]) -> Finding:
     """
-    ReLUs of the encoder (channels of convolutions) that are 0 for all observations, hence get no gradient.
+    ReLUs of the encoder (channels of convolutions) that are 0 for all observations and hence get no gradient.
 
     Value: the largest share of such units in a layer. Expected: below ``DEAD_SHARE``.
 
@@ -140,14 +148,14 @@ def dead_units(silent: dict[str, float]) -> Finding:
     layer = max(silent, key=lambda name: silent[name])
     problem = (
         f"{silent[layer]:.0%} of the units of the encoder's layer {layer!r} are 0 for every observation and no longer "
-        "learn: start anew with a smaller learning_rate, or clip or scale the rewards."
+        "learn: restart with a smaller learning_rate, or clip or scale the rewards."
     )
     return Finding("dead_units", silent[layer], problem if silent[layer] >= DEAD_SHARE else None)
 
 
 def collapsed_latents(latents: th.Tensor) -> Finding:
     """
-    Latents that are the same whatever is observed.
+    Latents that are the same for all observations.
 
     Value: standard deviation between observations over root mean square. Expected: at least ``LATENT_SPREAD``.
 
@@ -156,7 +164,7 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
     deviation, size = latents.var(dim=0, correction=0).mean().sqrt(), latents.square().mean().sqrt()
     spread = float(deviation / size.clamp(min=1e-12))
     problem = (
-        f"the encoder's latents differ by {spread:.1e} of their size between observations, but should by "
+        f"the encoder's latents differ by {spread:.1e} of their size between observations, not by "
         f"{LATENT_SPREAD} at least: try a smaller learning_rate, or another srl head or srl_kwargs."
     )
     return Finding("collapsed_latents", spread, problem if spread < LATENT_SPREAD else None)
@@ -164,18 +172,18 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
 
 def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
     """
-    An autoencoder no better than the mean image, which is the best of all constant drawings.
+    An autoencoder no better than the mean image, which is the best constant reconstruction.
 
-    Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` once there
-    was time to learn; early on it is below 0.
+    Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` after some
+    thousand updates; early on it is below 0.
 
     :param explained: The value
     :param updates: Updates that were made
     :param min_updates: Updates after which it is judged
     """
     problem = (
-        f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, but should "
-        f"explain {EXPLAINED_SHARE} at least: try another learning_rate, more filters, or srl='curl'."
+        f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, not "
+        f"{EXPLAINED_SHARE} at least: try another learning_rate, more filters, or srl='curl'."
     )
     is_bad = updates >= min_updates and explained < EXPLAINED_SHARE
     return Finding("autoencoder", explained, problem if is_bad else None)
@@ -185,12 +193,12 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
     """
     Temperatures that no longer weigh entropy against reward.
 
-    SAC bounds its temperature nowhere but at 0, to which it falls where the policy stays more random than the target
-    entropy asks whatever the temperature (no reward to be found, say); it rises without limit where the policy cannot
-    become as random as the target. So a learned one counts as at its bound when it lies outside of ``bounds`` *and*
-    the policy's entropy misses its target by ``ENTROPY_GAP`` nats per action dimension in the direction that drives it
-    further out: small rewards alone need a small temperature, and with it the policy meets the target. A fixed one
-    counts when it lies outside of ``bounds``, unless it is 0, which turns the entropy off.
+    SAC's temperature falls towards 0 if the policy stays more random than the target entropy at any temperature (say,
+    without any reward), and rises without limit if the policy cannot become as random as the target. So a learned one
+    counts as at its bound when it lies outside of ``bounds`` *and* the policy's entropy misses its target by
+    ``ENTROPY_GAP`` nats per action dimension in the direction that drives it further out: small rewards alone need a
+    small temperature, and with it the policy meets the target. A fixed one counts when it lies outside of ``bounds``,
+    unless it is 0, which turns the entropy off.
 
     Value: number of temperatures at a bound. Expected: 0.
 
@@ -207,28 +215,26 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
         how, advice = "is fixed at", "use ent_coef='auto', or scale the rewards"
         if learned:
             too_low, too_high = too_low and gap > ENTROPY_GAP, too_high and gap < -ENTROPY_GAP
-            how = f"lets the entropy be {entropy:.1f} where {target:.1f} is the target, and has run to"
-            advice = "see whether it finds any reward" if too_low else "set a smaller target_entropy"
+            how = f"has reached, with an entropy of {entropy:.1f} and a target of {target:.1f},"
+            advice = "check whether it finds any reward" if too_low else "set a smaller target_entropy"
         if (too_low or too_high) and (learned or value != 0):
-            expected = f"{value:.1e}, but {bounds[0]:g} to {bounds[1]:g} was expected: {advice}"
-            problems.append(f"the temperature of the {agent} agent {how} {expected}.")
+            expected = f"not in [{bounds[0]:g}, {bounds[1]:g}]: {advice}"
+            problems.append(f"the temperature of the {agent} agent {how} {value:.1e}, {expected}.")
     return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
 
 
-def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding | None:
+def curious_reward(deviation: float, temperatures: Sequence[Temperature]) -> Finding | None:
     """
-    A curious reward so small beside the entropy term that its agent acts at random.
+    A curious reward so small compared with the entropy term that its agent acts at random.
 
-    Value: standard deviation of the curious reward in the latest update over the mean of |temperature *
-    log-probability| (what all observations earn alike steers nothing). Expected: at least ``CURIOUS_SHARE``.
+    Value: standard deviation of the curious reward over the mean of |temperature * log-probability| (what all
+    observations earn alike has no effect). Expected: at least ``CURIOUS_SHARE``.
 
-    :param model: The model
+    :param deviation: Standard deviation of the reward
     :param temperatures: Of the agents that are trained; the last one is the agent that gets the reward
-    :return: None without curiosity, without entropy term, or before the first update
+    :return: None without entropy term
     """
-    latest = model._metrics.latest if getattr(model.policy, "intrinsic", None) is not None else {}
-    deviation = float(latest.get("train/curious_reward_std", np.nan))
-    if np.isnan(deviation) or not temperatures or temperatures[-1].value == 0:
+    if not temperatures or temperatures[-1].value == 0:
         return None
     entropy = float((temperatures[-1].value * temperatures[-1].log_prob).abs().mean())
     ratio = deviation / max(entropy, 1e-12)
@@ -241,13 +247,13 @@ def curious_reward(model: Any, temperatures: Sequence[Temperature]) -> Finding |
 
 def software_rendering(env: VecEnv) -> Finding | None:
     """
-    Frames that the CPU draws on a machine with a GPU.
+    Frames that the CPU renders on a machine with a GPU.
 
-    Value: 1 if so, else 0. OpenGL is asked in a process of its own, which takes a few seconds, on machines with a GPU
-    only.
+    Value: 1 if so, else 0. A process of its own renders with OpenGL, which takes a few seconds, only on machines with a
+    GPU.
 
     :param env: Training environments
-    :return: None without a GPU, without images, or where the environments do not render MuJoCo by OpenGL
+    :return: None without a GPU, without images, or if the environments do not render MuJoCo by OpenGL
     """
     gpus = render_check.find_gpus()
     renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
@@ -262,7 +268,7 @@ def software_rendering(env: VecEnv) -> Finding | None:
 
 
 def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str, float]] | None:
-    """Latents, [n, features_dim], and for each ReLU of the encoder the share of its units that never fire."""
+    """Compute latents, [n, features_dim], and for each ReLU of the encoder the share of its units that never fire."""
     found = encoder_of(model.policy)
     if found is None:
         return None
@@ -285,8 +291,14 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
-    """Share of the targets' variance that the autoencoder's drawings explain, of several images that of the worst; None
-    for heads that are not ``RAE``, and of images without any variance."""
+    """
+    Share of the targets' variance that the autoencoder explains; the least share if there are several images.
+
+    :param model: The model
+    :param batch: Transitions
+    :param latents: Their latents, [n, features_dim]
+    :return: None for heads that are not ``RAE``, and for images without any variance
+    """
     head = getattr(model.policy, "srl", None)
     parts: list[Any] = head.parts(latents) if isinstance(head, DictHead) else [("", head, latents)]
     if not all(isinstance(each, RAE) for _, each, _ in parts):
@@ -302,7 +314,7 @@ def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) 
 
 
 def _temperatures(model: Any, batch: ReplayBufferSamples) -> Iterator[Temperature]:
-    """Of the agents that are trained, the curious one last."""
+    """Temperatures of the agents that are trained, the curious one last."""
     if isinstance(model.policy, CuRePolicy):
         features = model.policy.encoder.trunk(model.policy.center(batch.observations))
         for name, agent in model.policy.agents.items():

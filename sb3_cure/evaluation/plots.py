@@ -1,4 +1,4 @@
-"""Figures of the experiments, in one style. Each function takes numbers and writes one PNG of 256 colours."""
+"""Figures in one style. Each function takes numbers and writes one PNG of 256 colours."""
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,33 +16,34 @@ from matplotlib.ticker import EngFormatter
 from PIL import Image
 
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
-from sb3_cure.evaluation.rollouts import Uncomfortable, binned_errors
+from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 
 #: Matplotlib style file of all figures: ``plt.style.use(STYLE)``
 STYLE = Path(__file__).with_name("plots.mplstyle")
 #: Colour of each policy
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
-#: Where colours are taken by arms
+#: Line style of each policy, if colours stand for arms
 LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
 _ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
 
-#: Arm, actor, ends of the error bar (None: none), the values whose mean is shown (one per seed), and what is written
-#: above
+#: Arm, actor, ends of the error bar or None, values whose mean is shown (one per seed), and text above
 Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
 PathOrFile: TypeAlias = Path | IO[bytes]
 
 
-#: Decorates what draws
+#: Decorator of functions that draw
 in_style = style.context(STYLE)
 
 
 def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) -> None:
     """
+    Save a figure as PNG of 256 colours, a quarter of the size of all colours.
+
     :param figure: A figure
-    :param path: File to write: 256 colours take a quarter of the room
+    :param path: File to write
     :param dpi: Pixels per inch
-    :param tight: Whether to fit the paper to what is drawn
+    :param tight: Whether to crop the margins
     """
     file = io.BytesIO()
     figure.savefig(file, dpi=dpi, bbox_inches="tight" if tight else None)
@@ -52,7 +53,7 @@ def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) 
 
 
 def _plain(text: str) -> str:
-    """Names are no formulas: matplotlib reads between dollar signs, and hides what begins with an underscore."""
+    """Escape a name: matplotlib takes dollar signs for formulas, and hides names that begin with an underscore."""
     return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
@@ -61,16 +62,19 @@ def _plain(text: str) -> str:
 
 def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     """
+    Choose a colour for each arm.
+
     :param methods: Arms of an experiment
     :param baseline: The one that the others are compared with: grey
-    :return: A colour for each; after thirteen of them they repeat
+    :return: Colours by arm; after thirteen of them they repeat
     """
     names = [method for method in methods if method != baseline]
     return {baseline: "#555555", **{name: _ARM_COLORS[index % 13] for index, name in enumerate(names)}}
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """Return (deterministic actions) over environment steps, with the random policy as a line.
+    """
+    Return (deterministic actions) over environment steps, with a line for the random policy.
 
     :param path: File to write
     :param rows: Evaluations with ``environment_steps`` and ``task_return``
@@ -78,10 +82,9 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     :param title: Title of the figure
     """
     steps = np.array([row["environment_steps"] for row in rows])
-    returns = {"task": np.array([[row["task_return"] for row in rows]])}
-    returns["random"] = np.full((1, len(rows)), random_return)
-    curves = {f"{actor} policy": (steps, values) for actor, values in returns.items()}
-    colors = {f"{actor} policy": COLORS[actor] for actor in returns}
+    returns = np.array([[row["task_return"] for row in rows]])
+    curves = {"task policy": (steps, returns), "random policy": (steps, np.full(returns.shape, random_return))}
+    colors = {f"{actor} policy": color for actor, color in COLORS.items()}
     learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
 
 
@@ -92,7 +95,8 @@ def learning_curves(
     ylabel: str,
     logarithmic: bool = False,
 ) -> None:
-    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
+    """
+    One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
 
     :param path: File to write
     :param curves: By task and arm: environment steps [n] and values [seeds, n]
@@ -113,7 +117,8 @@ def policy_curves(
     logarithmic: bool,
     actors: Sequence[str] = (),
 ) -> None:
-    """As ``learning_curves``, with arms by colour and policies by line style.
+    """
+    As ``learning_curves``, with arms by colour and policies by line style.
 
     :param path: File to write
     :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
@@ -152,7 +157,8 @@ def paired_differences(
     colors: Mapping[str, str],
     xlabel: str,
 ) -> None:
-    """Differences from the baseline: one line each, with every pair of seeds as a dot.
+    """
+    Differences from the baseline, one line each, with every pair of seeds as a dot.
 
     :param path: File to write
     :param rows: Arm, label of the line, differences by pair, and their mean with its interval
@@ -183,7 +189,8 @@ def aggregate_scores(
     profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
     colors: Mapping[str, str],
 ) -> None:
-    """Interquartile means (left) and performance profiles (right) with their intervals.
+    """
+    Interquartile means (left) and performance profiles (right) with their intervals.
 
     :param path: File to write
     :param iqm: By arm: value, low, high
@@ -214,7 +221,8 @@ def aggregate_scores(
 def visitation_bars(
     path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
 ) -> None:
-    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
+    """
+    SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
     :param panels: By title: its bars
@@ -230,15 +238,16 @@ def actor_bars(
     ylabel: str,
     lines: Mapping[str, Mapping[str, float]] | None = None,
 ) -> None:
-    """Policies in groups of arms, coloured by actor.
+    """
+    Policies in groups of arms, coloured by actor.
 
-    A bar is as high as the mean; with lines across to compare with the axis is logarithmic, where bars have no foot, so
-    that a mark shows the mean.
+    Bars show means. With lines to compare with, the axis is logarithmic, without a zero for bars to begin at: marks
+    show the means.
 
     :param path: File to write
     :param panels: By title: its bars
     :param ylabel: What is measured
-    :param lines: By title: values to compare with, by name; None: none, and a linear axis
+    :param lines: By title: values to compare with, by name; None: no lines, and a linear axis
     """
     figure, places = _panels(len(panels), height=3.3)
     for axes, (title, rows) in zip(places, panels.items(), strict=True):
@@ -267,7 +276,7 @@ def actor_bars(
         means = [float(values.mean()) for *_, values, _ in rows]
         if lines is not None and max(means) > 0:
             axes.set_yscale("log")
-            # Of contrastive errors the lowest is often zero: keep the means in sight.
+            # The lowest contrastive error is often zero: keep the means in sight.
             least = min(mean for mean in means if mean > 0)
             axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
@@ -278,12 +287,14 @@ def actor_bars(
 
 @in_style
 def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]], title: str) -> None:
-    """R² of each coordinate of the true state, a bar for each probe.
+    """
+    R² of each coordinate of the true state, a bar for each probe.
 
-    Bars end at -0.1: how much worse than the mean a prediction is tells nothing more; the number stands beside it.
+    Bars end at -0.1, as it does not matter how much worse than the mean a prediction is; numbers are written next to
+    them.
 
     :param path: File to write
-    :param probes: By what is compared (times of training, heads): R² by coordinate, of ``evaluation.state_probe``
+    :param probes: By label (times of training, heads): R² by coordinate, of ``evaluation.state_probe``
     :param title: Title of the figure
     """
     names = list(next(iter(probes.values())))
@@ -307,7 +318,7 @@ def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]]
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with so many axes, at most three in a row, as wide as a page."""
+    """Make a figure with a number of axes, at most three in a row, as wide as a page."""
     columns = min(count, 3)
     rows = -(-count // columns)
     figure = Figure(figsize=({1: 6.5, 2: 9.0, 3: 11.0}[columns], height * rows + 0.5))
@@ -318,7 +329,7 @@ def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """What any panel shows, once, below all of them."""
+    """Draw one legend of all panels below them."""
     shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     _legend(figure, shown)
 
@@ -332,15 +343,12 @@ def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
 # Images
 
 
-def _picture(image: np.ndarray) -> np.ndarray:
-    """For ``imshow``: [H, W, 3], or [H, W] if there is one channel."""
-    return image[..., 0] if image.shape[-1] == 1 else image
-
-
 def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
-    """Images [C, H, W] of one or three channels, side by side."""
+    """Show images [C, H, W] of one or three channels in a row."""
     strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
-    axes.imshow(_picture(strip), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
+    axes.imshow(
+        strip.squeeze(-1) if strip.shape[-1] == 1 else strip, cmap="gray", vmin=0, vmax=255, interpolation="nearest"
+    )
     axes.tick_params(bottom=False, labelbottom=False)
     axes.grid(False)
     axes.spines[:].set_visible(False)
@@ -350,11 +358,12 @@ def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
 def reconstructions_over_training(
     path: Path, observed: np.ndarray, rows: Sequence[tuple[int, np.ndarray]], title: str
 ) -> None:
-    """The same observations as they are drawn at several times of training, one row each, below the observations.
+    """
+    Reconstructions of the same observations at several times of training, one row each, below the observations.
 
     :param path: File to write
     :param observed: One frame of each observation, uint8 [n, C, H, W] with C = 1 or 3
-    :param rows: Agent steps of training, and what is drawn then of the same shape
+    :param rows: Agent steps of training, and the reconstructions then, of the same shape
     :param title: Title of the figure
     """
     strips = {"seen by the agent": observed}
@@ -372,38 +381,39 @@ def reconstructions_over_training(
 
 
 @in_style
-def uncomfortable_frames(
-    path: Path, found: Uncomfortable, frame_stack: int, title: str, drawn: np.ndarray | None = None
+def highest_error_frames(
+    path: Path, found: HighestErrors, frame_stack: int, title: str, drawn: np.ndarray | None = None
 ) -> None:
-    """The observations with the highest SRL error, worst first, each with its error and age.
+    """
+    The observations with the highest SRL error, highest first, each with its error and age.
 
     :param path: File to write
-    :param found: What ``sb3_cure.evaluation.rollouts.most_uncomfortable`` found, of images
+    :param found: Result of ``sb3_cure.evaluation.highest_errors`` for images
     :param frame_stack: Frames per observation, of which the newest is shown
     :param title: Title of the figure
-    :param drawn: Their reconstructions, shown beside them, uint8 like ``found.observations``, or None
-    :raises ValueError: if the observations are not so many frames, grey or in colour
+    :param drawn: Their reconstructions, shown on the right of each, uint8 like ``found.observations``, or None
+    :raises ValueError: if ``frame_stack`` does not divide the channels into frames, grey or in colour
     """
-    channels, left_over = divmod(found.observations.shape[1], frame_stack)
+    n_channels = found.observations.shape[1]
+    channels, left_over = divmod(n_channels, frame_stack)
     if left_over or channels not in (1, 3, 4):
-        raise ValueError(
-            f"frame_stack is {frame_stack}, but the observations have {found.observations.shape[1]} channels, of which "
-            "each frame takes 3, or 1 if it is grey: give the environment's frame_stack."
-        )
+        raise ValueError(f"frame_stack={frame_stack} does not divide {n_channels} channels into frames of 1 or 3.")
     pairs = [found.observations] if drawn is None else [found.observations, drawn]
     columns = min(len(found.errors), 8 if drawn is None else 4)
     n_rows = -(-len(found.errors) // columns)
     figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5))
     grid = figure.subplots(n_rows, columns, squeeze=False).flat
-    for place in grid:
-        place.set_axis_off()
-    gap = np.full((channels, found.observations.shape[2], 1), 255, np.uint8)
+    for axes in grid:
+        axes.set_axis_off()
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
-        frames = [images[index, -channels:] for images in pairs]
-        _show(grid[index], [frames[0], *(part for each in frames[1:] for part in (gap, each))])
+        # A white column on the right of each frame
+        _show(
+            grid[index],
+            [np.pad(images[index, -channels:], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs],
+        )
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
-    note += f", and how many times the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
+    note += f", and its multiple of the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
     figure.suptitle(f"{title}\n{note}", fontsize=10, wrap=True)
     save(figure, path, 120)
 
@@ -418,7 +428,8 @@ def curiosity_map(
     units: Sequence[str] | None = None,
     bins: int = 24,
 ) -> None:
-    """Where each policy goes and what SRL error it meets there, over two coordinates of the true state.
+    """
+    Where each policy goes and its SRL error there, over two coordinates of the true state.
 
     One row per policy: on the left the number of steps in each bin, on the right their mean SRL error (left out if no
     policy has errors). Axes and colours are the same for all policies.
@@ -436,11 +447,10 @@ def curiosity_map(
     check_coordinates(coordinates, names)
     columns = [list(names).index(name) for name in coordinates]
     both = [None if units is None else units[column] for column in columns]
-    places = {actor: states[:, columns] for actor, (states, _) in visits.items()}
-    seen = np.concatenate(list(places.values()))
+    seen = np.concatenate([states[:, columns] for states, _ in visits.values()])
     x_edges, y_edges = (np.linspace(*_span(seen[:, axis], both[axis]), bins + 1) for axis in (0, 1))
     edges = x_edges, y_edges
-    binned = {actor: binned_errors(places[actor], errors, edges) for actor, (_, errors) in visits.items()}
+    binned = {actor: binned_errors(states[:, columns], errors, edges) for actor, (states, errors) in visits.items()}
 
     means = np.concatenate([mean[np.isfinite(mean)] for _, mean in binned.values()])
     kinds = ["steps in bin"] + (["mean error"] if len(means) else [])
@@ -465,13 +475,13 @@ def curiosity_map(
             ticks = [count * 10**power for power in range(9) for count in (1, 2, 5) if count * 10**power <= most]
             bar.set_ticks(ticks, labels=[f"{tick:,}" for tick in ticks])
             bar.ax.minorticks_off()
-    n_steps = ", ".join(f"{actor} {len(states):,}" for actor, states in places.items())
+    n_steps = ", ".join(f"{actor} {len(states):,}" for actor, (states, _) in visits.items())
     figure.suptitle(f"{title}\nsteps: {n_steps}; grey: never visited", wrap=True)
     save(figure, path, 120, tight=True)
 
 
 def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
-    """Ends of an axis: the full circle for angles, else from the least to the greatest value."""
+    """Ends of an axis: the full circle for angles, else the least and the greatest value."""
     low, high = float(values.min()), float(values.max())
     if unit == "rad" and max(-low, high) <= np.float32(np.pi):
         return -np.pi, np.pi
@@ -481,7 +491,7 @@ def _span(values: np.ndarray, unit: str | None) -> tuple[float, float]:
 def _name_axes(
     axes: Axes, coordinates: tuple[str, str], units: Sequence[str | None], edges: Sequence[np.ndarray]
 ) -> None:
-    """Labels with units; angles have ticks at multiples of pi / 2."""
+    """Label axes with units, and angles at multiples of pi / 2."""
     labels = coordinate_labels(coordinates)
     for axis, label, unit, ends in zip((axes.xaxis, axes.yaxis), labels, units, edges, strict=True):
         axis.set_label_text(f"{label} [{unit}]" if unit else label)

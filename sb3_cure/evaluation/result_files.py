@@ -1,4 +1,4 @@
-"""Files of results: written whole or not at all, and what every result says about where it comes from."""
+"""Files of results, written whole or not at all, and the versions, machine and commit that made them."""
 
 import csv
 import io
@@ -17,13 +17,15 @@ import sb3_cure
 from sb3_cure.persistence.files import replacing
 
 Row = dict[str, Any]
-#: What decides what is computed: algorithms, physics, pixels
+#: Packages that decide what is computed: algorithms, physics, pixels
 _DEPENDENCIES = ("stable_baselines3", "sb3_contrib", "torch", "numpy", "gymnasium", "shimmy", "dm_control", "mujoco")
 
 
 def describe_run() -> dict[str, Any]:
     """
-    :return: Versions, machine and commit, to be kept beside results
+    Describe what makes a result.
+
+    :return: Versions, machine, GPU and commit
     """
     return {
         "versions": {
@@ -39,7 +41,9 @@ def describe_run() -> dict[str, Any]:
 
 def cpu_info() -> dict[str, str]:
     """
-    :return: What Linux tells of the first processor, by field; empty elsewhere
+    Read Linux's description of the first processor.
+
+    :return: Values by field; empty on other systems
     """
     info = Path("/proc/cpuinfo")
     lines = info.read_text().split("\n\n")[0].splitlines() if info.exists() else []
@@ -48,7 +52,9 @@ def cpu_info() -> dict[str, str]:
 
 def processor() -> str:
     """
-    :return: Its name, and the numbers that tell its generation: some of several generations bear one name
+    Name the processor, with its family and model: several generations may have one name.
+
+    :return: The name
     """
     info = cpu_info()
     if "model name" not in info:
@@ -59,9 +65,10 @@ def processor() -> str:
 
 def code_commit() -> str | None:
     """
-    :return: Commit of what runs: as ``SB3_CURE_COMMIT`` says (an image without a checkout sets it), else of the
-        checkout that the package lies in, marked where it has changes, else of the repository that pip installed it
-        from; None where nothing tells
+    Find the commit of the running code.
+
+    :return: ``SB3_CURE_COMMIT`` (set in images without a checkout), else the commit of the package's checkout, marked
+        if it has changes, else that of the repository that pip installed it from; None if unknown
     """
     commit = os.environ.get("SB3_CURE_COMMIT") or checkout_commit(Path(sb3_cure.__file__).parent.parent)
     if commit:
@@ -75,8 +82,10 @@ def code_commit() -> str | None:
 
 def checkout_commit(folder: Path) -> str | None:
     """
-    :param folder: A checkout, its uppermost folder
-    :return: Its commit, marked where it has changes; None if it is no checkout
+    Find the commit of a checkout.
+
+    :param folder: Its uppermost folder
+    :return: Its commit, marked if it has changes; None if it is no checkout
     """
     if not (folder / ".git").exists():  # git would look in the folders above
         return None
@@ -87,16 +96,18 @@ def checkout_commit(folder: Path) -> str | None:
         return None
 
 
-# Of what runs: later the checkout may have moved on.
+# At import, as the checkout may be updated later
 _COMMIT = code_commit()
 
 
 def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     """
-    :param path: A CSV file
+    Read a CSV file.
+
+    :param path: The file
     :param needed: Columns that it must have
-    :return: Its rows; numbers are numbers, missing values ``""``
-    :raises ValueError: saying what of the file's form is wrong
+    :return: Its rows; numbers as int or float, missing values as ``""``
+    :raises ValueError: if the file is incomplete
     """
     text = path.read_text(encoding="utf-8")
     reader = csv.DictReader(io.StringIO(text, newline=""))
@@ -106,7 +117,7 @@ def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
     if any(None in row or None in row.values() for row in rows):
         raise ValueError("has a row that is shorter or longer than its header")
     if not text.endswith("\n"):
-        raise ValueError("ends within a line, whose last number may have lost digits")
+        raise ValueError("ends within a line, so that its last number may have lost digits")
     return [{key: _number(value) for key, value in row.items()} for row in rows]
 
 
@@ -120,29 +131,34 @@ def _number(text: str) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """All of it or nothing: written beside, then renamed.
+    """
+    Write a text file, whole or not at all.
 
     :param path: File to write
     :param text: Its content
     """
-    with replacing(path) as beside:
-        beside.write_text(text)
+    with replacing(path) as draft:
+        draft.write_text(text)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """
-    :param path: File to write, whole or not at all
-    :param content: Its content; what JSON does not know as a text
+    Write a JSON file, whole or not at all.
+
+    :param path: File to write
+    :param content: Its content; values unknown to JSON are written as strings
     """
     write_text(path, json.dumps(content, indent=2, default=str) + "\n")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
     """
-    :param path: File to write, whole or not at all
+    Write a CSV file, whole or not at all.
+
+    :param path: File to write
     :param columns: The header, and the order of the values
     :param rows: Mappings that have all columns
     """
     lines = [columns, *([row[column] for column in columns] for row in rows)]
-    with replacing(path) as beside, beside.open("w", newline="") as file:
+    with replacing(path) as draft, draft.open("w", newline="") as file:
         csv.writer(file).writerows(lines)

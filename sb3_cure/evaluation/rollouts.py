@@ -1,4 +1,4 @@
-"""Roll out one policy alone (task, curious or random) and measure what it earns and what SRL error it sees."""
+"""Roll out one policy alone (task, curious or random), and measure its returns and SRL errors."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,15 +10,16 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_cure.cure.policies import encoder_of
-from sb3_cure.data.buffers import stored_places, transitions
+from sb3_cure.data.buffers import transitions, unmarked
 from sb3_cure.data.observations import copied, images_of, len_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
+from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
 ACTORS = ("task", "curious", "random")
@@ -27,14 +28,14 @@ ACTORS = ("task", "curious", "random")
 @dataclass
 class Episode:
     """
-    What one episode of T agent steps showed.
+    One episode of T agent steps.
 
     :param rewards: Reward of each step, [T]
-    :param srl_errors: The head's noise-free error of the observation before each step, [T]; empty without a head
-    :param observations: The observations before each step, [T, *shape], or such by key; images channels first, as the
-        model has them
-    :param frames: ``env.render()`` after each step, if asked for
-    :param states: The true state of the environment before each step, [T, d], if asked for; else empty
+    :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty without a head
+    :param observations: Observations before each step, [T, *shape], or such by key; images channels first, as the
+        model gets them
+    :param frames: ``env.render()`` after each step, if requested
+    :param states: True state of the environment before each step, [T, d], if requested; else empty
     """
 
     rewards: np.ndarray
@@ -45,14 +46,15 @@ class Episode:
 
     @property
     def total_reward(self) -> float:
-        """Return of the episode, undiscounted."""
+        """Undiscounted return of the episode."""
         return float(self.rewards.sum())
 
 
 def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk: int = 128) -> np.ndarray:
     """
-    Error of transitions without training noise, as the acting agent sees them (no augmentation): the SRL head's, or
-    that of an intrinsic reward which measures, such as ``"reconstruction"``.
+    Errors of transitions without training noise or augmentation.
+
+    They are the SRL head's, or those of an intrinsic reward that measures errors itself, such as ``"reconstruction"``.
 
     :param model: A model with an SRL head, or such a reward
     :param batch: Transitions, observations as stored (images in 0-255)
@@ -61,37 +63,37 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
     """
     policy: Any = model.policy
     policy.set_training_mode(False)
-    errors, fields = [], batch._asdict()
+    errors = []
     with th.no_grad():
         for start in range(0, len_of(batch.observations), chunk):
-            rows = slice(start, start + chunk)
-            columns: Any = {name: None if each is None else rows_of(each, rows) for name, each in fields.items()}
-            part = policy.samples(Samples(**columns), random=False)
-            errors.append(policy.error(part).float().cpu().numpy())
+            part: Any = (None if each is None else rows_of(each, slice(start, start + chunk)) for each in batch[:5])
+            errors.append(policy.error(policy.samples(Samples(*part), random=False)).float().cpu().numpy())
     return np.concatenate(errors)
 
 
 def trained_actors(model: BaseAlgorithm) -> list[str]:
     """
+    Policies that a model trains.
+
     :param model: A model, also of SB3's own algorithms
-    :return: Which of ``"task"`` and ``"curious"`` it trains
+    :return: ``"task"``, ``"curious"``, or both
     """
     has_curious = getattr(model.policy, "curious", None) is not None
     return ["task"] * getattr(model, "task", True) + ["curious"] * has_curious
 
 
-def even_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> None:
+def balance_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> None:
     """
-    Before policies are compared by CURL's error: take its negatives evenly from what they see.
+    Fill CURL's negatives evenly from what each policy sees, before policies are compared by CURL's error.
 
-    Rolls out an episode of each policy that the model has. Without this the negatives are those of the random
-    warm-up, to which the random policy's observations are the most alike. Heads without negatives are left alone.
+    Rolls out an episode of each policy of the model. Otherwise the negatives are those of the random warm-up, which
+    the random policy's observations resemble most. Heads without negatives stay unchanged.
 
     :param model: A trained model
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    heads = _with_banks(model)
+    heads = _heads_with_negatives(model)
     if not heads:
         return
     actors = [*trained_actors(model), "random"]
@@ -103,8 +105,7 @@ def even_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) 
         head.set_bank(th.as_tensor(frames[: len(head.bank)]))
 
 
-def _with_banks(model: BaseAlgorithm) -> dict[str, Any]:
-    """The model's heads that have negatives, by the key of their image."""
+def _heads_with_negatives(model: BaseAlgorithm) -> dict[str, Any]:
     heads = heads_by_key(getattr(model.policy, "srl", None))
     return {key: head for key, head in heads.items() if isinstance(head, CURL)}
 
@@ -112,30 +113,32 @@ def _with_banks(model: BaseAlgorithm) -> dict[str, Any]:
 @contextlib.contextmanager
 def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> Iterator[None]:
     """
-    Measure with ``even_negatives`` for a while, and leave the head as it was.
+    Measure errors within ``balance_negatives``, and restore the head afterwards.
 
     :param model: A model, also of SB3's own algorithms
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    heads = _with_banks(model)
+    heads = _heads_with_negatives(model)
     if not heads or any(int(head.bank_filled) == 0 for head in heads.values()):
         yield
         return
-    usual = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
-    even_negatives(model, env, seed)
+    banks = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
+    balance_negatives(model, env, seed)
     try:
         yield
     finally:
         for key, head in heads.items():
-            head.set_bank(usual[key])
+            head.set_bank(banks[key])
 
 
 def as_trained(model: BaseAlgorithm, observations: Any) -> Any:
     """
+    Normalize observations as in training.
+
     :param model: A model
-    :param observations: As its environments give them
-    :return: Normalised as in training, if a ``VecNormalize`` did so
+    :param observations: As its environments return them
+    :return: The same, normalized if the model is trained in ``VecNormalize``
     """
     normalizer = model.get_vec_normalize_env()
     return observations if normalizer is None else normalizer.normalize_obs(observations)
@@ -158,18 +161,18 @@ def run_episodes(
     :param model: A trained model
     :param env: One (not vectorised) environment
     :param n_episodes: How many episodes
-    :param actor: Whose actions: ``"task"``, ``"curious"`` or ``"random"`` (uniform)
+    :param actor: Who acts: ``"task"``, ``"curious"`` or ``"random"`` (uniform)
     :param deterministic: Whether policies act by their mean
-    :param seed: Seed of the first reset and of random actions. Later episodes start as the environment's random numbers
-        go on: alike for all policies where ``step`` draws none, as in DeepMind Control; else the first one only
+    :param seed: Seed of the first reset and of random actions. The environment's random numbers decide where later
+        episodes start: equal for all policies if ``step`` draws none, as in DeepMind Control
     :param render: Whether to keep ``env.render()`` of each step
     :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
         (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]
     :return: The episodes
-    :raises ValueError: if the actor is unknown, or the environment no known state
+    :raises ValueError: if the actor is unknown, or the environment has no known state
     """
     if actor not in ACTORS:
-        raise ValueError(f"actor is {actor!r}, but must be one of {', '.join(map(repr, ACTORS))}.")
+        raise ValueError(f"actor must be one of {', '.join(map(repr, ACTORS))}, not {actor!r}.")
     agent: Any = model
     predict = agent.predict_curious if actor == "curious" else agent.predict
     state_of = physics_state if states is True else states
@@ -177,29 +180,39 @@ def run_episodes(
         env.action_space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
-        observations, frames, true_states, steps = [copied(observation)], [], [], list[tuple[Any, ...]]()
-        done, memory = False, None  # memory: of recurrent policies
-        while not done:
+        # Copies: environments may reuse their arrays for observations, and change actions
+        observations = [_own_keys(observation, model.observation_space)]
+        actions, true_states, frames = list[np.ndarray](), list[np.ndarray](), list[Any]()
+        rewards, dones = list[float](), list[bool]()
+        finished, memory = False, None  # memory of recurrent policies
+        while not finished:
             if actor == "random":
                 action = env.action_space.sample()
             else:
-                action, memory = predict(as_trained(model, observation), memory, np.array([not steps]), deterministic)
+                action, memory = predict(
+                    as_trained(model, observations[-1]), memory, np.array([not actions]), deterministic
+                )
             if state_of:
-                true_states.append(np.array(state_of(env)))  # a copy
-            given = np.array(action)  # the environment may change it, and write each observation into one place
+                true_states.append(np.array(state_of(env)))
+            actions.append(np.array(action))
             observation, reward, terminated, truncated, _ = env.step(action)
-            done = terminated or truncated
-            observations.append(copied(observation))
-            steps.append((given, float(reward), terminated))
+            finished = terminated or truncated
+            observations.append(_own_keys(observation, model.observation_space))
+            rewards.append(float(reward))
+            dones.append(terminated)
             if render:
                 frames.append(env.render())
         seen: Any = _channels_first(stacked(observations), model.observation_space)
-        actions, rewards, dones = map(np.array, zip(*steps, strict=True))
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
             errors = srl_errors(model, _as_batch(model, as_trained(model, seen), actions, rewards, dones))
         kept = {"states": np.stack(true_states)} if states else {}
-        yield Episode(rewards, errors, rows_of(seen, slice(-1)), frames, **kept)  # type: ignore[arg-type]
+        yield Episode(np.array(rewards), errors, rows_of(seen, slice(-1)), frames, **kept)
+
+
+def _own_keys(observation: Any, space: spaces.Space) -> Any:
+    """Copy an observation without keys that its space does not have, as SB3's VecEnvs do."""
+    return copied({key: observation[key] for key in space.spaces} if isinstance(space, spaces.Dict) else observation)
 
 
 def _channels_first(observations: Any, space: spaces.Space) -> Any:
@@ -209,20 +222,21 @@ def _channels_first(observations: Any, space: spaces.Space) -> Any:
 
 
 def _as_batch(
-    model: BaseAlgorithm, observations: Any, actions: np.ndarray, rewards: np.ndarray, dones: np.ndarray
+    model: BaseAlgorithm, observations: Any, actions: list[np.ndarray], rewards: list[float], dones: list[bool]
 ) -> Samples:
-    """An episode in the form in which heads read the replay buffer (actions scaled to [-1, 1])."""
+    """Form a batch of an episode as replay buffers do: actions in [-1, 1], as vectors."""
     seen = obs_as_tensor(observations, model.device)
-    columns = (model.policy.scale_action(actions), dones[:, None], rewards[:, None])  # type: ignore[operator]
-    scaled, done, reward = (th.as_tensor(each, dtype=th.float32, device=model.device) for each in columns)
-    return Samples(rows_of(seen, slice(-1)), scaled, rows_of(seen, slice(1, None)), done, reward)
+    scaled = model.policy.scale_action(np.array(actions))  # type: ignore[operator]
+    columns = (np.reshape(each, (len(actions), -1)) for each in (scaled, dones, rewards))
+    action, done, reward = (th.as_tensor(each, dtype=th.float32, device=model.device) for each in columns)
+    return Samples(rows_of(seen, slice(-1)), action, rows_of(seen, slice(1, None)), done, reward)
 
 
-class Uncomfortable(NamedTuple):
+class HighestErrors(NamedTuple):
     """
-    Where the agent's representation errs the most.
+    Observations with the highest SRL error.
 
-    :param observations: The observations, the worst first, [k, *shape], or such by key
+    :param observations: The observations, highest error first, [k, *shape], or such by key
     :param errors: Their SRL errors, [k]
     :param ages: How many agent steps ago they were stored, [k]
     :param mean_error: Mean SRL error of the whole replay buffer
@@ -234,31 +248,49 @@ class Uncomfortable(NamedTuple):
     mean_error: float
 
 
-def most_uncomfortable(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: int = 128) -> Uncomfortable:
+def stored_places(buffer: ReplayBuffer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    The observations of the replay buffer with the highest noise-free SRL error.
+    Places of all stored transitions, newest first.
+
+    :param buffer: A replay buffer
+    :return: Rows, environments and ages (in rows), [n] each
+    """
+    return unmarked(buffer)
+
+
+def as_arrays(observations: Any) -> Any:
+    """
+    Convert tensors to arrays.
+
+    :param observations: Tensor, or a dictionary of such
+    :return: NumPy arrays
+    """
+    if isinstance(observations, dict):
+        return {key: part.cpu().numpy() for key, part in observations.items()}
+    return observations.cpu().numpy()
+
+
+def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: int = 128) -> HighestErrors:
+    """
+    Find the observations of the replay buffer with the highest noise-free SRL error.
 
     Reads the whole buffer, a chunk at a time. Two observations of one environment are at least ``gap`` steps apart:
-    else the answer would be one moment k times.
+    else the result would be one moment k times.
 
     :param model: A model with an SRL head and a replay buffer
-    :param k: How many observations; fewer where the buffer does not hold so many that are far enough apart
+    :param k: How many observations; fewer if the buffer does not hold so many that are far enough apart
     :param gap: Least distance in time, in steps of one environment; 1 allows neighbours
     :param chunk: How many observations are in memory at a time
-    :return: The observations, worst first, with their errors
-    :raises ValueError: if there is nothing to measure in the replay buffer
+    :return: The observations with their errors, highest first
+    :raises ValueError: if the replay buffer is empty
     """
     buffer: Any = model.replay_buffer  # type: ignore[attr-defined]
     rows, env_inds, ages = stored_places(buffer)
     if len(rows) == 0:
         raise ValueError("the replay buffer is empty.")
-
-    errors = np.zeros(len(rows), np.float32)
-    for start in range(0, len(rows), chunk):
-        part = slice(start, start + chunk)
-        errors[part] = srl_errors(
-            model, transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env()), chunk
-        )
+    parts = [slice(start, start + chunk) for start in range(0, len(rows), chunk)]
+    batches = (transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env()) for part in parts)
+    errors = np.concatenate([srl_errors(model, batch, chunk) for batch in batches])
     chosen: list[int] = []
     for candidate in np.argsort(-errors, kind="stable"):
         same = [other for other in chosen if env_inds[other] == env_inds[candidate]]
@@ -266,10 +298,8 @@ def most_uncomfortable(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chun
             chosen.append(int(candidate))
         if len(chosen) == k:
             break
-    found: Any = transitions(buffer, rows[chosen], env_inds[chosen]).observations
-    is_dict = isinstance(found, dict)
-    observations = {k: part.cpu().numpy() for k, part in found.items()} if is_dict else found.cpu().numpy()
-    return Uncomfortable(observations, errors[chosen], ages[chosen] * buffer.n_envs, float(errors.mean()))
+    observations = as_arrays(transitions(buffer, rows[chosen], env_inds[chosen]).observations)
+    return HighestErrors(observations, errors[chosen], ages[chosen] * buffer.n_envs, float(errors.mean()))
 
 
 def binned_errors(
@@ -281,7 +311,7 @@ def binned_errors(
     :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
     :param errors: SRL error of each visited state, [n], or empty
     :param edges: Edges of the bins of both coordinates, increasing, [a + 1] and [b + 1]
-    :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN where there is none
+    :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN without visits
     """
     x, y = (np.clip(states[:, axis], edges[axis][0], edges[axis][-1]) for axis in (0, 1))
     visits = np.histogram2d(x, y, bins=edges)[0]  # type: ignore[call-overload]
@@ -299,63 +329,58 @@ def state_probe(
     ridge: float = 1e-3,
 ) -> dict[str, float]:
     """
-    What a linear map reads of the true state in the latents: R² of each coordinate, by ridge regression.
+    R² of each coordinate of the true state, predicted from the latents by ridge regression.
 
     Each episode is predicted by the regression on all others, as its neighbours in time would give it away. An angle
-    is predicted as sine and cosine, of which the R² is one: as a number it would jump by a turn. R² is 1 for perfect
-    predictions, 0 for the mean of all states, and below 0 for what is worse than that.
+    is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect
+    predictions, 0 for the mean of all states, and below 0 for worse.
 
     :param model: A model of any SB3 algorithm with an encoder (``policies.encoder_of``); compare models on the same
         episodes, such as those of random actions with a seed
     :param episodes: Two or more, of ``run_episodes(..., states=True)``
     :param names: Names of the state's coordinates, [d], as of ``sb3_cure.envs.physics_state_names``
-    :param units: Their units, [d], as of ``physics_state_units``: ``"rad"`` marks angles. None: there are none
+    :param units: Their units, [d], as of ``physics_state_units``: ``"rad"`` marks angles. None: no angles
     :param ridge: Penalty of the squared weights for latents of variance 1, as a share of the number of observations
     :return: R² by name; NaN for coordinates that never change
-    :raises ValueError: if the model has no encoder, or episodes have no states, or there is only one
+    :raises ValueError: if the model has no encoder, episodes have no states, or there are fewer than two
     """
     policy: Any = model.policy
     found = encoder_of(policy)
     if found is None:
-        raise ValueError(f"the {type(policy).__name__} has no encoder whose latents could be read.")
+        raise ValueError(f"state_probe needs a policy with an encoder, which {type(policy).__name__} does not have.")
     policy.set_training_mode(False)
     latents, states = [], []
     for episode in episodes:
-        n = len(episode.states)
-        if n != len(episode.rewards):
+        if len(episode.states) != len(episode.rewards):
             raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
         seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
-        parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, n, 128)]
+        parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, len(episode.states), 128)]
         with th.no_grad():
             latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in parts]))
         states.append(episode.states)
     if len(states) < 2:
-        raise ValueError("the probe predicts each episode from others, but there is one at most: give more.")
+        raise ValueError("state_probe needs two episodes at least: it predicts each from the others.")
 
-    is_angle = [unit == "rad" for unit in units or [""] * len(names)]
-    columns = np.concatenate(states).T
-    targets_of = [
-        np.stack([np.sin(column), np.cos(column)], axis=1) if angle else column[:, None]
-        for column, angle in zip(columns, is_angle, strict=True)
+    targets = [
+        np.stack([np.sin(column), np.cos(column)], axis=1) if unit == "rad" else column[:, None]
+        for column, unit in zip(np.concatenate(states).T, units or [""] * len(names), strict=True)
     ]
-    targets, inputs = np.concatenate(targets_of, axis=1), np.concatenate(latents)
+    inputs, outputs = np.concatenate(latents), np.concatenate(targets, axis=1)
     owners = np.repeat(np.arange(len(states)), [len(each) for each in states])
-    errors = np.zeros(targets.shape[1])
-    for owner in range(len(states)):
-        own = owners == owner
-        predicted = _ridge(inputs[~own], targets[~own], inputs[own], ridge)
-        errors += np.square(predicted - targets[own]).sum(axis=0)
-    spread = np.square(targets - targets.mean(axis=0)).sum(axis=0)
-    ends = np.cumsum([part.shape[1] for part in targets_of])[:-1]
+    predicted = np.empty_like(outputs)
+    for own in (owners == owner for owner in range(len(states))):
+        predicted[own] = _ridge(inputs[~own], outputs[~own], inputs[own], ridge)
+    ends = np.cumsum([target.shape[1] for target in targets])[:-1]
     result = {}
-    for name, error, total in zip(names, np.split(errors, ends), np.split(spread, ends), strict=True):
-        varies = total.sum() > 1e-9 * len(targets)
-        result[name] = float(1 - error.sum() / total.sum()) if varies else float("nan")
+    for name, target, guess in zip(names, targets, np.split(predicted, ends, axis=1), strict=True):
+        spread = np.square(target - target.mean(axis=0)).sum()
+        varies = spread > 1e-9 * len(target)
+        result[name] = float(1 - np.square(guess - target).sum() / spread) if varies else float("nan")
     return result
 
 
 def _ridge(inputs: np.ndarray, targets: np.ndarray, new_inputs: np.ndarray, penalty: float) -> np.ndarray:
-    """Predictions for new inputs of a ridge regression on standardised inputs."""
+    """Predict targets of new inputs by ridge regression on standardised inputs."""
     mean, deviation, middle = inputs.mean(axis=0), inputs.std(axis=0) + 1e-12, targets.mean(axis=0)
     design = (inputs - mean) / deviation
     gram = design.T @ design + penalty * len(design) * np.eye(design.shape[1])

@@ -1,4 +1,4 @@
-"""Videos of a policy with its SRL error drawn in."""
+"""Videos of a policy with its SRL error."""
 
 import functools
 import textwrap
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import imageio.v2 as imageio
-import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: F401  (imageio looks for it late: at the first frame)
+import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: F401  (imageio imports it late: at the first frame)
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -17,13 +17,14 @@ RED, GREY = "#d62728", "#bbbbbb"
 
 
 def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, title: str = "") -> None:
-    """One episode as MP4: the camera's picture above, the SRL error up to now below.
+    """
+    Write one episode as MP4: the camera's picture above, the SRL error so far below.
 
     :param path: File to write, ``*.mp4``
     :param episode: Episode with ``frames`` (rendered with ``render=True``); without ``srl_errors`` none are drawn
     :param fps: Pictures per second, one per agent step
     :param action_repeat: Environment steps per agent step, for the caption
-    :param title: What is seen, put before the caption; wrapped where it is wider than the picture
+    :param title: Put before the caption; wrapped if it is wider than the picture
     """
     # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
     with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
@@ -32,7 +33,8 @@ def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, 
 
 
 def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
-    """Several policies at once, as ``write_video``, with one scale of the errors.
+    """
+    Write several policies side by side, as ``write_video``, with one scale of the errors.
 
     :param path: File to write, ``*.mp4``
     :param episodes: Episodes with ``frames``, by title; all end with the shortest
@@ -51,11 +53,12 @@ def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: i
 def annotated_frames(
     episode: Episode, action_repeat: int = 1, title: str = "", top: float | None = None
 ) -> Iterator[np.ndarray]:
-    """The pictures of ``write_video``.
+    """
+    Draw the pictures of ``write_video``.
 
-    :param episode: As there
-    :param action_repeat: As there
-    :param title: As there
+    :param episode: Episode with ``frames``
+    :param action_repeat: Environment steps per agent step
+    :param title: Put before the caption
     :param top: Error at the upper end of the curve; None: the episode's highest
     :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
@@ -69,13 +72,13 @@ def annotated_frames(
 
 
 def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray, length: int, top: float) -> np.ndarray:
-    """The frame above a panel with text and, if there are errors, the newest one as a number and all as a curve."""
+    """Draw the frame above a panel with text and, if there are errors, the latest as a number and all as a curve."""
     factor = -(-MIN_WIDTH // frame.shape[1])
     frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
     height, width = frame.shape[:2]
     unit = width // 64  # sizes follow the picture's
     line_height, curve_height = 4 * unit, 10 * unit if len(errors) else 0
-    # Only the title may be wrapped: it stays as it is, and all pictures have to have the same number of lines.
+    # Only the title may be wrapped, as it is constant: all pictures must have the same number of lines
     lines = [*_wrapped(title, 3 * unit, width - 2 * unit), caption]
     if len(errors):
         lines.append(f"SRL error {errors[-1]:.5f} (highest {top:.5f})")
@@ -100,18 +103,18 @@ def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray,
     return np.asarray(picture)
 
 
-#: By size; loading one takes longer than drawing a line
+#: Font by size, cached as loading takes longer than drawing a line
 _font = functools.cache(ImageFont.load_default)
 
 
 def _width(line: str, size: int) -> float:
-    """Of its pixels: glyphs such as ``_`` end beyond where the next one would begin."""
+    """Width of a line in pixels, with glyphs such as ``_`` that extend below the next one."""
     return _font(size).getbbox(line)[2]
 
 
 @functools.cache
 def _wrapped(text: str, size: int, width: int) -> list[str]:
-    """As few lines as fit into a width; words are broken only where one alone is wider."""
+    """Wrap text into as few lines as fit into a width; only words that are wider are broken."""
     for length in range(len(text), 1, -1):
         lines = textwrap.wrap(text, length, break_on_hyphens=False)
         if all(_width(line, size) <= width for line in lines):
@@ -120,7 +123,7 @@ def _wrapped(text: str, size: int, width: int) -> list[str]:
 
 
 def _fitting_size(line: str, size: int, width: int) -> int:
-    """The size, or as much smaller as a line with long numbers asks for."""
+    """Reduce a font size until the line fits, as it may contain long numbers."""
     while size > 1 and _width(line, size) > width:
         size -= 1
     return size

@@ -8,12 +8,12 @@ import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.data.buffers import infer_frame_stack
+from sb3_cure.data.buffers import frame_stack_of
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
-from sb3_cure.evaluation.rollouts import evenly_measured, most_uncomfortable, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import evenly_measured, highest_errors, run_episodes, trained_actors
 from sb3_cure.evaluation.video import write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
@@ -103,14 +103,14 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     if not (folder / "reconstructions.png").exists():  # not drawn in training
         for callback in watch_reconstructions(cell, repeat, folder):
             callback.draw(model)
-    found = most_uncomfortable(model, FRAMES)
+    found = highest_errors(model, FRAMES)
     with th.no_grad():
         pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))
     title, drawn = f"What the agent finds uncomfortable: {name}", None if pair is None else pair[1].cpu().numpy()
-    plots.uncomfortable_frames(folder / "uncomfortable.png", found, _frames_per_observation(model), title, drawn)
+    plots.highest_error_frames(folder / "uncomfortable.png", found, _frames_per_observation(model), title, drawn)
 
 
 def _frames_per_observation(model: CuReSAC) -> int:
     """As the environments tell, if frames then are grey or in colour; else each channel counts as a frame."""
-    told, (channels, *_) = infer_frame_stack(model.env), model.observation_space.shape  # type: ignore[misc]
+    told, (channels, *_) = frame_stack_of(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
     return told if channels in (told, 3 * told) else channels

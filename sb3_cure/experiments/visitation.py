@@ -16,7 +16,7 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.evaluation.rollouts import Episode, even_negatives, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import Episode, balance_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE
@@ -46,7 +46,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param folder: Where to write
     """
     env = cell.make_eval_env()
-    even_negatives(model, env, seed=VISIT_SEED - 1)
+    balance_negatives(model, env, seed=VISIT_SEED - 1)
     has_physics = env.has_wrapper_attr("physics")
     arrays: dict[str, Any] = {}
     if has_physics:

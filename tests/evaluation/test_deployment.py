@@ -8,9 +8,11 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch as th
-from dictionaries_for_tests import sensor_model
+from dictionaries_for_tests import Goal, sensor_model
 from envs_for_tests import PixelBox, VectorBox, tiny_model
+from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_cure.data.observations import stacked
 from sb3_cure.evaluation.deployment import DeterministicActor
 
 MODELS: dict[str, Any] = {
@@ -18,6 +20,8 @@ MODELS: dict[str, Any] = {
     "curl": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl="curl"),
     "vectors": lambda: tiny_model("MlpPolicy", VectorBox()),
     "curious alone": lambda: tiny_model("CnnPolicy", PixelBox(), task=False),
+    "images by key": lambda: sensor_model(),
+    "vectors by key": lambda: tiny_model("MultiInputPolicy", Goal()),
     "SB3's SAC": lambda: tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0), srl=None, curiosity=None),
 }
 
@@ -26,8 +30,8 @@ MODELS: dict[str, Any] = {
 def test_actions_are_those_of_predict(name: str) -> None:
     """In the environment's units, for both policies, whichever tool has followed the computation."""
     model = MODELS[name]().learn(14)
-    observations = np.stack([model.observation_space.sample() for _ in range(3)])
-    batch = th.as_tensor(observations)
+    observations: Any = stacked([model.observation_space.sample() for _ in range(3)])
+    batch = obs_as_tensor(observations, model.device)
     policies: dict[str | None, Any] = {None: model.predict}
     if model.curiosity is not None:
         policies["curious"] = model.predict_curious
@@ -45,7 +49,7 @@ def test_actions_are_those_of_predict(name: str) -> None:
 
 
 def test_onnx_of_a_dictionary(tmp_path: Path) -> None:
-    """Another runtime acts as ``predict`` does, on inputs of the names that the guide tells."""
+    """Another runtime acts as ``predict`` does, with the guide's names of inputs."""
     model, file = sensor_model(srl="curl").learn(14), tmp_path / "policy.onnx"
     observation: Any = model.observation_space.sample()
     batch = {key: part[None] for key, part in observation.items()}
@@ -55,7 +59,7 @@ def test_onnx_of_a_dictionary(tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, model.predict(batch, deterministic=True)[0], atol=1e-5)
 
 
-def test_what_acts_is_all_that_leaves() -> None:
+def test_only_acting_networks_are_exported() -> None:
     """No critics, decoder or target networks; and the networks stay the model's own."""
     model = tiny_model("CnnPolicy", PixelBox())
     module = DeterministicActor(model)
@@ -65,7 +69,7 @@ def test_what_acts_is_all_that_leaves() -> None:
     assert sum(value.numel() for value in exported.state_dict.values()) == sum(map(th.numel, parts)) + 4  # two bounds
 
 
-def test_training_goes_on_after_it_was_made() -> None:
+def test_actions_follow_further_training() -> None:
     """Actions are still those of ``predict``, though training leaves the networks in another mode."""
     model = tiny_model("CnnPolicy", PixelBox())
     model.policy.encoder.trunk.append(th.nn.Dropout())
@@ -79,14 +83,10 @@ def test_training_goes_on_after_it_was_made() -> None:
         np.testing.assert_allclose(actions, model.predict(batch.numpy(), deterministic=True)[0], atol=1e-5)
 
 
-def test_a_policy_that_is_not_there() -> None:
-    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
-    with pytest.raises(ValueError, match="actor is 'curious', but this model has 'task'"):
-        DeterministicActor(model, "curious")
-
-
-def test_scaled_images_are_refused() -> None:
+def test_wrong_actors_and_scaled_images_are_refused() -> None:
     """Floats in [0, 1] would be divided by 255 once more, and give actions all the same."""
-    module = DeterministicActor(tiny_model("CnnPolicy", PixelBox()))
-    with pytest.raises(ValueError, match=r"observations are torch.float32, but images must be uint8"):
-        module(th.rand(1, 6, 36, 36))
+    model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
+    with pytest.raises(ValueError, match="actor must be 'task' for this model, not 'curious'"):
+        DeterministicActor(model, "curious")
+    with pytest.raises(ValueError, match=r"images must be uint8, not torch.float32"):
+        DeterministicActor(model)(th.rand(1, 6, 36, 36))

@@ -474,7 +474,7 @@ def test_failing_pictures_cost_no_results(
     def fail(*_: Any) -> None:
         raise RuntimeError("no\nfont")
 
-    monkeypatch.setattr(plots, "uncomfortable_frames", fail)
+    monkeypatch.setattr(plots, "highest_error_frames", fail)
     cell = only_cell(tmp_path, budget=80)
     folder = run_cell(cell, tmp_path / "out")
     assert cell.is_done(tmp_path / "out") and (folder / "run.json").is_file()

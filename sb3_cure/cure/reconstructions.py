@@ -1,0 +1,62 @@
+"""Strips of observations above their reconstructions, for logs and notebooks."""
+
+import numpy as np
+import torch as th
+
+from sb3_cure.cure.policies import CuRePolicy
+from sb3_cure.data.observations import by_key, image_spaces, rows_of
+from sb3_cure.data.samples import Samples
+
+
+@th.no_grad()
+def reconstruction_strips(
+    policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8
+) -> dict[str, np.ndarray]:
+    """
+    Newest frames of a few observations above their reconstructions.
+
+    :param policy: The policy
+    :param batch: Samples
+    :param frame_stack: Frames per observation
+    :param columns: How many observations
+    :return: For each reconstructed image, by its key (``""`` if observations are images), an image uint8
+        (C, 2 * H, columns * W) with C = 1 or 3
+    """
+    if not image_spaces(policy.sensed_space):
+        return {}
+    pair = policy.reconstruct(rows_of(batch.observations, slice(columns)))
+    if pair is None:
+        return {}
+    seen, drawn = map(by_key, pair)
+    strips = {}
+    for key in drawn:
+        rows = [th.cat(list(newest_frames(images[key], frame_stack)), dim=2) for images in (seen, drawn)]
+        strips[key] = th.cat(rows, dim=1).cpu().numpy()
+    return strips
+
+
+def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
+    """
+    The (first) image of ``reconstruction_strips``, or None if there is none.
+
+    :param policy: The policy
+    :param batch: Samples
+    :param frame_stack: Frames per observation
+    :param columns: How many observations
+    :return: An image uint8 (C, 2 * H, columns * W) with C = 1 or 3, or None
+    """
+    return next(iter(reconstruction_strips(policy, batch, frame_stack, columns).values()), None)
+
+
+def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
+    """
+    Newest frame of each stack.
+
+    :param images: Stacks of frames, oldest first, 0-255, [B, C, H, W]
+    :param frame_stack: Frames per stack
+    :return: The newest frames, grey or in colour, uint8 [B, C', H, W] with C' = 1 or 3
+    """
+    channels = images.shape[1] // frame_stack
+    if channels not in (1, 3):
+        channels = 1
+    return images[:, -channels:].to(th.uint8)
