@@ -71,8 +71,8 @@ class CountReward(gym.RewardWrapper, RecordConstructorArgs):
         self.visits = dict(zip(map(tuple, state["cells"].tolist()), state["visits"], strict=True))
 
 
-class TellCell(gym.Wrapper, RecordConstructorArgs):
-    """Puts the cell of the true state that each step leads to into ``info["cell"]``, where callbacks see it at the ends
+class CellInfo(gym.Wrapper, RecordConstructorArgs):
+    """Write the cell of the true state that each step leads to into ``info["cell"]``, where callbacks see it at the ends
     of episodes, too.
 
     :param env: An environment of dm_control
