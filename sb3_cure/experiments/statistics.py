@@ -12,6 +12,7 @@ Intervals are 95 %. Two kinds are used, and named wherever they are shown:
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -383,17 +384,17 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
             )
     n, taus = len(next(iter(scores.values()))), np.linspace(0, 1, 1001)
 
-    def estimate(statistic: Callable[..., np.ndarray], *matrices: np.ndarray) -> tuple[np.ndarray, ...]:
+    def interval(statistic: Callable[..., Any], *matrices: np.ndarray) -> tuple[Any, Any, Any]:
         columns = [column for matrix in matrices for column in matrix.T]
-        return statistic(*columns, axis=-1), *_bootstrap(statistic, columns)
+        low, high = _bootstrap(statistic, columns)
+        return statistic(*columns, axis=-1), low, high
 
     iqm, improvement, profiles = {}, {}, {}
     for method, matrix in scores.items():
-        iqm[method] = Estimate(*map(float, estimate(interquartile_mean, matrix)), n)
-        profiles[method] = estimate(partial(share_above, taus=taus), matrix)
+        iqm[method] = Estimate(*interval(interquartile_mean, matrix), n)
+        profiles[method] = interval(partial(share_above, taus=taus), matrix)
         if method != (other := experiment.baseline_of(method)) and other in scores:
-            found = estimate(probability_of_improvement, matrix, scores[other])
-            improvement[method] = Estimate(*map(float, found), n)
+            improvement[method] = Estimate(*interval(probability_of_improvement, matrix, scores[other]), n)
     return Aggregates(tasks, n, iqm, improvement, taus, profiles)
 
 
