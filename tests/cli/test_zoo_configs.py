@@ -6,16 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import yaml
 from envs_for_tests import PixelBox
-from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure import CuReSAC
 from sb3_cure.cli import zoo
 from sb3_cure.cli.main import main
-from sb3_cure.experiments.demo import ENV_KWARGS, PROFILE
 from sb3_cure.experiments.grid import load_grid
 
 FOLDER = Path(__file__).parents[2] / "zoo_configs"
@@ -85,56 +82,6 @@ def set_up(
     return model, manager  # type: ignore[return-value]
 
 
-def test_the_files_and_their_entries() -> None:
-    """Each method twice; the paper's six tasks and a default, all registered ids."""
-    for folder in (FOLDER, FOLDER / "fast"):
-        assert {path.stem for path in folder.glob("*.yml")} == METHODS.keys()
-    for method, settings in METHODS.items():
-        names = yaml.safe_load((FOLDER / f"{method}.yml").read_text()).keys()
-        # CURL's crops need larger images, which only DeepMind Control's tasks can be asked for.
-        assert names == SIX_TASKS.keys() | {"default"} | ({"dmc_pixels"} if settings["srl"] == "curl" else set())
-        assert {"default", "dmc_pixels"} <= yaml.safe_load((FOLDER / "fast" / f"{method}.yml").read_text()).keys()
-    assert {task for folder in (FOLDER, FOLDER / "fast") for _, task in entries(folder)} <= gym.registry.keys()
-
-
-@pytest.mark.parametrize(("method", "task"), entries(FOLDER))
-def test_every_entry_is_the_papers_table(method: str, task: str, tmp_path: Path) -> None:
-    """rl-zoo3 builds each entry: the paper's numbers, action repeats, image sizes, and 500k environment steps."""
-    path = FOLDER / f"{method}.yml"
-    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
-    draws = model.srl in ("rae", "vae")
-    table = dict(
-        **METHODS[method], batch_size=128, buffer_size=80_000, gamma=0.99, learning_starts=1000, tau=0.01,
-        encoder_tau=0.05, target_update_interval=2, actor_update_interval=2, ent_coef="auto_0.1", gradient_steps=-1,
-        warmup_updates=1000 if draws else 0, curiosity_prob=0.2, curiosity_gamma=0.99, curiosity_beta=1.0,
-    )  # fmt: skip
-    assert {name: getattr(model, name) for name in table} == table
-    assert model.lr_schedule(1) == 1e-3
-    if model.srl != "curl":  # whose images are larger
-        assert model.augmentation == ("auto" if draws else "shift")
-    assert entry_of(path, task)["policy_kwargs"] == {"net_arch": [1024, 1024]}
-    repeat = model.env.get_attr("action_repeat")[0]  # type: ignore[union-attr]
-    assert repeat == SIX_TASKS.get(task, 4)
-    assert manager.n_timesteps * repeat == 500_000
-    # CURL crops 84 pixels out of 100; the encoder of all methods sees 84.
-    size = 100 if model.srl == "curl" else 84
-    assert model.observation_space.shape == (9, size, size)
-
-
-@pytest.mark.parametrize(("method", "task"), entries(FOLDER / "fast"))
-def test_every_fast_entry_has_the_demos_profile(method: str, task: str, tmp_path: Path) -> None:
-    """The demo's networks and, for cartpole, its camera, with the paper's reward; 100k environment steps."""
-    path = FOLDER / "fast" / f"{method}.yml"
-    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
-    expected = {**PROFILE, **METHODS[method]}
-    if model.srl in ("rae", "vae"):
-        expected.update(augmentation="auto", augmentation_kwargs={}, warmup_updates=1000)
-    assert entry_of(path, task)["policy_kwargs"] == expected.pop("policy_kwargs")
-    assert {name: getattr(model, name) for name in expected} == expected
-    assert manager.env_kwargs == (ENV_KWARGS if "cartpole" in task else {"image_size": 48, "renderer": "fast"})
-    assert manager.n_timesteps * model.env.get_attr("action_repeat")[0] == 100_000  # type: ignore[union-attr]
-
-
 #: What tells that something was learned: with a head, without one
 LOSS_OF = ("train/srl_loss", "train/critic_loss")
 FILES = [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS]
@@ -172,18 +119,6 @@ def test_each_fast_file_trains_from_the_command_line(
     assert main([*arguments, "--device", "cpu"]) == 0
     printed = re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)
     assert int(printed[-1]) == 20 + 149  # up to the last step of two episodes of 125
-
-
-@pytest.mark.parametrize("path", FILES)
-def test_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of whatever size and order of channels, here 52 pixels, channels last; with that file's head."""
-    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", Dots))
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=20, warmup_updates=2, buffer_size=200)
-    model, manager = set_up(FOLDER / path, "Dots-v0", tmp_path, n_timesteps=25, **small)
-    manager.learn(model)
-    assert (model.num_timesteps, model._n_updates) == (25, 2 + 5)
-    assert model.srl == METHODS[path.removeprefix("fast/").removesuffix(".yml")]["srl"]
-    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))

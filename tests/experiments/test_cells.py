@@ -192,16 +192,6 @@ def test_arms_of_a_seed_are_paired(tmp_path: Path) -> None:
     assert [row for row in first if row["actor"] == "task"] == second
 
 
-def test_arms_have_the_same_warm_up(tmp_path: Path) -> None:
-    """The replay buffers of paired arms are equal when learning starts."""
-    buffers = []
-    for curiosity in ("separate", "random", None):
-        model = CuReSAC("CnnPolicy", PixelBox(), seed=4, curiosity=curiosity, **{**TINY, "warmup_updates": 0})
-        model.learn(20)
-        buffers.append((model.replay_buffer.actions[:20].copy(), model.replay_buffer.rewards[:20].copy()))  # type: ignore[union-attr]
-    assert differences(buffers[0], buffers[1]) == differences(buffers[0], buffers[2]) == []
-
-
 def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **changes: Any) -> Grid:
     """The three arms of the paper's table, in two environments each; every phase has the same budget."""
     phases: dict[str, Any] = {"vanilla": {}}
@@ -437,48 +427,6 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert len(states) == len(errors) == 25
     draw(tmp_path / "map.png", drawn, [str(number) for number in range(4)], "", coordinates=("0", "1"))
     assert (tmp_path / "map.png").exists()
-
-
-@pytest.mark.usefixtures("few_rows")
-@pytest.mark.parametrize(("channels", "wraps", "shown"), [(3, False, 3), (4, True, 1), (4, False, 1)])
-def test_pictures_are_drawn_of_any_channels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, wraps: bool, shown: int
-) -> None:
-    """Whether or not an environment tells its frames: four channels are not a picture with transparency."""
-
-    class Channels(PixelBox):
-        def __init__(self) -> None:
-            super().__init__(frame_stack=3, tells_frame_stack=False)
-            self.observation_space = gym.spaces.Box(0, 255, (36, 36) if wraps else (channels, 36, 36), np.uint8)
-
-        def observe(self, first: bool = False) -> np.ndarray:
-            seen = super().observe(first)
-            return seen[0] if wraps else seen[:channels]
-
-    def make() -> gym.Env:
-        return gym.wrappers.FrameStackObservation(Channels(), channels) if wraps else Channels()
-
-    monkeypatch.setitem(gym.registry, TASK, gym.envs.registration.EnvSpec(TASK, make))
-    drawn: list[int] = []
-    draw = plots._picture
-    monkeypatch.setattr(plots, "_picture", lambda image: (drawn.append(image.shape[-1]), draw(image))[1])
-    folder = run_cell(only_cell(tmp_path, budget=100), tmp_path / "out")
-    assert (folder / "uncomfortable.png").is_file() and (folder / "DONE").is_file()
-    assert set(drawn) == {shown}
-
-
-@pytest.mark.usefixtures("few_rows")
-def test_failing_pictures_cost_no_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    def fail(*_: Any) -> None:
-        raise RuntimeError("no\nfont")
-
-    monkeypatch.setattr(plots, "uncomfortable_frames", fail)
-    cell = only_cell(tmp_path, budget=80)
-    folder = run_cell(cell, tmp_path / "out")
-    assert cell.is_done(tmp_path / "out") and (folder / "run.json").is_file()
-    assert f"{folder} is without some of its pictures: RuntimeError: no font\n" in capsys.readouterr().out
 
 
 # -------------------------------------------------------------------- visits

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from grids_for_tests import DMC_TASK, TASK, TINY, method, write_grid
+from grids_for_tests import DMC_TASK, TINY, method, write_grid
 
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.evaluation.result_files import read_rows
@@ -106,35 +105,6 @@ def test_heads_see_the_other_seeds_alone(visits: Path, monkeypatch: pytest.Monke
     assert seen == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}}
 
 
-def test_variants_do_not_outweigh_the_others(visits: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mix has random, task and curious observations alike, of the first arm of each; all arms are judged by it."""
-    out = visits.parent / "out"
-    for seed in (0, 1):  # the same cell, as if of another arm
-        shutil.copytree(out / FOLDER / "cure" / f"seed{seed}", out / FOLDER / "variant" / f"seed{seed}")
-    shutil.rmtree(out / FOLDER / "cure" / "seed2")
-    content = yaml.safe_load(visits.read_text())
-    visits.write_text(yaml.safe_dump({**content, "methods": {"cure": method(), "variant": method()}, "seeds": 2}))
-    rolled_out: list[tuple[str, str]] = []
-    mixed: list[int] = []
-    roll_out = heads.roll_out
-
-    def fit(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
-        mixed.append(len(observations))
-        yield 1
-
-    def count(model: CuReSAC, cell: Any, env: Any, actor: str) -> Any:
-        rolled_out.append((cell.method, actor))
-        return roll_out(model, cell, env, actor)
-
-    monkeypatch.setattr(heads, "fit_head", fit)
-    monkeypatch.setattr(heads, "roll_out", count)
-    (unit,) = heads.common_heads(load_grid(visits), out)
-    heads.run_heads(unit, out)
-    assert mixed == [3 * heads.COMMON_SHARE] * 2
-    for actor in ("random", "task", "curious"):  # of both seeds: once for the mix, once to be judged
-        assert (rolled_out.count(("cure", actor)), rolled_out.count(("variant", actor))) == (4, 2)
-
-
 def test_heads_in_other_hands_are_waited_for(visits: Path) -> None:
     """And not made again of what the other process has made them of."""
     out = visits.parent / "out"
@@ -158,20 +128,6 @@ def test_heads_in_other_hands_are_waited_for(visits: Path) -> None:
     heads.run_heads(unit, out)
     holder.join()
     assert (out / unit.folder / heads.RECORD).read_bytes() == record
-
-
-def test_without_models_no_heads_are_made(visits: Path, capsys: pytest.CaptureFixture) -> None:
-    """Repositories keep no ``model.zip``: further seeds would be judged by another measure, which is said."""
-    out = visits.parent / "out"
-    assert run.run_grid(load_grid(visits), out, pictures=False) == []
-    rows = common_rows(out)
-    for path in out.rglob("model.zip"):
-        path.unlink()
-    shutil.move(visits.parent / "seed3", out / FOLDER / "cure" / "seed3")
-    capsys.readouterr()
-    assert run.run_grid(load_grid(visits, seeds=4), out, pictures=False) == []
-    assert f"No common heads for {TASK}: they need two seeds" in capsys.readouterr().out
-    assert common_rows(out) == {**rows, "seed3": []}
 
 
 def test_arms_of_tqc_are_trained_and_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
