@@ -99,7 +99,6 @@ def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
     assert arguments["tensorboard_log"] is None, "what is switched off is told as well"
     config = json.loads((out / cell.folder / "config.json").read_text())
     assert config["action_repeat"] == 4 and config["arguments"]["batch_size"] == 8
-    assert config["defaults"]["curiosity_prob"] == 0.2 and config["defaults"]["gamma"] == 0.99
 
 
 def test_finished_cell_is_not_run_twice(finished: tuple[Cell, Path]) -> None:
@@ -167,7 +166,7 @@ def test_infinite_returns_end_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return observation, math.nan if truncated else reward, terminated, truncated, info
 
     monkeypatch.setattr(PixelBox, "step", step_or_nan)
-    with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: mend its rewards"):
+    with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: correct its rewards"):
         run_cell(only_cell(tmp_path, methods={"a": method(on_bad_transition="skip")}), tmp_path, pictures=False)
 
 
@@ -207,14 +206,14 @@ def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **change
 def warm_ups(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Filled by each cell: what its replay buffer holds of the first steps."""
     found: list[Any] = []
-    finish = cells._CellRun._keep_results
+    finish = cells._CellRun._write_results
 
     def keep(run_of_cell: Any) -> None:
         buffer = run_of_cell.model.replay_buffer
         found.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy()))
         finish(run_of_cell)
 
-    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+    monkeypatch.setattr(cells._CellRun, "_write_results", keep)
     return found
 
 

@@ -9,7 +9,7 @@ import pytest
 from grids_for_tests import DMC_TASK, method, write_grid
 
 from sb3_cure.envs import physics_state, physics_state_names, rendering
-from sb3_cure.envs.counting import TellCell
+from sb3_cure.envs.counting import CellInfo
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments.cells import run_cell
@@ -37,14 +37,14 @@ def grid(folder: Path, **changes: Any) -> Any:
 
 def test_cells_of_all_collected_states_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the stated steps, by other cells than the oracle's, whose reward is trained on and not evaluated by."""
-    states, step = [], TellCell.step
+    states, step = [], CellInfo.step
 
-    def noted(self: TellCell, action: np.ndarray) -> Any:
+    def noted(self: CellInfo, action: np.ndarray) -> Any:
         result = step(self, action)
         states.append(physics_state(self))
         return result
 
-    monkeypatch.setattr(TellCell, "step", noted)
+    monkeypatch.setattr(CellInfo, "step", noted)
     [cell] = grid(tmp_path).cells
     folder = run_cell(cell, tmp_path / "out", pictures=False)
     rows = read_rows(folder / "coverage.csv")
@@ -87,15 +87,15 @@ def test_policies_are_measured_in_the_wrappers_they_are_trained_in(tmp_path: Pat
 def test_coverage_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [cell] = grid(tmp_path).cells
     whole = run_cell(cell, tmp_path / "whole", pictures=False)
-    step, n_left = TellCell.step, [105]
+    step, n_left = CellInfo.step, [105]
 
-    def failing(self: TellCell, action: np.ndarray) -> Any:
+    def failing(self: CellInfo, action: np.ndarray) -> Any:
         n_left[0] -= 1
         if n_left[0] == 0:
             raise RuntimeError("the power went")
         return step(self, action)
 
-    monkeypatch.setattr(TellCell, "step", failing)
+    monkeypatch.setattr(CellInfo, "step", failing)
     with pytest.raises(RuntimeError, match="the power went"):
         run_cell(cell, tmp_path / "killed", 0, pictures=False)
     killed = run_cell(cell, tmp_path / "killed", 0, pictures=False)
