@@ -3,7 +3,7 @@
     python -m benchmarks.mutation --jobs 2
 
 cosmic-ray's operators list the mutants of each file in ``TESTS``. The seed decides which are drawn: equally many of
-each file (small files give all they have), in turn from each kind of operator, and one per place before a second one there.
+each file (small files give all they have), in turn from each kind of operator, and one per place before a second one.
 Type hints and operators of another type (``+`` by ``|``) are left out. Each mutant runs in a copy of package and tests.
 The tests of a file are a fast part of the suite: its other tests may kill mutants that survive here.
 

@@ -54,6 +54,8 @@ def run_grid(
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, if the grid cannot be run
     """
+    if engine not in ENGINES:
+        raise GridError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
     settings = (results, checkpoint_minutes, pictures)

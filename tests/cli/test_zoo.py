@@ -5,7 +5,6 @@ import pickle
 import re
 import shutil
 import sys
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -142,25 +141,6 @@ def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
     assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
 
 
-def test_namespace_and_atari_have_their_entries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The environment's own id goes first, then the id with its module, the namespace, Atari, and the default."""
-    order = [f"my_module:{TASK}", TASK, "tests", "atari", "default"]
-    zoo.register()
-    for first in range(5):
-        config = write({name: {**SETTINGS, "gamma": 0.5 + 0.01 * order.index(name)} for name in order[first:]})
-        arguments = type("Arguments", (), {"gym_packages": ["my_module"]})()
-        manager = zoo.ExperimentManager(arguments, "cure_sac", TASK, "logs", config=config)
-        manager._is_atari = True
-        hyperparams, _ = manager.read_hyperparameters()
-        assert hyperparams["gamma"] == pytest.approx(0.5 + 0.01 * first) and manager.env_name.gym_id == TASK
-
-
-def test_training_goes_on_with_a_trained_agent(set_up: Callable[..., Any], run: Path) -> None:
-    trained = CuReSAC.load(run / f"{RUN}.zip", custom_objects={"srl": Gentle}).policy.state_dict()
-    model, _ = set_up("-i", str(run / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
-    assert all(np.array_equal(value.cpu(), trained[name]) for name, value in model.policy.state_dict().items())
-
-
 def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
     """They are pickled, and their run's settings did not ask for them."""
     copied = hostile(run, folder, "vecnormalize.pkl", "cos\nmkdir\n(S'pwned'\ntR.")
@@ -180,27 +160,6 @@ def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., A
     """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
     with pytest.raises(ValueError, match=r"VecNormalize|this buffer stores"):
         set_up(**changes)[0].learn(20)
-
-
-def test_modules_of_the_working_directory_are_found(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Environment, head and buffer lie in one; it is named by either flag, and the entry of the file as well."""
-    Path("camera_of_mine.py").write_text(CAMERA)
-    settings = {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}
-    settings.update(srl="camera_of_mine.Head", replay_buffer_class="camera_of_mine.Buffer")
-    config = write({"camera_of_mine:Camera-v0": settings})
-    flags = (["--env", "camera_of_mine:Camera-v0"], ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"])
-    try:
-        for number, names in enumerate(flags, start=1):
-            gym.registry.pop("Camera-v0", None)
-            sys.modules.pop("camera_of_mine", None)
-            assert main(["train", *names, "--conf-file", config, "--eval-freq", "-1"]) == 0
-            assert main(["enjoy", *names, "-n", "20", "--no-render", "--srl", "camera_of_mine.Head"]) == 0
-            assert f"Camera-v0_{number}/Camera-v0.zip" in capsys.readouterr().out
-    finally:
-        gym.registry.pop("Camera-v0", None)
-        sys.modules.pop("camera_of_mine", None)
 
 
 # -------------------------------------------------------------------- tuning
@@ -394,10 +353,3 @@ def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) 
     assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
     (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
     assert video.stat().st_size > 1000
-
-
-def test_what_rl_zoo_writes_is_read_as_data() -> None:
-    """Tuples and ordered dictionaries are what they were, classes their names."""
-    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5)), ("class", Filmed)])
-    read = yaml.load(yaml.dump(settings), Loader=zoo.RunLoader)
-    assert read == {**settings, "class": f"{Filmed.__module__}.Filmed"}

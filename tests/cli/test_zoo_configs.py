@@ -84,28 +84,7 @@ def set_up(
 
 #: What tells that something was learned: with a head, without one
 LOSS_OF = ("train/srl_loss", "train/critic_loss")
-FILES = [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS]
-TRAINED = [("cure_sac", f"{method}.yml") for method in METHODS]  # the fast ones: from the command line, below
 TRAINED += [(algorithm, "cure_sac_ae.yml") for algorithm in zoo.ALGORITHMS if algorithm != "cure_sac"]
-
-
-@pytest.mark.parametrize(("algorithm", "path"), TRAINED)
-def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
-    """In two real environments; those of the evaluation show the same pixels."""
-    burst = min(entry_of(FOLDER / path, ANY_OTHER)["warmup_updates"], 3)
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=10, warmup_updates=burst, buffer_size=200)
-    model, manager = set_up(
-        FOLDER / path, "dmc_pixels/cartpole-swingup-v0", tmp_path, algorithm, n_timesteps=18, n_envs=2, **small
-    )
-    manager.learn(model)
-    assert type(model) is zoo.ALGORITHMS[algorithm] and model.num_timesteps == 18
-    # The burst, then an update per agent step.
-    assert model._n_updates == burst + 8
-    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
-    evaluation = manager.create_envs(1, eval_env=True, no_log=True)
-    assert evaluation.observation_space == model.observation_space
-    assert evaluation.get_attr("renderer") == ["dmc"]
-    evaluation.close()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -121,46 +100,7 @@ def test_each_fast_file_trains_from_the_command_line(
     assert int(printed[-1]) == 20 + 149  # up to the last step of two episodes of 125
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))
-def test_every_grid_has_a_fast_one(name: str) -> None:
-    """Which asks the same: the same methods from the fast files, pretrained in the same proportion."""
-    slow, fast = (load_grid(folder / name) for folder in (FOLDER / "experiments", FOLDER / "experiments" / "fast"))
-    assert (fast.kind, fast.baseline) == (slow.kind, slow.baseline)
-    methods = copy.deepcopy(slow.description["methods"])
-    for method in methods.values():
-        method["config"] = method["config"].replace("../", "../../fast/")
-        if "pretrain" in method:
-            share = method["pretrain"]["budget"] / slow.description["budget"]
-            method["pretrain"]["budget"] = share * fast.description["budget"]
-    assert list(fast.description["methods"].items()) == list(methods.items())
-
-
 def test_grids_read_the_entry_of_the_namespace() -> None:
     """As ``train`` does: a task without an entry of its own has that of ``dmc_pixels``, not the default."""
     cells = load_grid(FOLDER / "experiments" / "fast" / "visitation.yml", tasks=["reacher-easy"], seeds=1).cells
     assert [cell.env_kwargs for cell in cells] == [{"image_size": 48, "renderer": "fast"}] * 4
-
-
-@pytest.mark.parametrize("folder", ["experiments", "experiments/fast"])
-def test_an_ablation_is_one_change(folder: str) -> None:
-    """Against the method that its difference is taken from."""
-    grid = load_grid(FOLDER / folder / "ablations.yml", seeds=1)
-    settings = {cell.method: {**CURE_DEFAULTS, **cell.arguments} for cell in grid.cells}
-    changes = {}
-    for arm, method in grid.description["methods"].items():
-        other = settings[method.get("baseline", grid.baseline)]
-        changes[arm] = [name for name in other if settings[arm][name] != other[name]]
-    assert changes.pop(grid.baseline) == []
-    assert changes == {
-        "prob_005": ["curiosity_prob"],
-        "prob_05": ["curiosity_prob"],
-        "beta_01": ["curiosity_beta"],
-        "beta_10": ["curiosity_beta"],
-        "gamma_0": ["curiosity_gamma"],
-        "next_observation": ["curiosity_target"],
-        "not_normalized": ["normalize_curiosity"],
-        "bonus": ["curiosity"],
-        "no_encoder_gradient": ["curiosity_encoder_grad"],
-        "sequential": ["update"],
-        "alternating": ["srl_schedule"],
-    }

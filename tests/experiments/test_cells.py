@@ -17,7 +17,7 @@ from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
-from sb3_cure.evaluation import decoding, plots
+from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, media, run, visitation
 from sb3_cure.experiments.cells import run_cell
@@ -70,22 +70,6 @@ def test_cell_keeps_its_curve(finished: tuple[Cell, Path]) -> None:
         assert len(returns) == 2 and row["return_mean"] == pytest.approx(np.mean(returns))
     assert CuReSAC.load(out / cell.folder / "model.zip").num_timesteps == 100
     assert not (out / cell.folder / "checkpoint").exists()
-
-
-def test_cell_keeps_the_rewards_that_training_met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored: list[float] = []
-    save = CuReSAC.save
-
-    def noting_save(model: CuReSAC, path: Any) -> None:
-        stored.append(float(model.replay_buffer.rewards[: model.num_timesteps].sum()))
-        save(model, path)
-
-    monkeypatch.setattr(CuReSAC, "save", noting_save)
-    cell = only_cell(tmp_path)
-    run_cell(cell, tmp_path, pictures=False)
-    rows = read_rows(tmp_path / cell.folder / "eval.csv")
-    assert rows[0]["rewards_met"] == 0 != rows[1]["rewards_met"] != rows[-1]["rewards_met"]
-    assert rows[-1]["rewards_met"] == pytest.approx(stored[-1], abs=1e-3)
 
 
 def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
@@ -243,42 +227,6 @@ def test_pretrained_arms_have_the_same_warm_up(
     assert len(differences(warm_ups[0], warm_ups[3])) == 2, "another seed has another warm-up"
 
 
-@pytest.mark.usefixtures("few_rows")
-def test_common_generators_do_not_break_pairs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warm_ups: list[Any]
-) -> None:
-    """Where environments draw from Python's and NumPy's own numbers, neither evaluations, of one policy or two, nor
-    pictures change a training; evaluations start alike all along."""
-    starts: list[float] = []
-    reset, evaluated, evaluations = PixelBox.reset, cells._Record.evaluate, set()
-
-    def careless(self: PixelBox, *, seed: int | None = None, options: Any = None) -> Any:
-        reset(self, seed=seed)
-        self.position = np.array([random.uniform(-1, 1), np.random.uniform(-1, 1)])
-        starts.append(self.position.sum())
-        return self.observe(first=True), {}
-
-    def evaluate(self: Any) -> None:
-        before = len(starts)
-        evaluated(self)
-        n_actors = len(cells.trained_actors(self.model))
-        assert starts[before:] == starts[before : before + 2] * n_actors
-        evaluations.add(tuple(starts[before:][:2]))
-
-    monkeypatch.setattr(PixelBox, "reset", careless)
-    monkeypatch.setattr(cells._Record, "evaluate", evaluate)
-    methods = {name: method(curiosity=name or None, n_envs=2, learning_starts=40) for name in ("separate", "")}
-    methods["none"] = methods.pop("")
-    grid = load_grid(write_grid(tmp_path, methods=methods, budget=200, evaluation=dict(every=120, episodes=2)))
-    for out, pictures in (("with", True), ("without", False)):
-        for cell in grid.cells:
-            run_cell(cell, tmp_path / out, pictures=pictures)
-    assert differences(warm_ups[0], warm_ups[1]) == [] and len(evaluations) == 1
-    for cell in grid.cells:
-        tables = [(tmp_path / out / cell.folder / "episodes.csv").read_text() for out in ("with", "without")]
-        assert tables[0] == tables[1]
-
-
 # --------------------------------------------------------------- interruptions
 
 
@@ -374,31 +322,6 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
 
 
 # -------------------------------------------------------------------- pictures
-
-
-def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reconstructed observations are those of all arms, so that their errors compare; and a cell that is drawn is
-    trained as one that is not."""
-    fit = decoding.fit_decoder
-    monkeypatch.setattr(decoding, "fit_decoder", lambda model, sample, *rest: fit(model, sample, 1))  # not 500
-    observed, rows, titles = [], [], []
-
-    def keep(path: Path, shown: np.ndarray, drawn: Any, title: str) -> None:
-        observed.append(shown)
-        rows.append([steps for steps, _ in drawn])
-        titles.append(title)
-
-    monkeypatch.setattr(plots, "reconstructions_over_training", keep)
-    methods = {"cure": method(), "curl": method(srl="curl", srl_kwargs={"bank_size": 8})}
-    for cell in load_grid(write_grid(tmp_path, budget=160, methods=methods)).cells:
-        both = [run_cell(cell, tmp_path / name, pictures=name == "drawn") for name in ("drawn", "not drawn")]
-        drawn, plain = (CuReSAC.load(folder / "model.zip").get_parameters() for folder in both)
-        assert differences(drawn, plain) == []
-    assert rows[8] == [0, 5, 10, 15, 20, 25, 30, 35, 40], "with the untrained autoencoder"
-    assert rows[9] == [40], "drawn at the end where no picture was left by training"
-    assert titles[8].endswith("\nPixelBox, cure, seed 0") and titles[-1].endswith("\nPixelBox, curl, seed 0")
-    assert all(np.array_equal(shown, observed[0]) for shown in observed) and len(observed) == 10 + 9
-    assert len(np.unique(observed[0], axis=0)) == len(observed[0]) == 8
 
 
 @pytest.mark.usefixtures("few_rows")

@@ -14,8 +14,7 @@ from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, curve, write_cell, write_csv, write_grid
 
 from sb3_cure.experiments import report
-from sb3_cure.experiments.results import read_results
-from sb3_cure.experiments.tables import NONE, conditions_table
+from sb3_cure.experiments.tables import NONE
 
 TASK = "cartpole-swingup"
 HOSTILE = '<img src=x onerror=alert(1)>|$x$ "quoted" [a](b)'
@@ -221,18 +220,6 @@ def test_conditions_and_plots(results: Path) -> None:
     for name in ("curves/learning_curves", "curves/paired_difference", "curves/aggregates", "visitation/coverage"):
         with Image.open(results / f"{name}.png") as image:
             assert min(image.size) > 100
-
-
-def test_all_commits_of_cell_are_told(tmp_path: Path) -> None:
-    """Of a cell that was resumed with other code the last one alone would be false."""
-    write_curves(tmp_path)
-    path = tmp_path / TASK / "sac_ae" / "seed1" / "run.json"
-    resumed = {"history": [{}, {"commit": "older"}, {"commit": "abc1234"}]}
-    path.write_text(json.dumps({**json.loads(path.read_text()), **resumed}))
-    table = conditions_table(read_results(tmp_path)[0])
-    commits = table.rows.set_index(["arm", "seeds"]).commit
-    assert (commits["sac_ae", "0"], commits["sac_ae", "1"]) == ("abc1234", "unknown, older, abc1234")
-    assert f"at different commits: {TASK} seed 1." in table.note
 
 
 def test_page_holds_everything_itself(results: Path) -> None:
