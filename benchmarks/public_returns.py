@@ -33,7 +33,8 @@ _EVAL_COLUMNS = ("environment_steps", "agent_steps", "updates", "seconds", "retu
 
 
 def public_cell(cell: Cell) -> Cell:
-    """
+    """Cell of the public implementation that matches one of ours.
+
     :param cell: One of ours, in SAC-AE's settings
     :return: The public implementation's with the same environment, seed and budget
     """
@@ -74,7 +75,8 @@ class PublicTraining:
         self.updates = 0
 
     def steps(self) -> Iterator[int]:
-        """
+        """Train step by step.
+
         :return: Agent steps so far, before each step and after the last: between two of them one is made
         """
         warmup, total = self.settings["learning_starts"], -(-self.cell.budget // self.action_repeat)
@@ -108,7 +110,8 @@ class _PublicRun(PublicTraining):
         self.began = time.monotonic()
 
     def learn(self) -> list[Row]:
-        """
+        """Train and evaluate.
+
         :return: Rows of ``eval.csv``
         """
         for step in self.steps():
@@ -132,7 +135,8 @@ class _PublicRun(PublicTraining):
 
 
 def episode_return(env: gym.Env, act: Callable[[np.ndarray], np.ndarray], seed: int | None) -> float:
-    """
+    """Play one episode.
+
     :param env: One (not vectorised) environment
     :param act: From an observation to an action
     :param seed: Of the reset
