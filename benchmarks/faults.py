@@ -1,4 +1,4 @@
-"""Kill a training at every point where it writes a checkpoint, fill its disk, damage its files: what is lost?
+"""Kill a training at every point where it writes a checkpoint, fill its disk, damage its files: and see what is lost.
 
 python -m benchmarks.faults --out results/robustness (an hour; with --points 40, three minutes)
 
