@@ -17,7 +17,8 @@ from benchmarks.parts import parts, run_part
 
 
 def to_markdown(results: Mapping[str, Any], level: int = 1) -> list[str]:
-    """
+    """Format nested results as Markdown.
+
     :param results: Nested dictionaries of numbers
     :param level: Level of the headings
     :return: Lines of a report: a table wherever all values are dictionaries of numbers

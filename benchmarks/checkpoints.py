@@ -52,7 +52,8 @@ def _peak_mb(reset: bool = False) -> float:
 
 
 def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
-    """
+    """Time checkpoints against the bare writing of their frames.
+
     :param repeats: Checkpoints, each after ``NEW_STEPS`` new transitions, in turn with the bare writing of the frames,
         in one call and in pieces as a checkpoint writes them
     :param directory: Where to write; by default where temporary files go

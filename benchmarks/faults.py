@@ -1,4 +1,4 @@
-"""Kill a training at every point where it writes a checkpoint, fill its disk, damage its files: what is lost?
+"""Kill a training at every point where it writes a checkpoint, fill its disk, damage its files: and see what is lost.
 
 python -m benchmarks.faults --out results/robustness (an hour; with --points 40, three minutes)
 
@@ -219,7 +219,8 @@ class Site:
                     yield Fault(kind, file=str(path.relative_to(self.after)))
 
     def suffer(self, fault: Fault) -> Outcome:
-        """
+        """Inject a fault and classify its outcome.
+
         :param fault: What goes wrong
         :return: What came of it
         """
@@ -351,7 +352,8 @@ def _damage(path: Path, kind: str) -> None:
 def campaign(
     folder: Path, points: int | None = None, report: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Outcome]:
-    """
+    """Run the fault campaign.
+
     :param folder: Where to work
     :param points: How many of the failing writes to take, evenly spread; by default all (damages are all taken)
     :param report: Called after each fault with how many are done, and of how many

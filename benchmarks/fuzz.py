@@ -62,7 +62,8 @@ class Dots(gym.Env):
 
 @cache
 def example_model() -> CuReSAC:
-    """
+    """Small model whose archive is mutated.
+
     :return: The smallest model that has everything: a head with buffers, a curious agent, a replay buffer
     """
     encoder = dict(n_filters=2, n_layers=2, features_dim=4)
@@ -85,7 +86,8 @@ def example_model() -> CuReSAC:
 
 @cache
 def examples() -> dict[str, bytes]:
-    """
+    """Files to mutate.
+
     :return: The files to mutate, by what they are
     """
     model, files = example_model(), {kind: io.BytesIO() for kind in ("model", "buffer", "state")}
@@ -97,7 +99,8 @@ def examples() -> dict[str, bytes]:
 
 
 def load(kind: str, data: bytes) -> None:
-    """
+    """Load a mutated file as users do.
+
     :param kind: ``"model"``, ``"buffer"`` or ``"state"``
     :param data: The file's bytes
     """
@@ -128,7 +131,8 @@ def _hook(event: str, arguments: tuple) -> None:
 
 @contextlib.contextmanager
 def watching() -> Iterator[list[str]]:
-    """
+    """Watch for side effects of loading.
+
     :return: What was done within this context that no load of an untrusted file may do
     """
     global _events, _hooked
@@ -172,7 +176,8 @@ def limited_time() -> Iterator[None]:
 
 
 def outcome(loads: Callable[[], None]) -> str:
-    """
+    """Classify the result of loading a mutated file.
+
     :param loads: Loads something
     :return: ``"loaded"``, ``"refused"``, ``"asked for too much"``, or what it did that it may not
     """
@@ -192,7 +197,8 @@ def outcome(loads: Callable[[], None]) -> str:
 
 
 def members_of(data: bytes) -> dict[str, bytes]:
-    """
+    """Members of an archive.
+
     :param data: A zip file
     :return: Its members
     """
@@ -201,7 +207,8 @@ def members_of(data: bytes) -> dict[str, bytes]:
 
 
 def zip_of(members: dict[str, bytes]) -> bytes:
-    """
+    """Build an archive from its members.
+
     :param members: Contents by name
     :return: A zip file that stores them
     """
@@ -213,7 +220,8 @@ def zip_of(members: dict[str, bytes]) -> bytes:
 
 
 def mutate(data: bytes, rng: random.Random) -> tuple[str, bytes]:
-    """
+    """Mutate bytes.
+
     :param data: A file of ``examples``
     :param rng: Source of randomness
     :return: Kind of the mutation, and the mutated file
@@ -256,7 +264,8 @@ def mutate(data: bytes, rng: random.Random) -> tuple[str, bytes]:
 
 
 def parts_of(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """
+    """Header and data of a safetensors file.
+
     :param data: A safetensors file
     :return: Its header and the bytes of its tensors
     """
@@ -265,7 +274,8 @@ def parts_of(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def safetensors_of(header: Any, body: bytes) -> bytes:
-    """
+    """Build a safetensors file from header and data.
+
     :param header: Header, or anything else
     :param body: Bytes of the tensors
     :return: A safetensors file
@@ -327,7 +337,8 @@ def _changed(node: Any, rng: random.Random) -> Any:
 
 
 def fuzz(n_inputs: int, seed: int = 0) -> tuple[dict[str, dict[str, int]], list[str]]:
-    """
+    """Mutate files and load them.
+
     :param n_inputs: How many files to make and load
     :param seed: Of the mutations
     :return: Counts by kind of file and outcome, and what went wrong

@@ -18,7 +18,8 @@ from sb3_cure.data.buffers import FrameStackReplayBuffer
 
 
 def by_batch(sizes: tuple[int, ...] = (32, 64, 128, 256), repeats: int = 3) -> dict[str, Any]:
-    """
+    """Time updates by batch size.
+
     :param sizes: Batch sizes
     :param repeats: Rounds
     :return: Time of an update by batch size
@@ -29,7 +30,8 @@ def by_batch(sizes: tuple[int, ...] = (32, 64, 128, 256), repeats: int = 3) -> d
 
 
 def by_image(sizes: tuple[int, ...] = (36, 48, 64, 84), repeats: int = 3) -> dict[str, Any]:
-    """
+    """Time updates by image size.
+
     :param sizes: Sides of the images, pixels
     :param repeats: Rounds
     :return: Time of an update by image size
@@ -42,7 +44,8 @@ def by_image(sizes: tuple[int, ...] = (36, 48, 64, 84), repeats: int = 3) -> dic
 
 
 def by_buffer(sizes: tuple[int, ...] = (1000, 10_000, 80_000), repeats: int = 7) -> dict[str, Any]:
-    """
+    """Time samples and measure memory by capacity of the buffer.
+
     :param sizes: Capacities; each buffer is filled twice over with the same real frames, again and again
     :param repeats: Rounds
     :return: By capacity: time of ``sample(128)``, and the process's memory when the buffer was full for the first time
@@ -70,7 +73,8 @@ def by_buffer(sizes: tuple[int, ...] = (1000, 10_000, 80_000), repeats: int = 7)
 
 
 def on_disk(size: int, directory: str) -> dict[str, Any]:
-    """
+    """Measure a buffer whose frames lie in a file.
+
     :param size: Capacity of a buffer whose frames lie in a file
     :param directory: Where
     :return: Time to fill it, time of ``sample(128)``, and the memory that the process itself needs beside the file,

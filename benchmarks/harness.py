@@ -66,7 +66,8 @@ def median_ratio(times: Times, numerator: str, denominator: str) -> float:
 
 
 def summary(seconds: Sequence[float]) -> dict[str, float]:
-    """
+    """Summarise times.
+
     :param seconds: Times of one variant
     :return: Median, least and greatest, in milliseconds
     """
@@ -78,14 +79,16 @@ def summary(seconds: Sequence[float]) -> dict[str, float]:
 
 
 def memory_mb() -> float:
-    """
+    """Resident memory of this process.
+
     :return: Resident memory of this process, MiB
     """
     return psutil.Process().memory_info().rss / 2**20
 
 
 def anonymous_memory_mb() -> float:
-    """
+    """Memory of this process that no file backs.
+
     :return: Resident memory of this process that is not a mapped file, MiB
     """
     memory = psutil.Process().memory_info()
@@ -93,7 +96,8 @@ def anonymous_memory_mb() -> float:
 
 
 def describe_machine() -> dict[str, Any]:
-    """
+    """Describe the machine and the versions.
+
     :return: What the numbers depend on
     """
     return {
@@ -119,7 +123,8 @@ def describe_machine() -> dict[str, Any]:
 
 
 def machine_title(machine: dict[str, Any]) -> str:
-    """
+    """Title of a machine.
+
     :param machine: Result of ``describe_machine``
     :return: What tells its report from others: processors of one name may have other instructions
     """
@@ -128,7 +133,8 @@ def machine_title(machine: dict[str, Any]) -> str:
 
 
 def make_env(**kwargs: Any) -> gym.Env:
-    """
+    """Make the environment of the benchmarks.
+
     :param kwargs: For ``make_dmc_env``
     :return: Cartpole-swingup from pixels
     """
@@ -160,7 +166,8 @@ def stream(n_steps: int = N_FRAMES, **env_kwargs: Any) -> list[tuple[Any, ...]]:
 
 
 def fill(buffer: ReplayBuffer, transitions: Sequence[tuple[Any, ...]]) -> None:
-    """
+    """Add transitions to a buffer.
+
     :param buffer: Any replay buffer of SB3's kind
     :param transitions: Result of ``stream``
     """

@@ -1,15 +1,15 @@
-"""Do the tests notice a wrong operator? Small faults, one at a time, in the files that compute the method.
+"""Mutation testing: run the tests against small faults, one at a time, in the files that compute the method.
 
-python -m benchmarks.mutation --jobs 2
+    python -m benchmarks.mutation --jobs 2
 
-cosmic-ray's operators list the mutants of each file in ``TESTS``. The seed decides which are drawn: as many of each
-file (small files give all they have), in turn from each kind of operator, and one per place before a second one there.
-Left out are type hints and operators of another type (``+`` by ``|``). Each mutant runs in a copy of package and tests.
-The tests of a file are a fast part of the suite: its other tests may kill what survives here.
+cosmic-ray's operators list the mutants of each file in ``TESTS``. The seed decides which are drawn: equally many of
+each file (small files give all they have), in turn from each kind of operator, and one per place before a second one.
+Type hints and operators of another type (``+`` by ``|``) are left out. Each mutant runs in a copy of package and tests.
+The tests of a file are a fast part of the suite: its other tests may kill mutants that survive here.
 
-``mutation.csv`` has a row for each. What has one is not run again, so that a run that was killed goes on where it was;
-delete rows of survivors to run them against new tests. Lines may move: ``id`` is made of function, code and operator.
-``reason`` is written by hand, why a survivor lives; one that begins with "equivalent" does not count in the score.
+``mutation.csv`` has a row for each. Mutants with a row are not run again, so that a killed run continues; delete rows
+of survivors to run them against new tests. Lines may move: ``id`` is made of function, code and operator. ``reason`` is
+written by hand, why a survivor lives; one that begins with "equivalent" does not count in the score.
 """
 
 import argparse
@@ -37,25 +37,35 @@ from cosmic_ray.plugins import get_operator, operator_names
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 
 ROOT = Path(__file__).resolve().parent.parent
-#: What should kill the mutants of each file, the likeliest and fastest first (below tests/, or options of pytest)
-TESTS = {
-    "cure.py": """test_gradients.py test_actor_critic.py test_temperatures.py test_polyak_rates.py test_warmup_burst.py
-        test_curiosity_target.py test_guards.py test_alternating.py test_resume_and_more.py test_training.py
+#: Tests of each file or group of files, the likeliest and fastest first (paths below tests/, or options of pytest)
+GROUPS = {
+    "cure/cure.py": """cure/test_gradients.py cure/test_actor_critic.py cure/test_temperatures.py test_polyak_rates.py
+        cure/test_warmup_burst.py cure/test_curiosity_target.py cure/test_alternating.py
+        persistence/test_resume_and_more.py cure/test_training.py
         srl/test_contract.py::test_error_is_one_number_per_sample_detached
-        test_sb3_parity.py::test_updates_of_tqc_equal_sb3_contrib
+        cure/test_sb3_parity.py::test_updates_of_tqc_equal_sb3_contrib
         -k 'not (one_update_per or vectors or can_be_changed or frame_stack or bar or csv or board)'""",
-    "critics.py": "test_critics.py test_gradients.py test_actor_critic.py",
-    "encoder_update.py": "test_encoder_update.py test_encoder_shares.py test_gradients.py",
-    "mixers.py": "test_mixers.py test_resume_and_more.py test_training.py::test_schedules_begin_where_the_call_begins",
-    "intrinsic/__init__.py": "intrinsic test_arguments.py",
-    "intrinsic/base.py": "intrinsic test_curiosity_target.py test_gradients.py",
-    "intrinsic/srl_error.py": "intrinsic test_curiosity_target.py test_gradients.py",
-    "buffers.py": "test_buffers.py persistence/test_frame_rows.py",
+    "cure/critics.py": "cure/test_critics.py cure/test_gradients.py cure/test_actor_critic.py",
+    "cure/encoder_update.py": "cure/test_encoder_update.py cure/test_encoder_shares.py cure/test_gradients.py",
+    "cure/mixers.py": """cure/test_mixers.py persistence/test_resume_and_more.py
+        cure/test_training.py::test_schedules_begin_where_the_call_begins""",
+    "cure/pretraining.py": "cure -k pretrain",
+    "srl/*.py": "srl cure/test_dictionaries.py",
+    "intrinsic/*.py": "intrinsic cure/test_curiosity_target.py cure/test_gradients.py cure/test_dictionaries.py",
+    "data/buffers.py": "data/test_buffers.py persistence/test_frame_rows.py",
 }
-#: Only these replace each other; "Delete" takes a sign or a negation away
+#: The same by file; a pattern that matches no file stays, and is then missed
+TESTS = {
+    path: tests
+    for pattern, tests in GROUPS.items()
+    for path in sorted(f"{pattern.partition('/')[0]}/{file.name}" for file in (ROOT / "sb3_cure").glob(pattern))
+    or [pattern]
+}
+#: Operators that replace each other; "Delete" removes a sign or a negation
 ALIKE = ("Add Sub Mul Div FloorDiv Mod Pow", "BitOr BitAnd BitXor", "Eq NotEq Lt LtE Gt GtE", "Is IsNot", "UAdd USub")
 #: CPU seconds of a mutant, so that other work on the machine changes nothing; twenty times as long if it just waits
 LIMIT = 120
+_FIELDS = ("file", "function", "operator", "code", "id", "line", "place", "kind", "occurrence")
 COLUMNS = ("id", "file", "line", "function", "operator", "code", "mutant", "outcome", "test", "cpu_seconds", "reason")
 
 
@@ -82,7 +92,7 @@ def _mutants(file: str) -> Iterator[Row]:
 
 def _draw(file: str, seed: int) -> pd.DataFrame:
     """All mutants of a file, in the order of drawing: by a hash, so that an edit leaves those of other code alone."""
-    rows = pd.DataFrame(_mutants(file))
+    rows = pd.DataFrame(_mutants(file), columns=_FIELDS)
     rows["turn"] = [hashlib.sha256(f"{seed} {name}".encode()).hexdigest() for name in rows["id"]]
     for group in (["kind", "place"], ["kind"]):  # the first of each group, then the second of each, and so on
         rows = rows.sort_values("turn", kind="stable")
@@ -93,7 +103,7 @@ def _draw(file: str, seed: int) -> pd.DataFrame:
 def _run(row: Row) -> Row:
     """Run a file's tests on a copy with this mutant; without an operator, on the code as it is."""
     with tempfile.TemporaryDirectory(prefix="mutation-", ignore_cleanup_errors=True) as folder:
-        for name in ("sb3_cure", "tests"):
+        for name in ("sb3_cure", "tests", "benchmarks"):
             shutil.copytree(ROOT / name, Path(folder, name), ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", folder)
         path, mutant = Path(folder, "sb3_cure", row["file"]), ""
@@ -140,7 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "results/robustness", help="folder to write")
     parser.add_argument("--only", nargs="+", choices=list(TESTS), default=list(TESTS), help="files (default: all)")
-    parser.add_argument("--sample", type=int, default=320, help="mutants of all files together (default: 320)")
+    parser.add_argument("--sample", type=int, default=480, help="mutants of all files together (default: 480)")
     parser.add_argument("--seed", type=int, default=0, help="decides which are drawn (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="how many run at the same time (default: 2)")
     options = parser.parse_args()

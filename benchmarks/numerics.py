@@ -54,7 +54,8 @@ def _train(arm: str, seed: int, state: dict[str, Any], updates: int, tail: int, 
 
 
 def measure(updates: int = 2000, tail: int = 200, seeds: tuple[int, ...] = tuple(range(12))) -> dict[str, Any]:
-    """
+    """Compare bfloat16 with float32 on the same batches.
+
     :param updates: Updates of each arm
     :param tail: The last updates, over which the values are averaged
     :param seeds: Seeds of the random numbers (the noise of actions and dither, the order of the samples)

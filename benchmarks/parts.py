@@ -11,7 +11,8 @@ from sb3_cure.networks.allocator import tune_allocator
 
 
 def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, Any]]]:
-    """
+    """Measurements by name, in the order of the report.
+
     :param repeats: Rounds of the comparisons
     :param disk: Directory for the buffer of a million transitions (22 GB), or None
     :return: What can be measured, by name, in the order of the report
@@ -35,7 +36,8 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
 
 
 def run_part(part: str, repeats: int, disk: str | None) -> tuple[dict[str, Any], float]:
-    """
+    """Run one measurement.
+
     :param part: A name of ``parts``
     :param repeats: Rounds of the comparisons
     :param disk: As for ``parts``

@@ -12,7 +12,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -23,13 +23,7 @@ import torch as th
 from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.result_files import Row, checkout_commit, describe_run, write_csv, write_json, write_text
-from sb3_cure.experiments.cells import (
-    EVAL_SEED,
-    alone_in,
-    check_settings,
-    is_evaluation_due,
-    run_cell,
-)
+from sb3_cure.experiments.cells import EVAL_SEED, alone_in, check_cell, is_evaluation_due, run_cell
 from sb3_cure.experiments.grid import DONE, Cell, GridError, load_grid
 from sb3_cure.networks.allocator import tune_allocator
 
@@ -39,7 +33,8 @@ _EVAL_COLUMNS = ("environment_steps", "agent_steps", "updates", "seconds", "retu
 
 
 def public_cell(cell: Cell) -> Cell:
-    """
+    """Cell of the public implementation that matches one of ours.
+
     :param cell: One of ours, in SAC-AE's settings
     :return: The public implementation's with the same environment, seed and budget
     """
@@ -80,7 +75,8 @@ class PublicTraining:
         self.updates = 0
 
     def steps(self) -> Iterator[int]:
-        """
+        """Train step by step.
+
         :return: Agent steps so far, before each step and after the last: between two of them one is made
         """
         warmup, total = self.settings["learning_starts"], -(-self.cell.budget // self.action_repeat)
@@ -114,7 +110,8 @@ class _PublicRun(PublicTraining):
         self.began = time.monotonic()
 
     def learn(self) -> list[Row]:
-        """
+        """Train and evaluate.
+
         :return: Rows of ``eval.csv``
         """
         for step in self.steps():
@@ -138,7 +135,8 @@ class _PublicRun(PublicTraining):
 
 
 def episode_return(env: gym.Env, act: Callable[[np.ndarray], np.ndarray], seed: int | None) -> float:
-    """
+    """Play one episode.
+
     :param env: One (not vectorised) environment
     :param act: From an observation to an action
     :param seed: Of the reset
@@ -161,15 +159,14 @@ def run_public(checkout: Path, cell: Cell, results: Path) -> None:
     """
     tune_allocator()
     folder = results / cell.folder
-    config = {key: value for key, value in cell.config().items() if key != "defaults"}  # those of ours
-    check_settings(folder, config)
+    check_cell(folder, cell)
     folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
         if (folder / DONE).exists():
             return
         commit = checkout_commit(checkout)  # of what runs: later the checkout may have moved on
         run = _PublicRun(checkout, cell)
-        write_json(folder / "config.json", {**config, "action_repeat": run.action_repeat})
+        write_json(folder / "config.json", {**asdict(cell), "action_repeat": run.action_repeat})
         write_csv(folder / "eval.csv", _EVAL_COLUMNS, run.learn())
         conditions = {
             "device": "cpu",

@@ -70,13 +70,15 @@ class _Buffer:
         self._batches: Iterator[ReplayBufferSamples] = itertools.cycle(batches)
 
     def next(self) -> ReplayBufferSamples:
-        """
+        """Return the next batch.
+
         :return: A batch, as ``PlainSacAe`` takes it
         """
         return next(self._batches)
 
     def sample(self) -> tuple[th.Tensor, ...]:
-        """
+        """Sample a batch.
+
         :return: A batch, as the public implementation's own buffer returns it
         """
         batch = self.next()
@@ -85,7 +87,8 @@ class _Buffer:
 
 
 def import_public(checkout: Path, module: str) -> ModuleType:
-    """
+    """Import a module of the public implementation.
+
     :param checkout: Folder that holds the public implementation's files
     :param module: Name of one of them, without ending
     :return: The module
@@ -102,7 +105,8 @@ def import_public(checkout: Path, module: str) -> ModuleType:
 
 
 def public_agent(checkout: Path, shape: tuple[int, ...], n_actions: int, **changes: Any) -> Any:
-    """
+    """Make an agent of the public implementation.
+
     :param checkout: Folder that holds the public implementation's files
     :param shape: Of an observation, [C, H, W] with H = W
     :param n_actions: Size of an action
@@ -117,7 +121,8 @@ def public_agent(checkout: Path, shape: tuple[int, ...], n_actions: int, **chang
 
 
 def checkout_folder(text: str) -> Path:
-    """
+    """Check the folder of the public implementation.
+
     :param text: From the command line
     :return: The folder of that name, which holds the public implementation
     :raises argparse.ArgumentTypeError: if it does not
@@ -129,7 +134,8 @@ def checkout_folder(text: str) -> Path:
 
 
 def checkout_argument(parser: argparse.ArgumentParser) -> None:
-    """
+    """Add the argument that names the public implementation's folder.
+
     :param parser: Gets the argument ``checkout``, which must hold the public implementation
     """
     parser.add_argument(
@@ -147,7 +153,8 @@ def _agents(checkout: Path, setting: Setting) -> tuple[Any, PlainSacAe, Any]:
 
 
 def compare_losses(checkout: Path, setting: Setting, updates: int = 10) -> float:
-    """
+    """Compare the losses of both implementations on the same batch.
+
     :param checkout: Folder that holds the public implementation's files
     :param setting: Images and networks
     :param updates: How many
@@ -174,7 +181,8 @@ def compare_losses(checkout: Path, setting: Setting, updates: int = 10) -> float
 
 
 def measure(checkout: Path, setting: Setting, repeats: int, tuned: bool) -> Times:
-    """
+    """Time updates of both implementations.
+
     :param checkout: Path of the public implementation's checkout
     :param setting: Images and networks
     :param repeats: Rounds

@@ -22,7 +22,8 @@ def _step_call(env: gym.Env) -> Callable[[], object]:
 
 
 def measure(repeats: int = 7) -> dict[str, Any]:
-    """
+    """Time environment steps that render one frame.
+
     :param repeats: Rounds
     :return: Time of one environment step of action repeat 1, which renders one frame, by setting
     """

@@ -13,7 +13,8 @@ OURS, SB3 = "FrameStackReplayBuffer", "SB3 ReplayBuffer"
 
 
 def measure(repeats: int = 15, buffer_size: int = 12_000) -> dict[str, Any]:
-    """
+    """Compare our replay buffer with SB3's.
+
     :param repeats: Rounds
     :param buffer_size: Capacity of both, which fill entirely: far more than a processor's cache holds
     :return: Bytes per transition and sample times

@@ -78,7 +78,8 @@ class Rooms(gym.Env):
         return self.put(ROOMS[0]), {}
 
     def put(self, room: str) -> np.ndarray:
-        """
+        """Begin an episode in a room.
+
         :param room: Where to begin
         :return: First observation, [2, H, W]
         """
@@ -104,7 +105,8 @@ class Rooms(gym.Env):
 
 
 def make_agent(arm: str, seed: int, closed: bool) -> CuReSAC:
-    """
+    """Make an agent with a reward.
+
     :param arm: A key of ``ARMS``
     :param seed: Of everything
     :param closed: Whether the new room is
@@ -118,7 +120,8 @@ def make_agent(arm: str, seed: int, closed: bool) -> CuReSAC:
 
 
 def paid(arm: str, seed: int, updates: int) -> dict[str, float]:
-    """
+    """Mean reward by room.
+
     :param arm: A key of ``ARMS``
     :param seed: Of everything
     :param updates: Of the agent, on 500 random steps
@@ -165,7 +168,8 @@ class _Where(BaseCallback):
 
 
 def visits(arm: str, seed: int, steps: int) -> dict[str, float]:
-    """
+    """Share of steps by room.
+
     :param arm: A key of ``ARMS``
     :param seed: Of everything
     :param steps: Of the agent, the first 500 of them random
@@ -193,7 +197,8 @@ def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """
+    """Summarise visits in a table.
+
     :param rows: Of ``rewards.csv``
     :return: Lines of a table: means over seeds
     """

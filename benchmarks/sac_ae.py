@@ -188,7 +188,8 @@ class PlainSacAe:
 
     @staticmethod
     def dither(images: th.Tensor) -> th.Tensor:
-        """
+        """Reduce images to 5 bits, with dither.
+
         :param images: [B, C, H, W]
         :return: Uniform noise in [0, 1) of that shape
         """

@@ -67,7 +67,8 @@ BLOCK = 10
 
 
 def measure(repeats: int = 7, settings: tuple[Setting, ...] = SETTINGS) -> dict[str, Any]:
-    """
+    """Time updates of ours and of plain SAC-AE in each setting.
+
     :param repeats: Rounds that count
     :param settings: What to measure
     :return: By setting: milliseconds per update, ratios, and the floor
@@ -119,7 +120,8 @@ def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
 
 
 def added_costs(models: Mapping[str, Any], beside: Callable[[str], str], repeats: int) -> dict[str, dict[str, float]]:
-    """
+    """Time that variants add to an update.
+
     :param models: Models by name
     :param beside: Name of the model that another one's update is compared with
     :param repeats: Rounds that count

@@ -98,14 +98,16 @@ class Faults(gym.Wrapper):
         return observation, reward, terminated, truncated, info
 
     def gl_contexts(self) -> int:
-        """
+        """Count OpenGL contexts.
+
         :return: Rendering contexts of dm_control that this process holds
         """
         return count_gl_contexts()
 
 
 def count_gl_contexts() -> int:
-    """
+    """Count OpenGL contexts.
+
     :return: Rendering contexts of dm_control that this process holds
     """
     base = sys.modules.get("dm_control._render.base")
@@ -113,7 +115,8 @@ def count_gl_contexts() -> int:
 
 
 def make_env(kind: str, rate: float) -> gym.Env:
-    """
+    """Make an environment of the soak test.
+
     :param kind: ``"dot"`` or ``"dmc"``
     :param rate: Probability of a fault in a step
     :return: A pixel environment that fails now and then
@@ -124,7 +127,8 @@ def make_env(kind: str, rate: float) -> gym.Env:
 
 
 def state(env: gym.Env) -> np.ndarray:
-    """
+    """Visible state of an environment.
+
     :param env: What ``make_env`` made
     :return: What moves in the picture
     """
@@ -162,7 +166,8 @@ class Watch(BaseCallback):
         return True
 
     def look(self) -> dict[str, float]:
-        """
+        """Record the state of the process.
+
         :return: One row
         """
         gc.collect()  # or the number of objects that wait for it is measured
@@ -189,7 +194,8 @@ class Watch(BaseCallback):
 
 
 def slope(rows: list[dict[str, float]], name: str, start: float) -> float:
-    """
+    """Slope of a measurement over time.
+
     :param rows: What was written down
     :param name: A column
     :param start: Agent steps before which rows do not count
@@ -201,7 +207,8 @@ def slope(rows: list[dict[str, float]], name: str, start: float) -> float:
 
 
 def judge(rows: list[dict[str, float]], filled: float) -> dict[str, Any]:
-    """
+    """Judge whether measurements stay level.
+
     :param rows: What was written down
     :param filled: Agent steps after which the replay buffer is full
     :return: Growth after that, and whether it is within the bar (of memory only if 10 000 steps and more came after)
@@ -219,7 +226,8 @@ def judge(rows: list[dict[str, float]], filled: float) -> dict[str, Any]:
 
 
 def plot(rows: list[dict[str, float]], filled: float, path: Path) -> None:
-    """
+    """Plot measurements over time.
+
     :param rows: What was written down
     :param filled: Agent steps after which the replay buffer is full
     :param path: PNG file

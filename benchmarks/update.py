@@ -28,7 +28,8 @@ def _yardstick_call() -> Callable[[], object]:
 
 
 def measure(repeats: int = 7, precisions: tuple[str, ...] = PRECISIONS) -> dict[str, Any]:
-    """
+    """Time updates by mode, precision and head.
+
     :param repeats: Rounds
     :param precisions: Number formats to measure
     :return: Times by variant, and the ratios that matter
@@ -75,7 +76,8 @@ class PhaseTimer:
         self._inner: list[float] = []
 
     def wrap(self, owner: Any, method: str, phase: str) -> None:
-        """
+        """Time a method.
+
         :param owner: Object whose method is timed from now on
         :param method: Name of the method
         :param phase: Name under which its time is counted
@@ -90,7 +92,8 @@ class PhaseTimer:
 
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """
+        """Time a phase.
+
         :param name: What happens within
         """
         self._inner.append(0.0)
@@ -105,7 +108,8 @@ class PhaseTimer:
 
 
 def breakdown(updates: int = 20, **kwargs: Any) -> dict[str, float]:
-    """
+    """Time the phases of an update.
+
     :param updates: Updates to average over
     :param kwargs: For ``CuReSAC``
     :return: Milliseconds per update by phase
@@ -133,7 +137,8 @@ def breakdown(updates: int = 20, **kwargs: Any) -> dict[str, float]:
 
 
 def breakdowns() -> dict[str, Any]:
-    """
+    """Time the phases of an update for each head.
+
     :return: Result of ``breakdown`` by head, in the default mode
     """
     return {head: breakdown(srl=head) for head in ("rae", "curl")}

@@ -100,7 +100,8 @@ class RecordUpdates(RecordCurve):
 
 
 def settings_of(srl: str, steps: int) -> dict[str, Any]:
-    """
+    """Settings of an arm.
+
     :param srl: A key of ``HEADS``
     :param steps: Agent steps of each cell
     :return: What all cells of a head have in common
@@ -138,7 +139,8 @@ def run_cell(path: Path, srl: str, update: str, seed: int, steps: int) -> None:
 
 
 def read_cells(folder: Path) -> dict[tuple[str, str], dict[int, Rows]]:
-    """
+    """Read the curves of all cells.
+
     :param folder: Where the cells lie
     :return: Rows by (head, mode), by seed
     """

@@ -37,7 +37,8 @@ COLUMNS = ("task", "predictor", "updates", "seed", "error_min", "error_mean", "e
 def measure_task(
     task: str, seeds: Sequence[int], updates: Sequence[int], steps: int, **env_kwargs: object
 ) -> list[Row]:
-    """
+    """Measure the predictors on a task.
+
     :param task: Gymnasium id
     :param seeds: Of autoencoders
     :param updates: When to measure them

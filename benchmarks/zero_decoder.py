@@ -35,7 +35,8 @@ COLUMNS = ("mujoco", "dm_control", "machine", "task", "seed", "predictor", "erro
 
 
 def targets(domain: str, task: str, action_repeat: int, seed: int, steps: int = 120) -> np.ndarray:
-    """
+    """Targets of an autoencoder in random episodes.
+
     :param domain: Of the DeepMind Control suite
     :param task: Of the domain
     :param action_repeat: For how long each random action is held
@@ -60,7 +61,8 @@ def targets(domain: str, task: str, action_repeat: int, seed: int, steps: int = 
 
 
 def constant_errors(drawn: np.ndarray) -> dict[str, np.ndarray]:
-    """
+    """Errors of constant predictions.
+
     :param drawn: What is to be drawn, [n, H, W, C]
     :return: Mean squared errors: of zero and of the best constant colour for each picture [n]; of drawing one of the
         pictures where another one is seen, for each pair [n * (n - 1)]

@@ -1,4 +1,4 @@
-"""``python -m sb3_cure.zoo`` does what the command ``sb3-cure`` does; rl-zoo3's side is in :mod:`sb3_cure.cli.zoo`."""
+"""``python -m sb3_cure.zoo`` runs the command ``sb3-cure``; the code for rl-zoo3 is in :mod:`sb3_cure.cli.zoo`."""
 
 from sb3_cure.cli.main import main
 

@@ -37,6 +37,8 @@ def write_grid(folder: Path, **changes: Any) -> dict[str, Any]:
         "evaluation": {"every": 10_000, "episodes": 10},
         **changes,
     }
+    if isinstance(grid["seeds"], int):
+        grid["seeds"] = list(range(grid["seeds"]))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "grid.json").write_text(json.dumps(grid))
     return grid

@@ -1,6 +1,6 @@
-"""``sb3-cure doctor``: what this machine has, which choices follow from it, and what to install.
+"""``sb3-cure doctor``: show this machine, the choices that follow from it, and what to install.
 
-The exit status is 0 where training can work, else 1; what is only slow is a warning.
+The exit status is 0 if training can work, else 1; things that are only slow are warnings.
 """
 
 import argparse
@@ -19,9 +19,9 @@ from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_re
 from sb3_cure.networks.precision import resolve_precision
 
 PACKAGE = "sb3-cure"
-#: What networks compute in bf16 where they can
+#: Observations for which precision="auto" is shown
 IMAGES = spaces.Box(0, 255, (3, 84, 84), np.uint8)
-#: Extras that users may want, and for what; the remaining ones are for developing sb3_cure
+#: Purpose of each extra; the other extras are for developing sb3_cure
 EXTRAS = {
     "demo": "plots, videos, TensorBoard, progress bars",
     "zoo": "training and tuning from YAML files",
@@ -32,12 +32,12 @@ EXTRAS = {
 
 
 def needed_packages() -> dict[str, list[str]]:
-    """
-    :return: Names of the packages that sb3-cure needs, by extra; by ``""`` those that every installation needs
+    """Names of the packages that sb3-cure needs.
+
+    :return: Names by extra; by ``""`` those that every installation needs
     """
     needed = defaultdict(list)
-    lines = metadata.requires(PACKAGE) if installed_version(PACKAGE) else None  # None: run from its sources
-    for line in lines or []:
+    for line in (metadata.requires(PACKAGE) or []) if installed_version(PACKAGE) else []:  # else run from its sources
         name = re.match(r"[\w.-]+", line)
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
         if name and name[0] != PACKAGE:
@@ -46,9 +46,10 @@ def needed_packages() -> dict[str, list[str]]:
 
 
 def installed_version(package: str) -> str | None:
-    """
-    :param package: Name of a package
-    :return: Its version, None if it is not installed
+    """Version of a package.
+
+    :param package: Its name
+    :return: The version, None if it is not installed
     """
     try:
         return metadata.version(package)
@@ -57,9 +58,10 @@ def installed_version(package: str) -> str | None:
 
 
 def check_packages(names: Sequence[str]) -> tuple[str, list[str]]:
-    """
+    """Look up packages.
+
     :param names: Names of packages
-    :return: Those that are installed, with their versions, in one line; and the names of those that are missing
+    :return: The installed ones with their versions, in one line; and the names of the missing ones
     """
     versions = {name: installed_version(name) for name in names}
     line = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
@@ -67,9 +69,10 @@ def check_packages(names: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
+    """Run the command ``sb3-cure doctor``.
+
     :param argv: Command line, ``sys.argv[1:]`` by default
-    :return: 0 where training can work, else 1
+    :return: 0 if training can work, else 1
     """
     argparse.ArgumentParser("sb3-cure doctor", description=__doc__).parse_args(argv)
     errors, warnings = [], []

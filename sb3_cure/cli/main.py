@@ -1,4 +1,4 @@
-"""The command ``sb3-cure``: one word that says what to do, and that program's own arguments."""
+"""The command ``sb3-cure``: a subcommand and its arguments."""
 
 import pkgutil
 import sys
@@ -9,7 +9,8 @@ from sb3_cure.networks.allocator import tune_allocator
 
 
 class Command(NamedTuple):
-    """
+    """A subcommand.
+
     :param program: Function of the arguments that returns the exit status, or None for 0
     :param extra: Extra of sb3-cure that it needs, or None
     :param purpose: One line for the overview
@@ -20,7 +21,7 @@ class Command(NamedTuple):
     purpose: str
 
 
-#: Programs are named, because importing them takes seconds, and their packages may be missing.
+#: Programs are imported when they run: that takes seconds, and their packages may be missing
 COMMANDS = {
     "train": Command("sb3_cure.cli.zoo:train", "zoo", "train from a YAML file (rl-zoo3's train)"),
     "enjoy": Command("sb3_cure.cli.zoo:enjoy", "zoo", "watch a trained agent, or only print its returns"),
@@ -28,20 +29,22 @@ COMMANDS = {
     "optimize": Command("sb3_cure.cli.zoo:optimize", "zoo", "search hyper-parameters (rl-zoo3's train -optimize)"),
     "experiment": Command("sb3_cure.experiments.run:main", "experiments", "run a grid of tasks, methods and seeds"),
     "report": Command("sb3_cure.experiments.report:main", "experiments", "show a grid's results as one HTML file"),
-    "doctor": Command("sb3_cure.cli.doctor:main", None, "tell what this machine has and what is missing"),
+    "doctor": Command("sb3_cure.cli.doctor:main", None, "show what this machine has and what is missing"),
 }
 
 
 def usage() -> str:
-    """
-    :return: The overview of all commands
+    """Overview of all commands.
+
+    :return: The text
     """
     lines = [f"  {name:<12} {command.purpose}" for name, command in COMMANDS.items()]
     return "\n".join(["usage: sb3-cure COMMAND [ARGUMENTS]   (sb3-cure COMMAND --help shows them)", "", *lines])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """
+    """Run a subcommand.
+
     :param argv: Command line without the program's name, ``sys.argv[1:]`` by default
     :return: Exit status
     """

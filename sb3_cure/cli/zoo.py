@@ -32,11 +32,11 @@ from sb3_cure.envs.rendering import is_headless
 DEFAULT_ALGORITHM = "cure_sac"
 #: The file of settings where ``--conf-file`` is not given
 DEFAULT_SETTINGS = "cure_sac_ae"
-#: Algorithms by the names that ``--algo`` knows them by
+#: Algorithms by their name for ``--algo``
 ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"cure_sac": sb3_cure.CuReSAC, "cure_tqc": sb3_cure.CuReTQC}
-#: Arguments of the algorithms that take a class of the user's own, which settings name as ``my_module.MyClass``
+#: Arguments of the algorithms that take a class of the user's, which settings name as ``my_module.MyClass``
 OWN = ("srl", "intrinsic")
-#: Settings of a run by which replaying it imports and calls what they name, or unpickles
+#: Settings of a run that make a replay import and call code, or unpickle files
 TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
 
 
@@ -44,15 +44,15 @@ TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
 
 
 class ExperimentManager(exp_manager.ExperimentManager):
-    """rl-zoo3's, which reads the settings and makes environments and model, with these additions:
+    """rl-zoo3's manager, which reads the settings and makes environments and model, with additions.
 
     - ``--conf-file fast/cure_sac_ae`` is one of the package's files;
     - an entry ``dmc_pixels:`` of a YAML file holds for the tasks of this namespace that have none of their own, and
       ``my_module:My-v0:`` for an environment that this module registers;
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
-    - statistics beside the model of ``-i``, which are pickled, are loaded only where the settings say ``normalize``;
-    - ``--trial-id 0`` is the first trial, where rl-zoo3 takes 0 for none;
+    - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
+    - ``--trial-id 0`` is the first trial, not none;
     - ``optimize`` samples only what the chosen kind of curiosity uses.
     """
 
@@ -111,7 +111,7 @@ def sample_params(
     curiosity: str | None = "separate",
     quantiles: bool = False,
 ) -> dict[str, Any]:
-    """What ``optimize`` varies; all else, such as the head and the networks, stays as in the YAML file.
+    """Sample the parameters that ``optimize`` varies; all others stay as in the YAML file.
 
     :param trial: Optuna's trial
     :param n_actions: Unused (rl-zoo3's signature)
@@ -142,8 +142,9 @@ def sample_params(
 
 
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: Parameters of a trial, by the names that Optuna knows them by
+    """Convert parameters of a trial.
+
+    :param sampled_params: Parameters by their names in Optuna
     :return: Arguments of the algorithm
     """
     arguments = dict(sampled_params)
@@ -154,7 +155,7 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 
 def register() -> None:
-    """Make ``cure_sac`` and ``cure_tqc`` known to rl-zoo3: to its programs, its experiment manager and its samplers."""
+    """Register ``cure_sac`` and ``cure_tqc`` with rl-zoo3's programs, experiment manager and samplers."""
     ALGOS.update(ALGORITHMS)
     for name in ALGORITHMS:
         HYPERPARAMS_SAMPLER[name] = partial(sample_params, quantiles=name == "cure_tqc")
@@ -163,9 +164,10 @@ def register() -> None:
 
 
 def train(arguments: Sequence[str]) -> None:
-    """
-    :param arguments: Command line of rl-zoo3's ``train``; unless given, ``--algo`` is ``cure_sac`` and ``--conf-file``
-        ``cure_sac_ae``. ``--env`` may be ``my_module:My-v0``, with the module that registers it
+    """Run rl-zoo3's ``train``.
+
+    :param arguments: Its command line; unless given, ``--algo`` is ``cure_sac`` and ``--conf-file`` ``cure_sac_ae``.
+        ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
     _find_modules_here()
@@ -191,7 +193,8 @@ def train(arguments: Sequence[str]) -> None:
 
 
 def optimize(arguments: Sequence[str]) -> None:
-    """
+    """Search hyper-parameters with rl-zoo3's ``train -optimize``.
+
     :param arguments: As for ``train``
     """
     train(["-optimize", *arguments])
@@ -201,10 +204,7 @@ def optimize(arguments: Sequence[str]) -> None:
 
 
 class RunLoader(yaml.SafeLoader):
-    """Reads the settings that rl-zoo3 saves with a run: plain values, tuples and ordered dictionaries, nothing else.
-
-    Of classes and functions, such as an ``activation_fn``, the names are read, and nothing is imported.
-    """
+    """SafeLoader for the settings of a run, with tuples, ordered dictionaries, and names of classes as text."""
 
 
 RunLoader.add_constructor(
@@ -218,7 +218,8 @@ RunLoader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader,
 
 
 def enjoy(arguments: Sequence[str]) -> None:
-    """
+    """Watch a trained agent.
+
     :param arguments: Command line, see ``sb3-cure enjoy --help``
     """
     parser = _parser("enjoy", "Watch a trained agent, and print the returns of its episodes.")
@@ -227,28 +228,24 @@ def enjoy(arguments: Sequence[str]) -> None:
     if is_headless() and not args.no_render:
         print("There is no display to show the agent on (as with --no-render); `record` writes a video.")
         args.no_render = True
-    model, _ = _load(parser, args, None if args.no_render else "human")
-    env = model.get_env()
-    assert env is not None
+    model, env, _ = _load(parser, args, None if args.no_render else "human")
     episodes = _play(model, env, args)
     env.close()
     print(f"{len(episodes)} Episodes")
-    for name, key in (("reward", "r"), ("episode length", "l")):
+    for name, key in (("reward", "r"), ("episode length", "l")) if episodes else ():
         values = [episode[key] for episode in episodes]
-        if values:
-            print(f"Mean {name}: {np.mean(values):.2f} +/- {np.std(values):.2f}")
+        print(f"Mean {name}: {np.mean(values):.2f} +/- {np.std(values):.2f}")
 
 
 def record(arguments: Sequence[str]) -> None:
-    """
+    """Write a video of a trained agent.
+
     :param arguments: Command line, see ``sb3-cure record --help``
     """
     parser = _parser("record", "Write a video of a trained agent.")
     parser.add_argument("-o", "--output-folder", type=Path, help="Default: videos, in the run's folder")
     args = parser.parse_args(arguments)
-    model, path = _load(parser, args, "rgb_array")
-    env = model.get_env()
-    assert env is not None
+    model, env, path = _load(parser, args, "rgb_array")
     folder = args.output_folder or path.parent / "videos"
     recorder = VecVideoRecorder(env, str(folder), lambda step: step == 0, args.n_timesteps, name_prefix=path.stem)
     _play(model, recorder, args)
@@ -281,8 +278,8 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
 
 def _load(
     parser: argparse.ArgumentParser, args: argparse.Namespace, render_mode: str | None
-) -> tuple[OffPolicyAlgorithm, Path]:
-    """The model, in its run's environment and without a replay buffer to speak of, and its path."""
+) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
+    """The model with the smallest replay buffer, its run's environment, and its path."""
     _find_modules_here()
     module, _, task = args.env.rpartition(":")
     for package in [*args.gym_packages, *([module] if module else [])]:
@@ -305,25 +302,23 @@ def _load(
         task, stats_path=str(folder), should_render=False, hyperparams=settings, env_kwargs=env_kwargs
     )
     objects: dict[str, Any] = {name: get_class_by_name(vars(args)[name]) for name in OWN if vars(args)[name]}
-    # The smallest buffer, of the default class: it is not used, and its own may be one that archives do not hold.
+    # The smallest buffer, of the default class: it is not used, and the run's class may not be in the archive.
     objects.update(replay_buffer_class=None, replay_buffer_kwargs={}, optimize_memory_usage=False)
     load: Any = ALGORITHMS[args.algo].load
-    return load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted), path
+    model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
+    return model, model.get_env(), path
 
 
 def _find_model(parser: argparse.ArgumentParser, args: argparse.Namespace, task: str) -> Path:
-    """The model that the flags name, of the run that they name or the latest that holds one."""
+    """The model that the flags name, of their run or the latest one with a model."""
     name = EnvironmentName(task)
-
-    def number(run: Path) -> int:  # --uuid adds to it
-        return int(run.name.removeprefix(f"{name}_").partition("_")[0])
-
     runs = [run for run in Path(args.folder, args.algo).glob(f"{name}_[0-9]*") if any(run.glob("*.zip"))]
-    runs = [run for run in runs if args.exp_id in (0, number(run))]
+    numbers = {run: int(run.name.removeprefix(f"{name}_").partition("_")[0]) for run in runs}  # --uuid adds to it
+    runs = [run for run in runs if args.exp_id in (0, numbers[run])]
     if not runs:
         wanted = f"run {args.exp_id}" if args.exp_id else "run"
         parser.error(f"there is no {wanted} of {task} with a model in {Path(args.folder, args.algo)}.")
-    latest = max(runs, key=lambda run: (number(run), run.stat().st_mtime))
+    latest = max(runs, key=lambda run: (numbers[run], run.stat().st_mtime))
     pattern = f"{name}.zip"
     if args.load_best:
         pattern = "best_model.zip"
@@ -331,8 +326,7 @@ def _find_model(parser: argparse.ArgumentParser, args: argparse.Namespace, task:
         pattern = f"rl_model_{args.load_checkpoint or '*'}_steps.zip"
     models = list(latest.glob(pattern))
     if not models:
-        there = ", ".join(sorted(file.name for file in latest.glob("*.zip")))
-        parser.error(f"{latest} has no {pattern}; it has {there}.")
+        parser.error(f"{latest} has no {pattern}; it has {', '.join(sorted(f.name for f in latest.glob('*.zip')))}.")
     return max(models, key=lambda model: model.stat().st_mtime)
 
 
@@ -341,7 +335,7 @@ def _read_settings(path: Path) -> dict[str, Any]:
 
 
 def _play(model: OffPolicyAlgorithm, env: VecEnv, args: argparse.Namespace) -> list[dict[str, float]]:
-    """Monitor's summaries of the episodes that ended."""
+    """Play, and return Monitor's summaries of the finished episodes."""
     episodes = []
     observations = env.reset()
     with contextlib.suppress(KeyboardInterrupt):
@@ -355,6 +349,6 @@ def _play(model: OffPolicyAlgorithm, env: VecEnv, args: argparse.Namespace) -> l
 
 
 def _find_modules_here() -> None:
-    """Classes and environments that the user names may lie in the working directory."""
+    """Let the user name classes and environments of the working directory."""
     if "" not in sys.path:
         sys.path.append("")

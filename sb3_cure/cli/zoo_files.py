@@ -1,4 +1,4 @@
-"""The YAML files that come with the package, found by name, such as ``fast/cure_sac_ae``."""
+"""Find the YAML files of the package by name, such as ``fast/cure_sac_ae``."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def zoo_file(name: str | Path, folder: Path = ZOO) -> Path:
     :param name: A file of the package by its path in ``folder`` without suffix, or the path of any other with suffix
     :param folder: ``ZOO`` or ``GRIDS``
     :return: Path of the file; one with a suffix is returned as it is, whether it exists or not
-    :raises ValueError: with the names that there are, if a name is none of them
+    :raises ValueError: with the known names, for an unknown one
     """
     path = Path(name)
     if path.suffix:

@@ -1,4 +1,4 @@
-"""One cell of a grid: train, evaluate, keep the results. Begun anew, it goes on from its last checkpoint."""
+"""Run one cell of a grid: train, evaluate, write the results. Started again, it continues at its last checkpoint."""
 
 import contextlib
 import json
@@ -6,6 +6,7 @@ import platform
 import shutil
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,17 +23,17 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import ALGOS, DONE, Cell, GridError, comparable, constructor_defaults, read_kept
-from sb3_cure.experiments.media import draw_cell, watch_reconstructions
+from sb3_cure.experiments.grid import ALGOS, DONE, SETTINGS, Cell, GridError, constructor_defaults, read_kept
+from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
 
-#: Evaluations start from the same states in all cells, see ``run_episodes``
+#: Seed of evaluations, which start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
-#: The file that tells why a cell failed, until it is begun again
+#: File with the traceback of a failed cell, until it is started again
 ERROR = "error.txt"
-#: Between two reports of progress
-PROGRESS_SECONDS = 2.0
+#: Seconds between two writes of ``progress.json``, and between two printed lines
+PROGRESS_SECONDS, PRINT_SECONDS = 2.0, 120.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
     "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
@@ -44,19 +45,19 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     """Train and measure one cell, unless that is done.
 
     Writes ``config.json``, ``eval.csv``, ``episodes.csv``, ``run.json``, ``model.zip`` and pictures into the cell's
-    folder; ``DONE`` comes last. A cell that was interrupted goes on from its last checkpoint, and what its files
-    hold from after the checkpoint is dropped, so that no row appears twice.
+    folder; ``DONE`` comes last. A cell that was interrupted continues at its last checkpoint; rows that it wrote after
+    the checkpoint are dropped, so that no row appears twice.
 
-    :param cell: What to run
+    :param cell: The cell
     :param results: Folder of all results
-    :param checkpoint_minutes: Minutes between two checkpoints: at most so much is lost by an interruption
+    :param checkpoint_minutes: Minutes between two checkpoints, the most that an interruption loses
     :param pictures: Whether to draw and to film as well
     :return: The cell's folder
     :raises GridError: if the folder holds the same cell with other settings
     :raises CellIsRunning: if another process is running it
     """
     folder = Path(results) / cell.folder
-    check_settings(folder, cell.config())
+    check_cell(folder, cell)
     folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
         if not (folder / DONE).exists():
@@ -66,37 +67,41 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     return folder
 
 
-def check_settings(folder: Path, config: dict[str, Any], name: str = "config.json") -> None:
+def check_cell(folder: Path, cell: Cell) -> None:
+    """Refuse a folder that holds results of other settings.
+
+    :param folder: The cell's folder, whether it exists or not
+    :param cell: The cell
+    :raises GridError: if they differ
     """
-    :param folder: Of what is to be run, or has been run
-    :param config: Its settings, or some of them
-    :param name: The file that tells those that it was run with
-    :raises GridError: if the folder holds results of other settings
+    keys = ("kind", "budget", "eval_every", "eval_episodes", "coverage", *SETTINGS)
+    check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in keys})
+
+
+def check_settings(path: Path, settings: dict[str, Any]) -> None:
+    """Refuse a file of settings that differ from the given ones.
+
+    :param path: A JSON file, which may be missing
+    :param settings: Settings of this run; keys that the file lacks are not compared
+    :raises GridError: if they differ
     """
-    path = folder / name
-    if not path.exists():
-        return
-    begun, now = read_kept(path), json.loads(json.dumps(config, default=str))
-    for key in (key for key in now if key in begun):
-        there, here = comparable(key, begun[key], now[key])
-        if there != here:
-            if isinstance(there, dict) and isinstance(here, dict):  # of many, those that differ
-                names = [name for name in {**there, **here} if there.get(name) != here.get(name)]
-                there, here = ({name: each[name] for name in names if name in each} for each in (there, here))
+    before = read_kept(path) if path.exists() else {}
+    for key, now in json.loads(json.dumps(settings, default=str)).items():
+        if before.get(key, now) != now:
             raise GridError(
-                f"{folder} was run with other settings: {key} is {there!r} there and {here!r} now. Choose another "
-                "--out, or remove that folder."
+                f"{path.parent} was run with other settings: {key} was {before[key]!r} and is {now!r} now. Choose "
+                "another --out, or remove that folder."
             )
 
 
 class _CellRun:
-    """What a cell needs while it runs; ``finish`` does what is left to do."""
+    """Everything that a running cell needs."""
 
     def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool):
         self.cell, self.folder, self.pictures = cell, folder, pictures
         self.checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
         self.record = _Record(cell, folder)
-        write_json(folder / "config.json", {**cell.config(), "action_repeat": self.record.action_repeat})
+        write_json(folder / "config.json", {**asdict(cell), "action_repeat": self.record.action_repeat})
         resumed = self._resume()
         self.pretrains = cell.pretrain is not None and (resumed is None or resumed.is_pretraining)
         self.model = resumed or cell.make_model(self._make_env())
@@ -104,40 +109,39 @@ class _CellRun:
     def finish(self) -> None:
         try:
             self._train()
-            self._keep_results()
+            self._write_results()
         finally:
             self.record.eval_env.close()
             if self.model.env is not None:
                 self.model.env.close()
 
     def _train(self) -> None:
-        """The same calls whether the cell begins or goes on: a resumed model does what is left of them."""
+        """Make the same calls in every attempt: a resumed model does what is left of them."""
         cell, record = self.cell, self.record
-        callbacks = [record, self.checkpoints]
+        callbacks: list[BaseCallback] = [record, self.checkpoints]
         if cell.pretrain is not None and self.pretrains:
             steps = record.agent_steps(cell.pretrain.budget)
-            self.model.pretrain(steps, cell.pretrain.collector, callback=callbacks)
+            self.model.pretrain(steps, cell.pretrain.collector, callback=[*callbacks])
         record.evaluates = True
         if cell.budget > 0:
-            with untouched_randomness(self.model.device, EVAL_SEED):
-                drawing = watch_reconstructions(cell, record.action_repeat, self.folder) if self.pictures else []
-            covers = cell.coverage
-            path = self.folder / "coverage.csv"
-            counting = [] if covers is None else [CoverageRecorder(covers.at, record.action_repeat, path)]
-            self.model.learn(record.agent_steps(cell.budget), callback=[*callbacks, *counting, *drawing])
+            if cell.coverage is not None:
+                path = self.folder / "coverage.csv"
+                callbacks.append(CoverageRecorder(cell.coverage.at, record.action_repeat, path))
+            if self.pictures:
+                with untouched_randomness(self.model.device, EVAL_SEED):
+                    callbacks += reconstruction_callbacks(cell, record.action_repeat, self.folder)
+            self.model.learn(record.agent_steps(cell.budget), callback=callbacks)
 
-    def _keep_results(self) -> None:
+    def _write_results(self) -> None:
         cell, record = self.cell, self.record
-        # Not among the results until everything else is: the state from here on can be made anew.
         self.model.save(self.folder / "model.zip")
         if cell.kind == "visitation":
             measure_visits(self.model, cell, self.folder)
         if self.pictures:
             try:
                 draw_cell(self.model, cell, self.folder)
-            except Exception as error:  # the results are there without them
-                reason = " ".join(str(error).split())
-                print(f"{self.folder} is without some of its pictures: {type(error).__name__}: {reason}")
+            except Exception as error:  # the results are complete without them
+                print(f"{self.folder} lacks some of its pictures: {type(error).__name__}: {error}")
         record.write_tables()
         record.report(self.model, force=True)
         write_json(self.folder / "run.json", record.conditions(self.model))
@@ -148,7 +152,7 @@ class _CellRun:
         return make_vec_env(self.cell.make_env, n_envs=self.cell.n_envs)
 
     def _resume(self) -> CuReSAC | None:
-        """The model of the newest whole checkpoint, or None."""
+        """The model of the newest complete checkpoint, or None."""
         cell, path = self.cell, self.checkpoints.path
         if not ExactCheckpoint.exists(path):
             return None
@@ -156,13 +160,13 @@ class _CellRun:
             return ALGOS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
         except ValueError as error:
             aside = path.with_name(f"unusable-{time.time_ns()}")
-            print(f"{self.folder} begins anew, its checkpoints are kept in {aside.name}: {error}")
+            print(f"{self.folder} starts anew, its checkpoints are kept in {aside.name}: {error}")
             path.rename(aside)
             return None
 
 
 class _TimedCheckpoint(ExactCheckpoint):
-    """Due by the clock, because cells differ in speed.
+    """Checkpoints by the clock, because cells differ in speed.
 
     :param path: Folder of the checkpoints
     :param minutes: Minutes between two checkpoints
@@ -185,9 +189,9 @@ class _TimedCheckpoint(ExactCheckpoint):
 
 
 class _Record(BaseCallback):
-    """Evaluates between two agent steps, when all updates are made, and reports progress.
+    """Evaluate between two agent steps, when all updates are made, and report progress.
 
-    What it has recorded stands in plain attributes, which checkpoints keep.
+    Its records are plain attributes, which checkpoints keep.
 
     :param cell: The cell
     :param folder: Its folder
@@ -202,15 +206,16 @@ class _Record(BaseCallback):
         self.evaluates = False
         self.evaluations: list[Row] = []
         self.episodes: list[Row] = []
-        #: What each attempt ran on, this one last
+        #: Machine and versions of each attempt, this one last
         self.attempts: list[Row] = []
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
         self.loss_sum, self.n_losses = th.zeros(()), 0
         #: Sum of the rewards of all transitions that training has collected
         self.rewards_met = 0.0
-        self._now, self._reported_at = time.monotonic(), -np.inf
-        self._is_known = False
+        self._now = self._printed_at = time.monotonic()
+        self._reported_at = -np.inf
+        self._has_begun = False
 
     def state_dict(self) -> dict[str, Any]:
         """Get what a resumed cell continues from.
@@ -230,14 +235,14 @@ class _Record(BaseCallback):
     def agent_steps(self, environment_steps: int) -> int:
         return -(-environment_steps // self.action_repeat)
 
-    def begin_attempt(self, model: CuReSAC) -> None:
-        """Once, when what former attempts have recorded is back."""
-        if not self._is_known:
-            self._is_known = True
+    def _begin_attempt(self, model: CuReSAC) -> None:
+        """Note machine and versions once, after the records of earlier attempts were restored."""
+        if not self._has_begun:
+            self._has_begun = True
             self.attempts.append({"started": _now(), **describe_run(), "device": str(model.device)})
 
     def _on_training_start(self) -> None:
-        self.begin_attempt(self.model)  # type: ignore[arg-type]
+        self._begin_attempt(self.model)  # type: ignore[arg-type]
 
     def _on_step(self) -> bool:
         loss = self.logger.name_to_value.get("train/srl_loss")
@@ -262,8 +267,6 @@ class _Record(BaseCallback):
         self.seconds += now - self._now
         self._now = now
 
-    # -------------------------------------------------------------- evaluation
-
     def _evaluate_if_due(self, finished: bool) -> None:
         steps = self.num_timesteps * self.action_repeat
         if self.evaluates and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
@@ -277,13 +280,12 @@ class _Record(BaseCallback):
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")
         row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
         for actor in trained_actors(model):
-            # Environments may draw from the common random numbers of Python or NumPy, as training does.
+            # Environments may draw from the global generators of Python or NumPy, as training does.
             with untouched_randomness(model.device, EVAL_SEED):
-                rolled_out = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
-                seen = [(float(episode.total_reward), episode.srl_errors) for episode in rolled_out]
-            returns = [value for value, _ in seen]
-            if not np.isfinite(returns).all():  # reports could not be made of it
-                raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: mend its rewards.")
+                episodes = list(run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED))
+            returns = [float(episode.total_reward) for episode in episodes]
+            if not np.isfinite(returns).all():
+                raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: correct its rewards.")
             for number, value in enumerate(returns):
                 values = (row["environment_steps"], actor, number, value)
                 self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
@@ -292,7 +294,8 @@ class _Record(BaseCallback):
             else:
                 row["curious_return_mean"] = float(np.mean(returns))
             if getattr(model.policy, "measures_errors", False):
-                row[f"{actor}_srl_error"] = float(np.concatenate([errors for _, errors in seen]).mean())
+                errors = np.concatenate([episode.srl_errors for episode in episodes])
+                row[f"{actor}_srl_error"] = float(errors.mean())
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
@@ -306,53 +309,45 @@ class _Record(BaseCallback):
         write_csv(self.folder / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(self.folder / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
 
-    # ---------------------------------------------------------------- progress
-
     def report(self, model: CuReSAC, force: bool = False) -> None:
-        """Write ``progress.json``, unless that was done a moment ago."""
-        if not force and time.monotonic() - self._reported_at < PROGRESS_SECONDS:
-            return
-        self._reported_at = time.monotonic()
-        returns = [row["return_mean"] for row in self.evaluations if row["return_mean"] != ""]
-        write_progress(
-            self.folder,
-            done=model.num_timesteps * self.action_repeat + (self.cell.pretraining_steps if self.evaluates else 0),
-            seconds=self.seconds,
-            best_return=max(returns, default=None),
-        )
+        """Write ``progress.json``, unless that was done a moment ago, and print it now and then."""
+        now = time.monotonic()
+        if force or now - self._reported_at >= PROGRESS_SECONDS:
+            cell, self._reported_at = self.cell, now
+            done = model.num_timesteps * self.action_repeat + (cell.pretraining_steps if self.evaluates else 0)
+            total = cell.pretraining_steps + cell.budget
+            prints = now - self._printed_at >= PRINT_SECONDS
+            self._printed_at = now if prints else self._printed_at
+            write_progress(self.folder, done, total, self.seconds, prints)
 
     def conditions(self, model: CuReSAC) -> dict[str, Any]:
-        """
+        """Conditions under which the results were obtained.
+
         :param model: The cell's model
-        :return: What the results were obtained under
+        :return: Versions, machine, arguments as the model has them, times, attempts
         """
-        self.begin_attempt(model)
+        self._begin_attempt(model)
+        names = constructor_defaults(type(model))
         return {
             **describe_run(),
             "device": str(model.device),
             "precision": getattr(model, "_computed_precision", "fp32"),
-            "arguments": _resolved_arguments(model),
+            "arguments": {name: getattr(model, name) for name in names if hasattr(model, name)},
             "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
             "attempts": len(self.attempts),
-            # Where it was interrupted: what each attempt ran on
             **({"history": self.attempts} if len(self.attempts) > 1 else {}),
         }
 
 
-def _resolved_arguments(model: CuReSAC) -> dict[str, Any]:
-    """The constructor's arguments as the model has them: given, by default, or chosen for this machine."""
-    return {name: getattr(model, name) for name in constructor_defaults(type(model)) if hasattr(model, name)}
-
-
 def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finished: bool) -> bool:
-    """
+    """Whether to evaluate now.
+
     :param evaluations: Rows of ``eval.csv`` so far
     :param steps: Environment steps so far
     :param every: Environment steps between two evaluations
     :param finished: Whether training has ended: then the last row is due, whatever its step
-    :return: Whether to evaluate now
     """
     if not evaluations:
         return True
@@ -361,12 +356,12 @@ def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finish
 
 
 class CellIsRunning(GridError):
-    """Another process is at this cell."""
+    """Another process runs this cell."""
 
 
 @contextlib.contextmanager
 def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Hold a folder's lock, which goes with the process, however that ends.
+    """Hold a folder's lock, which ends with the process.
 
     :param folder: A folder
     :param wait: Whether to wait for another process that holds it
@@ -374,13 +369,11 @@ def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
     """
     lock = filelock.FileLock(folder / ".lock")
     try:
-        lock.acquire(timeout=-1 if wait else 1)  # not at once: `is_held` holds it for a moment, too
+        lock.acquire(timeout=-1 if wait else 1)  # not 0: `is_held` holds it for a moment, too
     except filelock.Timeout:
-        raise CellIsRunning(
-            f"{folder} is being run by another process: wait for it, or choose another --out."
-        ) from None
+        raise CellIsRunning(f"{folder} is being run by another process: wait, or choose another --out.") from None
     except OSError as error:
-        print(f"{folder} cannot be locked ({error.strerror}): take care that no other process runs this.")
+        print(f"{folder} cannot be locked ({error.strerror}): make sure that no other process runs this cell.")
     try:
         yield
     finally:
@@ -388,29 +381,35 @@ def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def is_held(folder: Path) -> bool:
+    """Whether a process holds a folder's lock; locks of other machines may be invisible.
+
+    :param folder: Folder of a cell, whether it exists or not
     """
-    :param folder: Of a cell, whether it exists or not
-    :return: Whether a process runs it; of other machines this may not be known
-    """
-    if not (folder / ".lock").exists():
-        return False
     try:
-        with filelock.FileLock(folder / ".lock", timeout=0):
-            return False
+        if (folder / ".lock").exists():
+            filelock.FileLock(folder / ".lock").acquire(timeout=0).lock.release()
     except filelock.Timeout:
         return True
     except OSError:
         return False
+    return False
 
 
-def write_progress(folder: Path, **progress: Any) -> None:
-    """Tell a display, which may be another process or machine, how far this is, if it can be told.
+def write_progress(folder: Path, done: int, total: int, seconds: float, prints: bool = False) -> None:
+    """Write ``progress.json`` for displays, which may be other processes or machines; errors are ignored.
 
-    :param folder: Of the cell
-    :param progress: What to tell, besides when and where
+    :param folder: Folder of the cell
+    :param done: Steps or updates so far
+    :param total: All of them
+    :param seconds: Seconds so far
+    :param prints: Whether to print it, too
     """
+    left = f", about {(total - done) * seconds / done / 60:.0f} min left" if done else ""
+    text = f"{done:,} of {total:,}{left}"
     with contextlib.suppress(OSError):
-        write_json(folder / "progress.json", {**progress, "time": time.time(), "machine": platform.node()})
+        write_json(folder / "progress.json", {"text": text, "time": time.time(), "machine": platform.node()})
+    if prints:
+        print(f"{folder}: {text}", flush=True)
 
 
 def _now() -> str:

@@ -1,4 +1,4 @@
-"""How many cells of the true state all collected transitions have reached so far."""
+"""Count the cells of the true state that all collected transitions have reached."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,17 +13,17 @@ COLUMNS = ("environment_steps", "agent_steps", "cells", "entropy_bits")
 
 
 class CoverageRecorder(BaseCallback):
-    """Counts the cells that training environments in ``CellInfo`` report, and writes ``coverage.csv``.
+    """Count the cells that training environments in ``CellInfo`` report, and write ``coverage.csv``.
 
-    Whoever acts: what is measured is the data that a method collects, from the first step of its random warm-up on.
-    What it has counted stands in plain attributes, which checkpoints keep.
+    All collected transitions count, of both actors and from the first step of the random warm-up on. The counts are
+    plain attributes, which checkpoints keep.
 
     :param at: Environment steps after which a row is written
     :param action_repeat: Environment steps per agent step
-    :param path: The file; None: the rows are in ``rows`` alone
+    :param path: The file
     """
 
-    def __init__(self, at: Sequence[int], action_repeat: int, path: Path | None = None):
+    def __init__(self, at: Sequence[int], action_repeat: int, path: Path):
         super().__init__()
         self._at, self._action_repeat, self._path = sorted(at), action_repeat, path
         #: Visits of each cell, by its numbers with commas between them
@@ -39,12 +39,7 @@ class CoverageRecorder(BaseCallback):
             counts = np.array(list(self.visits.values()))
             values = (steps, self.num_timesteps, len(counts), entropy_bits(counts))
             self.rows.append(dict(zip(COLUMNS, values, strict=True)))
-            self._write()
         return True
 
     def _on_training_end(self) -> None:
-        self._write()
-
-    def _write(self) -> None:
-        if self._path is not None:
-            write_csv(self._path, COLUMNS, self.rows)
+        write_csv(self._path, COLUMNS, self.rows)

@@ -1,4 +1,4 @@
-"""Train CuReSAC on cartpole-swingup from pixels in ten minutes on two cores, and draw what it learned.
+"""Train CuReSAC on cartpole-swingup from pixels in ten minutes on two cores, and draw the results.
 
     python -m sb3_cure.experiments.demo --out demo
 
@@ -7,7 +7,6 @@ Writes ``learning_curve.csv/png``, ``sees_and_holds.png``, ``curiosity_map.png``
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -66,7 +65,7 @@ EXPECTED_RATIO = 3
 
 
 class Progress(BaseCallback):
-    """Evaluates the task policy now and then, tells how far the training is, and ends it after some minutes.
+    """Evaluate the task policy now and then, print the progress, and end the training after some minutes.
 
     :param eval_env: Environment to evaluate in
     :param steps: Agent steps in all
@@ -80,34 +79,22 @@ class Progress(BaseCallback):
         self.repeat = eval_env.get_wrapper_attr("action_repeat")
 
     def _on_training_start(self) -> None:
-        self.start = self.told = time.monotonic()
+        self.start = time.monotonic()
 
     def _on_step(self) -> bool:
-        now = time.monotonic()
         if self.num_timesteps % max(self.steps // EVALUATIONS, 1) == 0:
             self.evaluate()
-        if now - self.told > (0.5 if sys.stdout.isatty() else 30):
-            self.told = now
-            self._tell(now - self.start)
-        return now - self.start < self.seconds
+        return time.monotonic() - self.start < self.seconds
 
     def evaluate(self) -> None:
-        """Add a row to the learning curve."""
+        """Add a row to the learning curve, and print it."""
         returns = [episode.total_reward for episode in run_episodes(self.model, self.eval_env, 3, "task", seed=10_000)]
         steps, seconds = self.num_timesteps, round(time.monotonic() - self.start, 1)
         row = {"agent_steps": steps, "environment_steps": steps * self.repeat, "seconds": seconds}
         self.rows.append({**row, "task_return": float(np.mean(returns))})
-
-    def _tell(self, seconds: float) -> None:
-        left = min(self.seconds - seconds, seconds * (self.steps / self.num_timesteps - 1))
-        minutes, rest = divmod(round(left), 60)
-        recent = [info["r"] for info in list(self.model.ep_info_buffer or [])[-5:]]
-        parts = [f"step {self.num_timesteps:,} of {self.steps:,}"]
-        parts += [f"return of the last episodes {np.mean(recent):.0f}"] if recent else []
-        parts += [f"evaluated {self.rows[-1]['task_return']:.0f} of 1000"] if self.rows else []
-        parts += [f"about {minutes} min {rest:02} s of training left"]
-        end = "\r" if sys.stdout.isatty() else "\n"
-        print("  " + ", ".join(parts) + "   ", end=end, flush=True)
+        minutes = min(self.seconds - seconds, seconds * (self.steps / steps - 1)) / 60
+        left = f"about {max(minutes, 0):.0f} minutes of training left"
+        print(f"  step {steps:,} of {self.steps:,}, return {np.mean(returns):.0f} of 1000, {left}", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -160,27 +147,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         **{"settings": SETTINGS, "environment": ENV_KWARGS, **describe_run(), "precision": model._computed_precision},
     }
     write_json(out / "summary.json", summary)
-    print(
-        f"Return after {model.num_timesteps:,} agent steps: {np.mean(final):.0f} of 1000 (random policy: "
-        f"{random_return:.0f}). Error of what the latents hold, where policies go: "
-        + ", ".join(f"{actor} {error:.4f}" for actor, error in errors.items())
-        + f". Pictures and video: {out}/ ({time.monotonic() - start:.0f} s in all)"
-    )
-    if model.num_timesteps < options.steps:
-        print(
-            f"Warning: time ended the training at step {model.num_timesteps:,} of {options.steps:,}: on a slower or "
-            "busy machine give it more --minutes."
-        )
+    steps = model.num_timesteps
+    print(f"Return after {steps:,} agent steps: {np.mean(final):.0f} of 1000 (random policy: {random_return:.0f})")
+    print("Reconstruction error by policy:", ", ".join(f"{actor} {error:.4f}" for actor, error in errors.items()))
+    print(f"Pictures and video: {out}/ ({time.monotonic() - start:.0f} s in all)")
+    if steps < options.steps:
+        print(f"Warning: time ended the training at step {steps:,} of {options.steps:,}: give it more --minutes.")
     if ratio < EXPECTED_RATIO:
         print(
-            f"Warning: the return is {ratio:.1f} times the random policy's. Trainings of all {TOTAL_STEPS:,} steps end "
-            "above 3 times; seeds differ (--seed 1), and so do shorter trainings."
+            f"Warning: trainings of {TOTAL_STEPS:,} steps usually end above {EXPECTED_RATIO} times the random return."
         )
     return 0
 
 
 def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float]:
-    """Where policies go with sampled actions, what the latents do not hold there, and a video.
+    """Draw where policies go with sampled actions and their errors there, and film them.
 
     :return: Mean error by policy
     """

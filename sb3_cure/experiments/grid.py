@@ -1,5 +1,6 @@
 """Experiment grids: a YAML file names tasks, methods and seeds; a cell is one of each."""
 
+import contextlib
 import copy
 import importlib
 import inspect
@@ -7,7 +8,7 @@ import json
 import pkgutil
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,11 +24,13 @@ from sb3_cure.envs.counting import CellInfo
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
-#: The file that tells that a cell is finished
+#: Empty file of a finished cell
 DONE = "DONE"
-#: What methods train, by the name of rl-zoo's ``--algo``
+#: Algorithms by the name of rl-zoo's ``--algo``
 ALGOS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
-# What a string with a dot names: a class of one's own.
+#: Keys of ``config.json`` that decide what is trained, and are compared before results are mixed
+SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
+#: Arguments that may name a class of the user's, as ``"my_module.MyClass"``
 _CLASSES = ("srl", "intrinsic", "replay_buffer_class")
 
 
@@ -36,14 +39,15 @@ class GridError(ValueError):
 
 
 def short_name(task: str) -> str:
-    """
+    """Gymnasium id without module, namespace and version: a folder's name.
+
     :param task: Gymnasium id
-    :return: The id without module, namespace and version: a folder's name
+    :return: The name
     """
     return re.sub(r"-v\d+$", "", re.split("[:/]", task)[-1])
 
 
-# --------------------------------------------------------------- what a file is
+# ---------------------------------------------------------------- format of the file
 
 
 def _check_registered(task: str) -> str:
@@ -55,12 +59,6 @@ def _check_registered(task: str) -> str:
     except (gym.error.Error, ImportError, TypeError) as error:
         raise ValueError(f"{' '.join(str(error).split())} (one of your own is my_module:My-v0)") from error
     return task
-
-
-def _check_algo(algo: str) -> str:
-    if algo not in ALGOS:
-        raise ValueError(f"it must be one of {', '.join(ALGOS)}")
-    return algo
 
 
 _Name = Annotated[str, Field(pattern=r"^[\w.-]*\w[\w.-]*$")]
@@ -85,7 +83,7 @@ class Pretraining:
 
 @pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Coverage:
-    """How cells of the true state are counted that all collected transitions reach, in ``coverage.csv``.
+    """Cells of the true state to count, and when, in ``coverage.csv``.
 
     :param widths: Width of a cell along each coordinate, by the names of ``physics_state_names``; other ones than those
         by which an arm is rewarded
@@ -111,7 +109,7 @@ class Evaluation(_Part):
     episodes: PositiveInt = 10
 
 
-#: Settings of which an override of some keys leaves the others: they belong to whatever head and reward there is
+#: Settings that are merged with an override key by key
 _MERGED = ("env_kwargs", "policy_kwargs")
 
 
@@ -119,7 +117,7 @@ class Method(_Part):
     """An arm of the comparison.
 
     :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
-    :param overrides: What differs from the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
+    :param overrides: Changes of the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
     :param algo: A key of ``ALGOS``
     :param pretrain: The phase before training, if any
     :param train: Whether the task is learned at all
@@ -128,7 +126,7 @@ class Method(_Part):
 
     config: str
     overrides: dict[str, Any] = {}
-    algo: Annotated[str, AfterValidator(_check_algo)] = "cure_sac"
+    algo: Literal["cure_sac", "cure_tqc"] = "cure_sac"
     pretrain: Pretraining | None = None
     train: bool = True
     baseline: str | None = None
@@ -138,14 +136,14 @@ class GridFile(_Part):
     """A grid's YAML file.
 
     :param experiment: Its name, the folder of its results
-    :param kind: What the report makes of it
+    :param kind: Decides what the report shows
     :param budget: Environment steps of training; 0: pretraining alone
     :param tasks: Gymnasium ids
     :param methods: The arms by name
     :param seeds: How many, or which
     :param evaluation: When and how to evaluate
     :param baseline: The arm with which the others are compared, by default the first
-    :param coverage: What to count of the true states, if anything
+    :param coverage: Cells of the true state to count, if any
     """
 
     experiment: _Name
@@ -171,7 +169,7 @@ class GridFile(_Part):
         return self
 
 
-# ----------------------------------------------------------------- what is run
+# ---------------------------------------------------------------- cells
 
 
 @dataclass(frozen=True)
@@ -191,7 +189,7 @@ class Cell:
     :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
     :param algo: A key of ``ALGOS``
-    :param coverage: What to count of the true states, if anything
+    :param coverage: Cells of the true state to count, if any
     """
 
     experiment: str
@@ -211,7 +209,7 @@ class Cell:
 
     @property
     def folder(self) -> Path:
-        """Where it lies below the folder of results."""
+        """Its folder below the folder of results."""
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
 
     @property
@@ -220,7 +218,7 @@ class Cell:
         return self.pretrain.budget if self.pretrain else 0
 
     def build_arguments(self) -> dict[str, Any]:
-        """A copy of ``arguments``, as SB3 writes into some, with the classes that are named by their modules."""
+        """Copy ``arguments``, as SB3 writes into some, and import the classes that they name."""
         arguments = copy.deepcopy(self.arguments)
         arguments.pop("env_wrapper", None)
         if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
@@ -228,15 +226,16 @@ class Cell:
         return {**arguments, **self.custom_objects()}
 
     def make_env(self) -> gym.Env:
-        """An environment to train in: in the wrappers that ``env_wrapper`` names, as in rl-zoo's files."""
+        """Make an environment to train in, with the wrappers of ``env_wrapper``, as in rl-zoo's files."""
         env = gym.make(self.task, **self.env_kwargs)
         for wrap, kwargs in self._wrappers():
             env = wrap(env, **kwargs)
         return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
-        """An environment to measure policies in: in the same wrappers but those of rewards
-        (``gymnasium.RewardWrapper``, ``NormalizeReward``), so that it gives the task's reward.
+        """Make an environment to measure policies in, which gives the task's reward.
+
+        Wrappers of rewards (``gymnasium.RewardWrapper``, ``NormalizeReward``) are left out.
 
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
         """
@@ -252,36 +251,33 @@ class Cell:
         return not any(_changes_rewards(wrap) for wrap, _ in self._wrappers())
 
     def _wrappers(self) -> Iterator[tuple[Any, dict[str, Any]]]:
-        """What ``env_wrapper`` names, and its arguments, innermost first."""
+        """Wrappers of ``env_wrapper`` and their arguments, innermost first."""
         named = self.arguments.get("env_wrapper") or []
         for each in named if isinstance(named, list) else [named]:
             [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
             yield pkgutil.resolve_name(name), kwargs
 
     def custom_objects(self) -> dict[str, Any]:
-        """What loading its model needs besides the archive: classes that are named by their modules."""
+        """Import the user's classes that the arguments name; a model's archive needs them to be loaded."""
         given = {name: str(self.arguments.get(name)) for name in _CLASSES}
         return {name: pkgutil.resolve_name(value) for name, value in given.items() if "." in value}
 
     def make_model(self, env: Any, **changes: Any) -> CuReSAC:
-        """
+        """Make its model.
+
         :param env: Its environment, or several as a ``VecEnv``
         :param changes: Arguments instead of its own
-        :return: Its model before training
+        :return: The model before training
         """
         return ALGOS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
 
     def is_done(self, results: Path) -> bool:
-        """
+        """Whether it has been run.
+
         :param results: Folder of all results
-        :return: Whether it has been run
+        :return: Whether it is marked as ``DONE``
         """
         return (results / self.folder / DONE).exists()
-
-    def config(self) -> dict[str, Any]:
-        """What its ``config.json`` holds: with the values of the arguments that are not given, which may change."""
-        known = constructor_defaults(ALGOS[self.algo])
-        return {**asdict(self), "defaults": {name: known[name] for name in known if name not in self.arguments}}
 
 
 @dataclass(frozen=True)
@@ -289,11 +285,11 @@ class Grid:
     """All cells of an experiment.
 
     :param experiment: Its name, the folder of its results
-    :param kind: What the report makes of it
-    :param baseline: The arm with which those are compared that name no ``baseline`` of their own
-    :param cells: What was chosen, seed by seed, so that whole comparisons are finished early
+    :param kind: Decides what the report shows
+    :param baseline: The arm that others are compared with, unless they name a ``baseline`` of their own
+    :param cells: The chosen cells, seed by seed, so that whole comparisons are finished early
     :param arms: A cell of each method on each task of the file
-    :param description: The whole file, whatever was chosen of it: what ``grid.json`` holds
+    :param description: The whole file, whatever was chosen of it: the content of ``grid.json``
     """
 
     experiment: str
@@ -304,9 +300,10 @@ class Grid:
     description: dict[str, Any]
 
     def with_seeds_in(self, results: Path) -> list[Cell]:
-        """
+        """All arms with the chosen seeds, and with further seeds that are found in the folder.
+
         :param results: Folder of all results
-        :return: All arms with the seeds that were chosen, and the further ones that other calls have run there
+        :return: The cells
         """
         found = (seed_of(folder) for arm in self.arms for folder in (results / arm.folder.parent).glob("seed*"))
         seeds = {cell.seed for cell in self.cells} | {seed for seed in found if seed is not None}
@@ -318,9 +315,10 @@ def _changes_rewards(wrapper: Any) -> bool:
 
 
 def constructor_defaults(algorithm: type) -> dict[str, Any]:
-    """
-    :param algorithm: Class of an algorithm that hands on to its bases what it does not name
-    :return: Values of the arguments that need not be given, but for the seed and what only SB3 itself gives
+    """Default values of a constructor's arguments, but for the seed.
+
+    :param algorithm: Class of an algorithm that passes unknown arguments on to its bases
+    :return: Values by name
     """
     defaults: dict[str, Any] = {}
     for cls in inspect.getmro(algorithm):
@@ -334,47 +332,30 @@ def constructor_defaults(algorithm: type) -> dict[str, Any]:
     return defaults
 
 
-def comparable(key: str, one: Any, other: Any) -> tuple[Any, Any]:
-    """
-    :param key: A key of ``config.json``
-    :param one: Its value in one file, None if it has none
-    :param other: Its value in another
-    :return: Both, as they are to be compared: of defaults those that both name, as versions differ in what arguments
-        there are, and once kept none
-    """
-    if key != "defaults":
-        return one, other
-    shared = [name for name in one or {} if name in (other or {})]
-    return {name: one[name] for name in shared}, {name: other[name] for name in shared}
+def read_kept(path: Path) -> dict[str, Any]:
+    """Read a JSON file in the folder of results.
 
-
-def read_kept(path: Path, *keys: str) -> dict[str, Any]:
-    """
-    :param path: A JSON file in the folder of results
-    :param keys: What it must have
+    :param path: The file
     :return: Its content
     :raises GridError: if it is damaged
     """
     try:
-        content = json.loads(path.read_text())
-        if not isinstance(content, dict) or not all(key in content for key in keys):
-            raise ValueError
+        return json.loads(path.read_text())
     except (OSError, ValueError):
-        remove = path if path.name == "grid.json" else path.parent
-        raise GridError(f"{path} is damaged: put it back, or remove {remove}, which is then made anew.") from None
-    return content
+        raise GridError(f"{path} is damaged: remove {path.parent}, which is then made anew.") from None
 
 
 def seed_of(folder: Path) -> int | None:
-    """
+    """Seed of a cell's folder.
+
     :param folder: In that of an arm
-    :return: The seed whose cell it holds; None if it is no cell's
+    :return: The seed; None if it is no cell's
     """
     number = folder.name.removeprefix("seed")
     return int(number) if folder.is_dir() and number.isdecimal() else None
 
 
-# --------------------------------------------------------------------- reading
+# ---------------------------------------------------------------- reading
 
 
 def load_grid(
@@ -387,11 +368,10 @@ def load_grid(
 ) -> Grid:
     """Read a grid and the zoo files it names.
 
-    A file's budget of 0 means pretraining alone: nothing is trained after it. No other budget is in proportion to that,
-    so that one can be asked for only where no method pretrains.
+    A file's budget of 0 means pretraining alone, and then ``budget`` can be given only if no method pretrains.
 
     :param path: YAML file, or the name of one of the package's grids, such as ``fast/curves``
-    :param seeds: Instead of the file's: how many (the first of those that it lists, else from 0), or which
+    :param seeds: Instead of the file's: a number of seeds (the first of the file's list, else from 0), or a list
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
     :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
@@ -447,19 +427,18 @@ def _validated(path: Path, content: Any) -> GridFile:
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
-    """Another budget, and phases of pretraining as long in proportion to it as they are to the file's."""
+    """Change the budget, and that of pretraining in proportion."""
     for method in file.methods.values():
         if method.pretrain is not None:
             if file.budget == 0:
-                raise GridError(f"budget in {path} is 0 (pretraining alone), to which no other is in proportion.")
+                raise GridError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
             method.pretrain = replace(method.pretrain, budget=steps)
     file.budget = budget
 
 
 def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
-    """What an arm means on a task, of the zoo file's entry with the grid's overrides: ``n_envs``, ``env_kwargs`` and
-    arguments of the algorithm."""
+    """``n_envs``, ``env_kwargs`` and arguments of an arm on a task: the zoo file's entry with the grid's overrides."""
     config = path.parent / _find(method.config, ZOO)
     entries, name = _read_yaml(config), task.rpartition(":")[2]
     found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
@@ -479,7 +458,7 @@ def _merged(mapping: Any, overrides: Any) -> Any:
 
 
 def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
-    """What would train nothing, or end in an error after everything is trained."""
+    """Refuse arms that train nothing, or that end in an error after everything is trained."""
     seen: dict[str, dict[str, Any]] = {}
     for cell in arms:
         if cell.budget == 0 and cell.pretrain is None:
@@ -494,7 +473,7 @@ def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 1e-6 for a number, as YAML 1.2 does: torch would meet the text in the first update."""
+    """SafeLoader that reads 1e-6 as a number, as YAML 1.2 does; YAML 1.1 reads it as text."""
 
 
 _Loader.add_implicit_resolver(
@@ -525,36 +504,26 @@ def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> s
 def check_arms(cells: Iterable[Cell]) -> None:
     """Build the model of each arm on each task once, before the first of them is trained.
 
-    On the CPU, as the cells may run on another machine, and with next to no replay buffer, which may fill the memory.
+    On the CPU, as the cells may run on another machine, and with the smallest replay buffer, which may fill the memory.
 
     :param cells: Cells that are to be run
-    :raises GridError: for the first that cannot be
+    :raises GridError: for the first that cannot be built
     """
-    envs: dict[str, gym.Env] = {}
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
-        key = f"{cell.task} {cell.env_kwargs} {cell.arguments.get('env_wrapper')}"
         try:
-            if key not in envs:
-                envs[key] = cell.make_env()
-                _tell_time_limit(envs[key], cell.task)
-            if cell.kind == "visitation" and isinstance(envs[key].observation_space, gym.spaces.Dict):
-                raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
-            with untouched_randomness(th.device("cpu")):
-                cell.make_model(envs[key], device="cpu", buffer_size=1)
-        except GLUnavailableError:  # with Ray other machines may have what this one has not
-            break
+            with contextlib.closing(cell.make_env()) as env, untouched_randomness(th.device("cpu")):
+                _warn_of_endless_episodes(env, cell.task)
+                if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
+                    raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
+                cell.make_model(env, device="cpu", buffer_size=1)
+        except GLUnavailableError:  # with Ray other machines may have OpenGL
+            return
         except Exception as error:
-            known = isinstance(error, ValueError | TypeError)
-            reason = f"{'' if known else type(error).__name__ + ': '}{' '.join(str(error).split())}"
-            raise GridError(f"method {cell.method!r} on {cell.task} cannot work: {reason}") from error
-    for env in envs.values():
-        env.close()
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise GridError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error
 
 
-def _tell_time_limit(env: gym.Env, task: str) -> None:
-    limits = ("_max_episode_steps", "max_episode_steps", "physics")  # those of dm_control end by themselves
+def _warn_of_endless_episodes(env: gym.Env, task: str) -> None:
+    limits = ("_max_episode_steps", "max_episode_steps", "physics")  # episodes of dm_control end by themselves
     if not any(map(env.has_wrapper_attr, limits)):
-        print(
-            f"{task} tells no time limit: if its episodes do not end by themselves, its first evaluation never ends; "
-            "then register it with max_episode_steps=1000, for example."
-        )
+        print(f"{task} has no time limit: an evaluation never ends if its episodes do not end by themselves.")

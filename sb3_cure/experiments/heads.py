@@ -1,7 +1,7 @@
-"""Common heads: by them all policies of a seed are judged alike, as their own heads differ from run to run.
+"""Common heads: they judge all policies of a seed alike, as own heads differ from run to run.
 
-The common head of a seed is an autoencoder that is fitted to an even mix of what the random, task and curious policies
-of the task's *other* seeds saw. Those of a task are a unit of work like a cell, with a folder of their own.
+The common head of a seed is an autoencoder that is fitted to an even mix of the observations of the random, task and
+curious policies of the task's *other* seeds. The heads of a task are a unit of work like a cell, with their own folder.
 """
 
 import time
@@ -21,23 +21,21 @@ from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_
 from sb3_cure.experiments.grid import ALGOS, Cell, Grid, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
-#: Updates of a common head: an autoencoder tells little before some thousands of them
+#: Updates of a common head
 COMMON_UPDATES = 3000
 #: Observations per policy in the mix to which a common head is fitted
 COMMON_SHARE = 1000
-#: Whose observations these are: with further arms of the same kind, such as variants, it would outweigh the others
-POLICIES = "random, task and curious, each of the first arm that has it"
-#: The file that tells that common heads are finished, and of what they were made
+#: File of finished common heads, with what they were fitted to
 RECORD = "common_head.json"
 
 
 @dataclass(frozen=True)
 class CommonHeads:
-    """The common heads of a task, one for each of its seeds of which all arms are finished.
+    """Common heads of a task, one for each of its seeds of which all arms are finished.
 
-    :param grid: The grid, whichever of its seeds and arms this call has chosen
+    :param grid: The grid, whichever of its seeds and arms are chosen
     :param task: Gymnasium id
-    :param updates: How many fit each
+    :param updates: Updates of each head
     :param share: Observations of each policy of a seed in the mix
     """
 
@@ -48,53 +46,54 @@ class CommonHeads:
 
     @property
     def folder(self) -> Path:
-        """Where they lie below the folder of results."""
+        """Their folder below the folder of results."""
         return Path(self.grid.experiment, short_name(self.task), "common_heads")
 
     def seeds(self, results: Path, coming: Sequence[Cell] = ()) -> dict[int, list[Cell]]:
-        """
+        """All arms by seed, of the seeds of which all arms are finished and have kept their model.
+
         :param results: Folder of all results
-        :param coming: Cells that are to be regarded as finished
-        :return: By seed, all arms, of those seeds of which all are finished and have kept their model
+        :param coming: Cells to regard as finished
+        :return: Cells by seed
         """
         arms: dict[int, list[Cell]] = {}
         for cell in self.grid.with_seeds_in(results):
             if cell.task == self.task:
                 arms.setdefault(cell.seed, []).append(cell)
 
-        def is_there(cell: Cell) -> bool:
-            return cell.is_done(results) and (results / cell.folder / "model.zip").exists()
+        def is_ready(cell: Cell) -> bool:
+            return cell in coming or (cell.is_done(results) and (results / cell.folder / "model.zip").exists())
 
-        return {seed: cells for seed, cells in arms.items() if all(is_there(cell) or cell in coming for cell in cells)}
+        return {seed: cells for seed, cells in arms.items() if all(map(is_ready, cells))}
 
-    def made_of(self, results: Path) -> dict[str, Any]:
-        """What their record holds when they are finished: further seeds, or a cell run again, ask for others."""
+    def fingerprint(self, results: Path) -> dict[str, Any]:
+        """Content of their record: with further seeds, or a cell run again, it differs, and they are fitted anew."""
         finished = {
-            str(cell.folder): read_kept(results / cell.folder / "run.json", "finished")["finished"]
+            str(cell.folder): read_kept(results / cell.folder / "run.json")["finished"]
             for cells in self.seeds(results).values()
             for cell in cells
         }
-        return {"cells": finished, "updates": self.updates, "share": self.share, "policies": POLICIES}
+        return {"cells": finished, "updates": self.updates, "share": self.share}
 
     def is_done(self, results: Path) -> bool:
-        """
+        """Whether they were fitted to all seeds that are finished now.
+
         :param results: Folder of all results
-        :return: Whether they have been made of all that is finished now
         """
         path = results / self.folder / RECORD
-        return path.exists() and self.made_of(results).items() <= read_kept(path).items()
+        return path.exists() and self.fingerprint(results).items() <= read_kept(path).items()
 
 
 Unit: TypeAlias = Cell | CommonHeads
 
 
 def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list[CommonHeads]:
-    """
+    """Common heads of the chosen tasks that have two seeds to fit them to.
+
     :param grid: A grid
     :param results: Folder of all results
-    :param coming: Cells that are to be regarded as finished
-    :return: Those of the chosen tasks that have two seeds to make them of; none in grids of another kind than
-        ``"visitation"``
+    :param coming: Cells to regard as finished
+    :return: One for each such task; none in grids of another kind than ``"visitation"``
     """
     tasks = dict.fromkeys(cell.task for cell in grid.cells if grid.kind == "visitation")
     every = [CommonHeads(grid, task, COMMON_UPDATES, COMMON_SHARE) for task in tasks]
@@ -104,10 +103,10 @@ def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list
 def run_heads(heads: CommonHeads, results: Path) -> None:
     """Fit a task's common heads and add their rows to the ``visitation.csv`` of its cells, unless that is done.
 
-    Policies are rolled out anew from each cell's ``model.zip``: the same episodes as before. Where another process is
-    making them, that is waited for: it may know of fewer cells.
+    Policies are rolled out anew from each cell's ``model.zip``: the same episodes as before. If another process is
+    fitting them, wait for it, as it may know of fewer cells.
 
-    :param heads: Which
+    :param heads: The heads
     :param results: Folder of all results
     """
     folder = results / heads.folder
@@ -116,29 +115,29 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
         if heads.is_done(results):
             return
         (folder / ERROR).unlink(missing_ok=True)
-        made_of, seeds = heads.made_of(results), heads.seeds(results)
+        fingerprint, seeds = heads.fingerprint(results), heads.seeds(results)
         mixes = {seed: _mix(cells, heads.share, results) for seed, cells in seeds.items()}
         tables: dict[Path, list[Row]] = {}
-        begun, told, total = time.monotonic(), -np.inf, heads.updates * len(seeds)
+        begun, reported, total = time.monotonic(), -np.inf, heads.updates * len(seeds)
         for index, (seed, cells) in enumerate(seeds.items()):
             judge = _judge(cells[0])
             others = np.concatenate([mixes[other] for other in mixes if other != seed])
             for number in fit_head(judge, others, heads.updates):
-                if (now := time.monotonic()) - told > PROGRESS_SECONDS:
-                    told = now
-                    write_progress(folder, done=heads.updates * index + number, total=total, seconds=now - begun)
+                if (now := time.monotonic()) - reported > PROGRESS_SECONDS:
+                    reported = now
+                    write_progress(folder, heads.updates * index + number, total, now - begun)
             for cell in cells:
                 path = results / cell.folder / "visitation.csv"
                 kept = [row for row in read_rows(path) if row["head"] != "common"]
                 tables[path] = kept + list(_rows(judge, cell, results))
         for path, rows in tables.items():
             write_csv(path, COLUMNS, rows)
-        write_json(folder / RECORD, {**made_of, **describe_run()})
+        write_json(folder / RECORD, {**fingerprint, **describe_run()})
         (folder / "progress.json").unlink(missing_ok=True)
 
 
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
-    """The episodes of ``measure_visits`` again, by policy, but for those policies that are known."""
+    """The episodes of ``measure_visits`` again by policy, without the known policies."""
     path = results / cell.folder / "model.zip"
     model = ALGOS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
     env = cell.make_eval_env()
@@ -149,7 +148,10 @@ def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator
 
 
 def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
-    """Observations of one seed's policies, as many of each kind."""
+    """Equally many observations of each policy of a seed, those of the first arm that has it.
+
+    Further arms of the same kind, such as variants, would outweigh the others.
+    """
     seen: dict[str, np.ndarray] = {}
     for cell in cells:
         for actor, episodes in _episodes(cell, results, seen):
@@ -159,7 +161,7 @@ def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
 
 
 def _judge(cell: Cell) -> CuReSAC:
-    """An autoencoder with the networks of a seed's first cell, which has learned nothing yet."""
+    """An untrained autoencoder with the networks of a seed's first cell."""
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
     env = cell.make_eval_env()
@@ -178,9 +180,9 @@ def _judge(cell: Cell) -> CuReSAC:
 
 
 def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
-    """Train encoder and autoencoder on given observations alone, with neither rewards nor actions.
+    """Train encoder and autoencoder on given observations alone, without rewards and actions.
 
-    :param model: A model with an autoencoder; what it has learned so far is the start
+    :param model: A model with an autoencoder, which is trained further
     :param observations: Images in 0-255, [n, *shape]
     :param updates: Updates, of 128 observations and with Adam at 1e-3
     :return: After each update, its number (from 1)
@@ -203,10 +205,11 @@ def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator
 
 
 def observation_batch(observations: np.ndarray, device: th.device) -> Samples:
-    """
+    """Samples with observations alone, which are all that an autoencoder reads.
+
     :param observations: Images in 0-255, [n, *shape]
-    :param device: Where the batch is to be
-    :return: Samples with observations alone, which are all that an autoencoder reads
+    :param device: Device of the batch
+    :return: The samples
     """
     return Samples(th.as_tensor(observations, device=device), None, None, None, None)  # type: ignore[arg-type]
 

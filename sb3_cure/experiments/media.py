@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.data.buffers import frame_stack_of
+from sb3_cure.data.buffers import infer_frame_stack
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
@@ -18,38 +18,34 @@ from sb3_cure.evaluation.video import write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
 
-#: Films and reconstructed observations are the same in all cells of a task, as far as the policies let them
+#: Seed of films and reconstructed observations, the same in all cells of a task
 FILM_SEED = 30_000
 FRAMES = 16
 ROWS_OF_RECONSTRUCTIONS = 8
-#: Reconstructed observations, and how many random agent steps lie between two of them
+#: Reconstructed observations, and random agent steps between two of them
 RECONSTRUCTED, STEPS_APART = 8, 50
 
 
-def watch_reconstructions(cell: Cell, action_repeat: int, folder: Path) -> list[ReconstructionCallback]:
-    """
+def reconstruction_callbacks(cell: Cell, action_repeat: int, folder: Path) -> list[ReconstructionCallback]:
+    """Callbacks that draw reconstructions during training, of the same observations in all cells of a task.
+
     :param cell: A cell that is about to be trained
     :param action_repeat: Environment steps per agent step
-    :param folder: Where to write ``reconstructions.png``, one row per time, of the same observations in all cells of
-        the task (that have the same ``env_kwargs``)
-    :return: Callbacks that draw it during training
+    :param folder: Where to write ``reconstructions.png``, one row per time
+    :return: The callbacks; none without images or SRL head
     """
     if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
         return []
     every = max(cell.budget // action_repeat // ROWS_OF_RECONSTRUCTIONS, 1)
-    return [ReconstructionCallback(folder, every, _random_observations(cell), title=name_of(cell))]
+    return [ReconstructionCallback(folder, every, _random_observations(cell), title=_title(cell))]
 
 
-def name_of(cell: Cell) -> str:
-    """
-    :param cell: A cell
-    :return: What its pictures are called
-    """
+def _title(cell: Cell) -> str:
     return f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
 
 
 def _random_observations(cell: Cell) -> np.ndarray:
-    """Of episodes with random actions, [n, *shape]."""
+    """Observations of episodes with random actions, [n, *shape]."""
     env = cell.make_eval_env()
     env.action_space.seed(FILM_SEED)
     observation, _ = env.reset(seed=FILM_SEED)
@@ -67,15 +63,13 @@ def _random_observations(cell: Cell) -> np.ndarray:
 def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     """Write ``<actor>_policy.mp4``, ``reconstructions.png``, ``uncomfortable.png`` and ``curiosity_map.png``.
 
-    Each is left out where there is nothing to show: no policy that was trained or no frames to film, no images or head
-    to reconstruct with, no SRL error, no true state. Videos have deterministic actions; the map is that of the visits
-    of ``measure_visits``, with sampled ones.
+    Those for which a cell lacks images, a trained policy, a head or true states are left out. Videos have
+    deterministic actions; the map shows the visits of ``measure_visits``, with sampled ones.
 
     :param model: The cell's model, with its replay buffer
     :param cell: The cell
     :param folder: Where to write
     """
-    name = name_of(cell)
     with contextlib.closing(cell.make_eval_env()) as env:
         repeat = action_repeat_of(env)
         can_film = cell.budget > 0 and "rgb_array" in env.metadata.get("render_modes", [])
@@ -87,7 +81,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
                     episodes = roll_out(model, cell, env, actor, states=True)
                     states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
                     visits[actor] = np.concatenate(states), np.concatenate(errors)
-            title = f"Where policies go with sampled actions: {name}"
+            title = f"Where policies go with sampled actions: {_title(cell)}"
             names, units = physics_state_names(env), physics_state_units(env)
             plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
     if can_film:
@@ -95,22 +89,23 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
             fps = max(round(env.metadata.get("render_fps") or 30), 1)
             for actor in trained_actors(model):
                 (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
-                title = f"{actor} policy, deterministic actions: {name}"
+                title = f"{actor} policy, deterministic actions: {_title(cell)}"
                 write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
-    measures = getattr(model.policy, "measures_errors", False)
-    if not measures or not is_image_space(model.observation_space) or model.replay_buffer.size() == 0:  # type: ignore[union-attr]
+    if getattr(model.policy, "measures_errors", False) and is_image_space(model.observation_space):
+        _draw_replay_buffer(model, cell, repeat, folder)
+
+
+def _draw_replay_buffer(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -> None:
+    if model.replay_buffer.size() == 0:  # type: ignore[union-attr]
         return
-    if not (folder / "reconstructions.png").exists():  # not drawn in training
-        for callback in watch_reconstructions(cell, repeat, folder):
+    if not (folder / "reconstructions.png").exists():  # without training
+        for callback in reconstruction_callbacks(cell, repeat, folder):
             callback.draw(model)
     found = highest_errors(model, FRAMES)
     with th.no_grad():
         pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))
-    title, drawn = f"What the agent finds uncomfortable: {name}", None if pair is None else pair[1].cpu().numpy()
-    plots.highest_error_frames(folder / "uncomfortable.png", found, _frames_per_observation(model), title, drawn)
-
-
-def _frames_per_observation(model: CuReSAC) -> int:
-    """As the environments tell, if frames then are grey or in colour; else each channel counts as a frame."""
-    told, (channels, *_) = frame_stack_of(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
-    return told if channels in (told, 3 * told) else channels
+    title, drawn = f"Highest SRL errors: {_title(cell)}", None if pair is None else pair[1].cpu().numpy()
+    # Each channel counts as a frame, unless they are the frames' grey or colour channels.
+    n_frames, (channels, *_) = infer_frame_stack(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
+    n_frames = n_frames if channels in (n_frames, 3 * n_frames) else channels
+    plots.highest_error_frames(folder / "uncomfortable.png", found, n_frames, title, drawn)

@@ -1,10 +1,10 @@
-"""Published numbers (``published.json``, each with its source), and results beside them. Anchors, not gates."""
+"""Published numbers (``published.json``, each with its source), and results compared with them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from sb3_cure.experiments.statistics import stack_curves
 
 #: Below this part of a published mean, a return is suspected to be a bug of ours.
 SUSPECT_BELOW = 0.75
-#: What uniform dither of 1/32 adds to a mean squared error: the least that RAE's *training* loss can be. The error that
-#: sb3_cure measures is against the dither's mean, so it is the excess over this floor already.
+#: Mean squared error that uniform dither of 1/32 adds, the least value of RAE's *training* loss. The measured SRL error
+#: is against the dither's mean, so it is the excess over this floor already.
 DITHER_FLOOR = (1 / 32) ** 2 / 12
 
 
@@ -45,25 +45,28 @@ class MinMeanMax(NamedTuple):
 _NUMBERS = json.loads((files(__package__) / "published.json").read_text(encoding="utf-8"))
 PAPER: str = _NUMBERS["paper"]
 SOURCES: dict[str, str] = {method: entry["source"] for method, entry in _NUMBERS["returns"].items()}
+
+
+def _convert(numbers: dict[str, Any], kind: Callable[..., Any]) -> dict[Any, Any]:
+    """Nested tables with rows of type ``kind``, and steps as integers."""
+    keys = {name: int(name) if name.isdecimal() else name for name in numbers}
+    return {
+        keys[name]: kind(*value) if isinstance(value, list) else _convert(value, kind)
+        for name, value in numbers.items()
+    }
+
+
 #: Episode returns: method -> environment steps -> task (domain_task)
 RETURNS: dict[str, dict[int, dict[str, MeanStd]]] = {
-    method: {
-        int(steps): {task: MeanStd(*value) for task, value in tasks.items()} for steps, tasks in entry["steps"].items()
-    }
-    for method, entry in _NUMBERS["returns"].items()
+    method: _convert(entry["steps"], MeanStd) for method, entry in _NUMBERS["returns"].items()
 }
 #: Returns after pretraining of sac_ae: arm -> task; PAPER, Table I. The steps of training are not stated there.
 #: "ball_in_cup" and "finger_turn" are taken for ball_in_cup_catch and finger_turn_easy, the suite's tasks of that name.
-PRETRAINING: dict[str, dict[str, MeanStd]] = {
-    arm: {task: MeanStd(*value) for task, value in tasks.items()} for arm, tasks in _NUMBERS["pretraining"].items()
-}
+PRETRAINING: dict[str, dict[str, MeanStd]] = _convert(_NUMBERS["pretraining"], MeanStd)
 #: SRL error per step: task -> policy; PAPER, last table of the appendix.
-SRL_ERROR: dict[str, dict[str, MinMeanMax]] = {
-    task: {actor: MinMeanMax(*value) for actor, value in actors.items()}
-    for task, actors in _NUMBERS["srl_error"].items()
-}
+SRL_ERROR: dict[str, dict[str, MinMeanMax]] = _convert(_NUMBERS["srl_error"], MinMeanMax)
 
-#: What makes a method, beside its head: the published settings
+#: The published settings of all methods
 SETTINGS = {
     "batch_size": 128,
     "gamma": 0.99,
@@ -81,7 +84,7 @@ SETTINGS = {
 }
 #: Updates after the warm-up by published method
 WARMUP_UPDATES = {"SAC-AE": 1000, "CURL": 0}
-#: What an arm may choose without becoming another method; its head, augmentation and curiosity are looked at
+#: Arguments that may differ without making an arm another method; head, augmentation and curiosity are judged apart
 FREE = {
     *("policy", "srl", "srl_kwargs", "augmentation", "augmentation_kwargs", "curiosity"),
     *("buffer_size", "replay_buffer_kwargs", "precision", "update", "overlap", "device", "verbose"),
@@ -89,34 +92,34 @@ FREE = {
 
 
 def task_key(task: str) -> str:
-    """
+    """Name of a task in the tables above.
+
     :param task: A task as results name it (``"cartpole-swingup"``, ``"finger-turn_easy"``)
-    :return: As the tables above name it (``"cartpole_swingup"``, ``"finger_turn_easy"``)
+    :return: Its key (``"cartpole_swingup"``, ``"finger_turn_easy"``)
     """
     return task.replace("-", "_")
 
 
-def published_method(config: dict) -> tuple[str | None, bool]:
-    """Which published method an arm is.
+def published_method(config: dict[str, Any]) -> tuple[str | None, bool]:
+    """Published method that an arm is or builds upon.
 
     :param config: Its ``config.json``
-    :return: The method that it is or builds upon, None for a head without published numbers; and whether it is that
-        method, in its settings and without curiosity
+    :return: The method, None for a head without published numbers; and whether the arm is that method, in its settings
+        and without curiosity
     """
-    arguments = config.get("arguments", {})
+    arguments = config["arguments"]
     base = {"rae": "SAC-AE", "curl": "CURL"}.get(str(arguments.get("srl", "rae")))
-    head = dict(arguments.get("srl_kwargs", {}))
-    augmentation = arguments.get("augmentation") or head.pop("augmentation", "none")
-    usual = ("crop",) if base == "CURL" else ("none", "auto")  # auto: what the head asks for, nothing with "rae"
+    usual = ("crop",) if base == "CURL" else (None, "auto")  # auto: no augmentation with "rae"
     settings = {**SETTINGS, "warmup_updates": WARMUP_UPDATES.get(str(base))}
-    is_usual = augmentation in usual and all(key in FREE or settings.get(key) == arguments[key] for key in arguments)
+    is_usual = all(key in FREE or settings.get(key) == arguments[key] for key in arguments)
     is_plain = config.get("algo", "cure_sac") == "cure_sac" and arguments.get("curiosity", "separate") is None
-    return base, is_usual and is_plain and not head
+    has_usual_views = arguments.get("augmentation") in usual and not arguments.get("srl_kwargs")
+    return base, is_usual and is_plain and has_usual_views
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """An arm beside a published number at the same environment steps.
+    """An arm compared with a published number at the same environment steps.
 
     :param experiment: Name of the experiment
     :param task: As of ``task_key``
@@ -148,19 +151,14 @@ class Comparison:
 
 
 def compare_with_published(experiments: Sequence[Experiment]) -> list[Comparison]:
-    """
+    """Compare arms with published returns.
+
     :param experiments: Experiments; those about visitation have no returns to compare
     :return: Every arm at every published step that its curves reach, of those that see the published pixels
     """
     rows = []
-    arms = [
-        (experiment, task, method)
-        for experiment in experiments
-        if experiment.kind != "visitation"
-        for task in experiment.tasks
-        for method in experiment.methods
-    ]
-    for experiment, task, method in arms:
+    curves = [each for each in experiments if each.kind != "visitation"]
+    for experiment, (task, method) in [(each, arm) for each in curves for arm in each.arms]:
         cells = [cell for cell in experiment.done(task, method).values() if len(cell.curve()[0]) > 1]
         if not cells or cells[0].config.get("pretrain") or not all(cell.sees_published_pixels for cell in cells):
             continue

@@ -1,4 +1,4 @@
-"""One HTML file about all experiments in a folder, with the tables as Markdown beside it.
+"""Write one HTML file about all experiments in a folder, and their tables as Markdown.
 
     sb3-cure report results
 
@@ -12,7 +12,6 @@ import itertools
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,9 +24,17 @@ import sb3_cure
 from sb3_cure.evaluation import plots
 from sb3_cure.experiments import published, statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
-from sb3_cure.experiments.tables import NONE, Table, interval_text, number_text, of_tasks, plural, ratio_text, words
+from sb3_cure.experiments.tables import (
+    NONE,
+    Table,
+    interval_text,
+    number_text,
+    plural,
+    ratio_text,
+    render_text,
+    tasks_text,
+)
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
-from sb3_cure.persistence.files import replacing
 
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: With more arms than these, each is compared with the baseline only
@@ -58,7 +65,6 @@ class Figure:
         if self.name.endswith(".mp4"):
             return None
         with Image.open(io.BytesIO(self.content), formats=["PNG"]) as image:
-            image.verify()
             return image.size
 
 
@@ -76,15 +82,15 @@ class Section:
 
     @property
     def facts(self) -> str:
-        return words("facts", self.experiment)
+        return render_text("facts", self.experiment)
 
     @property
     def progress(self) -> str:
-        return words("progress", self.experiment)
+        return render_text("progress", self.experiment)
 
     @property
-    def says(self) -> str:
-        """What comes first, for the overview."""
+    def summary(self) -> str:
+        """The first headline, for the overview."""
         more = len(self.headlines) - 1
         return (*self.headlines, NONE)[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
 
@@ -99,7 +105,8 @@ def _figure(name: str, caption: str, draw: Callable[..., None], *arguments: Any)
 
 
 def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "none") -> Section:
-    """
+    """Describe an experiment.
+
     :param experiment: An experiment
     :param thresholds: Returns, for the steps to reach them
     :param media: See ``media_of``
@@ -116,11 +123,10 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
         headlines, parts = _visitation(experiment)
     updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
     if len(updates) and not updates.any():
-        headlines.insert(0, words("untrained"))
-    explored = _stacked(experiment, "cells", at_least=1)
-    if explored:
+        headlines.insert(0, render_text("untrained"))
+    if explored := _stacked(experiment, "cells", at_least=1):
         if grown := _stacked(experiment, "cells"):
-            label, caption = "cells of the true state\nreached in training", words("cells_reached", list(grown))
+            label, caption = "cells of the true state\nreached in training", render_text("cells_reached", list(grown))
             parts.append(_figure("cells_reached", caption, plots.learning_curves, grown, colors, label))
         parts.append(tables.cells_reached_table(experiment, explored))
         headlines += _exploration_headlines(experiment, list(explored))
@@ -134,39 +140,38 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
 
 
 def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
-    """
+    """Draw return, SRL loss and SRL error of the policies over training.
+
     :param experiment: An experiment
     :param colors: By arm
-    :return: Return, SRL loss and SRL error of the policies over training, where there is anything to draw
+    :return: Figures of those that were recorded
     """
     for column, name, label, logarithmic in (
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
         ("srl_loss", "srl_loss", "SRL loss", True),
     ):
-        curves = _stacked(experiment, column)
-        if curves:
-            caption = words(name, list(curves))
+        if curves := _stacked(experiment, column):
+            caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
     errors: dict[str, dict[tuple[str, str], Curves]] = {}
     for actor in ("task", "curious"):
         for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
             errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
     if errors:
-        there = {actor for lines in errors.values() for _, actor in lines}
-        actors = [actor for actor in plots.LINE_STYLES if actor in there]
+        found = {actor for lines in errors.values() for _, actor in lines}
+        actors = [actor for actor in plots.LINE_STYLES if actor in found]
         label = "SRL error\n(deterministic actions)"
-        caption = words("srl_error", list(errors), actors)
+        caption = render_text("srl_error", list(errors), actors)
         yield _figure("srl_error", caption, plots.policy_curves, errors, colors, label, True, actors)
 
 
 def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str, dict[str, Curves]]:
-    """By task and arm, where there are so many evaluations with a value in the column."""
+    """Curves by task and arm, where there are at least so many evaluations with a value in the column."""
     curves: dict[str, dict[str, Curves]] = {}
-    for task in experiment.tasks:
-        for method in experiment.methods:
-            steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
-            if len(steps) >= at_least:
-                curves.setdefault(task, {})[method] = steps, values
+    for task, method in experiment.arms:
+        steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
+        if len(steps) >= at_least:
+            curves.setdefault(task, {})[method] = steps, values
     return curves
 
 
@@ -174,7 +179,7 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
     coverage, errors = state_coverage(experiment), summarise_errors(experiment)
     parts: list[Part] = []
     if coverage:
-        caption, label = words("coverage_bars"), "occupied cells of the true state"
+        caption, label = render_text("coverage_bars"), "occupied cells of the true state"
         parts.append(_figure("coverage", caption, plots.actor_bars, _bars(coverage), label))
         parts.append(tables.coverage_table(experiment, coverage))
     for head in HEADS:
@@ -182,13 +187,13 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
         lines: dict[str, dict[str, float]] = {task: {} for task in bars}
         for task, values in lines.items():
             for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
-                means = [row.mean for row in errors if (row.task, row.head) == (task, other)]
-                values |= {label: float(np.mean(means))} if means else {}
+                if means := [row.mean for row in errors if (row.task, row.head) == (task, other)]:
+                    values[label] = float(np.mean(means))
             theirs = published.SRL_ERROR.get(published.task_key(task))
             if theirs and experiment.sees_published_pixels:
                 values["paper's cure"] = theirs["curious"].mean
         if bars:
-            caption = words("visitation_bars", head, {label for values in lines.values() for label in values})
+            caption = render_text("visitation_bars", head, {label for values in lines.values() for label in values})
             parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
     if errors:
         parts.append(tables.error_table(experiment, errors))
@@ -198,7 +203,7 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
 
 
 def _bars(rows: Sequence[Measured]) -> dict[str, list[plots.Bar]]:
-    """By task."""
+    """Bars by task."""
     panels: dict[str, list[plots.Bar]] = {}
     for row in rows:
         text = f"{number_text(row.ratio.value, 2)}\N{MULTIPLICATION SIGN}" if math.isfinite(row.ratio.value) else ""
@@ -209,23 +214,22 @@ def _bars(rows: Sequence[Measured]) -> dict[str, list[plots.Bar]]:
 
 
 def _visitation_headlines(experiment: Experiment, measures: Sequence[tuple[Measured, str]]) -> Iterator[str]:
-    """Of each arm with a curious policy a sentence against the random policy, and one against the task policy."""
-    arms = [(task, method) for task in experiment.tasks for method in experiment.methods]
-    for (task, method), other in itertools.product(arms, ("ratio", "task_ratio")):
+    """A sentence on each curious policy against the random policy, and one against the task policy."""
+    for (task, method), other in itertools.product(experiment.arms, ("ratio", "task_ratio")):
         rows = [(row, what) for row, what in measures if (row.task, row.method, row.actor) == (task, method, "curious")]
         ratios = [(getattr(row, other), what) for row, what in rows]
         found = [(ratio_text(ratio), what, ratio.n) for ratio, what in ratios if math.isfinite(ratio.value)]
         if found:
             policy = "random policy" if other == "ratio" else f"task policy of {experiment.baseline_of(method)}"
-            yield words("visits", method, task, policy, found)
+            yield render_text("visits", method, task, policy, found)
 
 
 def _exploration_headlines(experiment: Experiment, tasks: Sequence[str]) -> Iterator[str]:
-    """Of each arm a sentence: how many of the cells of its baseline it reached."""
+    """A sentence on each arm: its cells over those of its baseline."""
     for task, method in itertools.product(tasks, experiment.methods):
         baseline, ratio = experiment.baseline_of(method), statistics.cells_ratio(experiment, task, method)
         if method != baseline and ratio.n:
-            yield words("explores", method, task, baseline, ratio_text(ratio), ratio.n)
+            yield render_text("explores", method, task, baseline, ratio_text(ratio), ratio.n)
 
 
 def _comparison(
@@ -242,29 +246,14 @@ def _comparison(
         if row.task is None or row.method not in several:
             digits = tables.difference_digits(row, experiment)
             value, interval = number_text(row.t.value, digits), interval_text(row.t, digits)
-            headlines.append(words("difference", row, value, interval, of_tasks(row)))
+            headlines.append(render_text("difference", row, value, interval, tasks_text(row)))
     if differences:
-        lines = [
-            (
-                row.method,
-                f"{tables.difference_label(row, experiment.baseline)}, {of_tasks(row)}",
-                np.concatenate(list(row.differences.values())),
-                (row.t.value, row.t.low, row.t.high),
-            )
-            for row in differences
-        ]
-        caption = words("paired_difference", tables.compared_with(differences, experiment))
-        label = "difference in area under the curve (return)"
-        parts.append(_figure("paired_difference", caption, plots.paired_differences, lines, colors, label))
-        parts.append(tables.difference_table(experiment, differences))
-        finals = statistics.paired_differences(experiment, "finals")
-        parts.append(tables.difference_table(experiment, finals, "final return", "As above."))
+        parts += _difference_parts(experiment, differences, colors)
     elif len(experiment.methods) > 1:
-        headlines.append(words("nothing_shared", experiment.baseline))
+        headlines.append(render_text("nothing_shared", experiment.baseline))
     else:
-        headlines.append(words("one_arm"))
-    pairs = list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []
-    if pairs:
+        headlines.append(render_text("one_arm"))
+    if pairs := list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []:
         note = "As above, over all tasks."
         parts.append(tables.difference_table(experiment, pairs, note=note, compared="between any two arms"))
     try:
@@ -272,11 +261,31 @@ def _comparison(
     except ResultsError as error:
         return headlines, [*parts, f"No aggregates: {error}"]
     if found is None:
-        return headlines, [*parts, words("no_aggregates")]
+        return headlines, [*parts, render_text("no_aggregates")]
     iqm = {method: (each.value, each.low or 0.0, each.high or 0.0) for method, each in found.iqm.items()}
-    caption, drawn = words("aggregate_scores"), (iqm, found.taus, found.profiles)
+    caption, drawn = render_text("aggregate_scores"), (iqm, found.taus, found.profiles)
     parts.append(_figure("aggregates", caption, plots.aggregate_scores, *drawn, colors))
     return headlines, [*parts, tables.aggregate_table(experiment, found)]
+
+
+def _difference_parts(
+    experiment: Experiment, differences: Sequence[statistics.PairedDifference], colors: Mapping[str, str]
+) -> Iterator[Part]:
+    lines = [
+        (
+            row.method,
+            f"{tables.difference_label(row, experiment.baseline)}, {tasks_text(row)}",
+            np.concatenate(list(row.differences.values())),
+            (row.t.value, row.t.low, row.t.high),
+        )
+        for row in differences
+    ]
+    caption = render_text("paired_difference", tables.compared_with(differences, experiment))
+    label = "difference in area under the curve (return)"
+    yield _figure("paired_difference", caption, plots.paired_differences, lines, colors, label)
+    yield tables.difference_table(experiment, differences)
+    finals = statistics.paired_differences(experiment, "finals")
+    yield tables.difference_table(experiment, finals, "final return", "As above.")
 
 
 def _all_pairs(experiment: Experiment) -> Iterator[statistics.PairedDifference]:
@@ -288,29 +297,18 @@ def _all_pairs(experiment: Experiment) -> Iterator[statistics.PairedDifference]:
 
 
 def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, list[Part]]]:
-    """
+    """Cells with their pictures and videos.
+
     :param experiment: An experiment
     :param which: ``"all"`` seeds, of each arm the ``"first"`` one that has some, or ``"none"``
-    :return: Cells with their pictures and videos
+    :return: Cells and what to show of them
     """
-    shown: set[tuple[str, str]] = set()
-    order = [(task, method) for task in experiment.tasks for method in experiment.methods]
-    for cell in sorted(experiment.finished, key=lambda cell: (order.index((cell.task, cell.method)), cell.seed)):
-        files = [cell.folder / name for name in MEDIA if (cell.folder / name).exists()]
-        if files and which != "none" and (which == "all" or (cell.task, cell.method) not in shown):
-            shown.add((cell.task, cell.method))
-            yield cell, list(map(_medium, files))
-
-
-def _medium(path: Path) -> Part:
-    """A picture or video of a cell, or a sentence about why it cannot be shown."""
-    try:
-        figure = Figure(path.name, words("media", path.name), path.read_bytes())
-        if figure.size is None and figure.content[4:8] != b"ftyp":
-            raise ValueError("it is no MP4.")
-        return figure
-    except (OSError, SyntaxError, ValueError) as error:  # SyntaxError: Pillow's word for a broken PNG
-        return f"{path.name} cannot be shown: {error}"
+    for task, method in experiment.arms if which != "none" else ():
+        for cell in experiment.done(task, method).values():
+            if files := [cell.folder / name for name in MEDIA if (cell.folder / name).exists()]:
+                yield cell, [Figure(path.name, render_text("media", path.name), path.read_bytes()) for path in files]
+                if which == "first":
+                    break
 
 
 # Files
@@ -325,7 +323,7 @@ def write_report(
     :param out: HTML file
     :param thresholds: Returns, for the steps to reach them
     :param media: Of which seeds: ``"first"``, ``"all"`` or ``"none"``
-    :return: What was written
+    :return: The files that were written
     :raises ResultsError: with one sentence that names the file and what is wrong
     """
     experiments = read_results(results)
@@ -334,62 +332,59 @@ def write_report(
     table = tables.published_table(compared) if compared else None
     facts = {"title": results.resolve().name, "sections": sections, "comparisons": table, "media": media}
     facts |= {"version": sb3_cure.__version__, "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
-    pages = {out: "report.html.j2", results / "summary.md": "summary.md.j2"}
-    texts = {path: tables.render(template, **facts) for path, template in pages.items()}
-    for section in sections:
-        text = tables.render("experiment.md.j2", section=section, level=1, plots_beside=True)
-        texts[section.experiment.folder / "table.md"] = text
+    texts = {
+        out: tables.render("report.html.j2", **facts),
+        results / "summary.md": tables.render("summary.md.j2", **facts),
+    }
     files = {path: text.encode() for path, text in texts.items()}
     for section in sections:
-        figures = [part for part in section.parts if isinstance(part, Figure)]
-        files |= {section.experiment.folder / figure.name: figure.content for figure in figures}
-    written: list[Path] = []
-    failed: set[Path] = set()
+        folder = section.experiment.folder
+        text = tables.render("experiment.md.j2", section=section, level=1, plots_beside=True)
+        files[folder / "table.md"] = text.encode()
+        files |= {folder / part.name: part.content for part in section.parts if isinstance(part, Figure)}
     for path, content in files.items():
         try:
-            if path.parent not in failed:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with nullcontext(path) if path == out else replacing(path) as file:
-                    file.write_bytes(content)
-                written.append(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
         except OSError as error:
-            if path == out:
-                raise ResultsError(f"{path} cannot be written ({error.strerror}): choose another --out.") from None
-            # Others' results may be read-only, of some experiments or of all.
-            print(f"{path.parent} cannot be written to ({error.strerror}): its tables and plots are in {out} alone.")
-            failed.add(path.parent)
-    return written
+            raise ResultsError(f"{path} cannot be written ({error.strerror}).") from None
+    return list(files)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The command ``sb3-cure report``.
+    """Run the command ``sb3-cure report``.
 
     :param argv: Command line, ``sys.argv`` by default
-    :return: 0, or 1 if the results cannot be read
+    :return: 0, or 1 if the results cannot be read or the report cannot be written
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("results", type=Path, help="folder that `sb3-cure experiment` wrote, or one experiment in it")
     parser.add_argument("--out", type=Path, help="HTML file (default: report.html in the folder)")
-    of_returns = "returns whose steps are told (default: 250,500,750)"
-    parser.add_argument("--thresholds", type=returns, default=THRESHOLDS, help=of_returns)
-    of_media = "videos and pictures of which seeds (default: of each arm the first that has some)"
-    parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=of_media)
+    returns_help = "returns for which the steps to reach them are shown (default: 250,500,750)"
+    parser.add_argument("--thresholds", type=returns, default=THRESHOLDS, help=returns_help)
+    media_help = "seeds with videos and pictures (default: of each arm the first that has some)"
+    parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=media_help)
     options = parser.parse_args(argv)
-    out = options.out or options.results / "report.html"
     try:
-        written = write_report(options.results, out, options.thresholds, options.media)
+        written = write_report(
+            options.results, options.out or options.results / "report.html", options.thresholds, options.media
+        )
     except ResultsError as error:
         print(f"sb3-cure report: {error}", file=sys.stderr)
         return 1
     size = written[0].stat().st_size / 2**20
-    print(f"{written[0]} ({size:.1f} MB), and {len(written) - 1} tables and plots beside it and in the experiments")
+    print(f"Wrote {written[0]} ({size:.1f} MB), and {len(written) - 1} tables and plots")
     return 0
 
 
 def returns(text: str) -> list[float]:
-    """For argparse, which names it where it fails."""
+    """Parse returns, separated by commas (argparse shows this function's name in errors).
+
+    :param text: Such as ``"250,500"``
+    :return: The returns
+    """
     return [float(number) for number in text.split(",")]
 
 

@@ -1,8 +1,6 @@
-"""Reads the folders that experiments wrote, and refuses what would make a wrong number."""
+"""Read the folders that experiments wrote, and refuse what would give wrong numbers."""
 
-import csv
 import json
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,11 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_cure.evaluation.result_files import read_rows
-from sb3_cure.experiments.grid import comparable, seed_of, short_name
+from sb3_cure.experiments.grid import SETTINGS, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
-_AGAIN = "remove the cell's folder and run the grid again"
+_FIX = "remove the cell's folder and run the grid again"
 
 
 class ResultsError(ValueError):
@@ -28,9 +25,9 @@ class CellResult:
     :param task: Short name of the task (``"cartpole-swingup"``)
     :param method: Name of the arm
     :param seed: Seed
-    :param folder: Where its files lie
+    :param folder: Its folder
     :param status: ``"done"``, ``"unfinished"``, ``"failed"``, ``"not run"``, or which other budget it was run with;
-        only cells that are done have what follows, and enter statistics
+        only done cells have the following fields and enter statistics
     :param config: ``config.json``
     :param run: ``run.json``
     :param evaluations: ``eval.csv`` (missing values are nan)
@@ -56,28 +53,27 @@ class CellResult:
     @property
     def sees_published_pixels(self) -> bool:
         """Whether its images are those of the published results: only then numbers compare."""
-        arguments = self.config.get("arguments", {})
-        if not str(self.config.get("task", "")).startswith("dmc_pixels/"):
-            return False
-        crops = "crop" in (arguments.get("augmentation"), arguments.get("srl_kwargs", {}).get("augmentation"))
+        crops = self.config["arguments"].get("augmentation") == "crop"
         usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
-        return {**usual, **self.config.get("env_kwargs", {})} == usual
+        is_dmc = str(self.config["task"]).startswith("dmc_pixels/")
+        return is_dmc and {**usual, **self.config["env_kwargs"]} == usual
 
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
-        """
+        """Environment steps and values, where there are any.
+
         :param column: A column of ``eval.csv``, or ``"cells"`` of ``coverage.csv``
-        :return: Environment steps and values where there are any, [n] each
+        :return: Steps and values, [n] each
         """
         table = self.coverage if column == "cells" else self.evaluations
         if column not in table:
             return np.zeros(0), np.zeros(0)
-        known = table[np.isfinite(table[column])]
+        known = table.dropna(subset=[column])
         return known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
 
     def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-        """
-        :return: True physics states by actor, [n, d] each, and the units of their coordinates (``visits.npz``); both
-            empty if there are none
+        """True physics states that were visited (``visits.npz``).
+
+        :return: States by actor, [n, d] each, and the units of their coordinates; both empty if there are none
         :raises ResultsError: if the file cannot be read
         """
         path = self.folder / "visits.npz"
@@ -89,7 +85,7 @@ class CellResult:
                 found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
                 return found, tuple(map(str, file["state_units"])) if found else ()
         except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
+            raise ResultsError(f"{path} cannot be read ({error}): {_FIX}.") from None
 
 
 @dataclass(frozen=True)
@@ -97,30 +93,38 @@ class Experiment:
     """All cells of a grid, run or not.
 
     :param name: Its folder below the one that was read (``"500k/curves"``), or its own name
-    :param folder: Where it lies
+    :param folder: Its folder
     :param grid: ``grid.json``
-    :param kind: ``"curves"``, ``"visitation"`` or ``"pretraining"``
-    :param budget: Environment steps of each cell
-    :param baseline: The arm that the others are compared with
-    :param cells: By (task, method, seed), in the grid's order; cells on disk that the grid does not name come last
+    :param cells: By (task, method, seed), in the grid's order; cells that the grid does not name come last
     """
 
     name: str
     folder: Path
     grid: dict[str, Any]
-    kind: str
-    budget: int
-    baseline: str
     cells: dict[tuple[str, str, int], CellResult]
 
+    @property
+    def kind(self) -> str:
+        """``"curves"``, ``"visitation"`` or ``"pretraining"``."""
+        return self.grid["kind"]
+
+    @property
+    def budget(self) -> int:
+        """Environment steps of each cell."""
+        return self.grid["budget"]
+
+    @property
+    def baseline(self) -> str:
+        """The arm that the others are compared with."""
+        return self.grid["baseline"]
+
     def baseline_of(self, method: str) -> str:
-        """
+        """The arm with which an arm is compared: its own baseline if the grid gives it one.
+
         :param method: Name of an arm
-        :return: The arm with which it is compared: its own baseline if the grid gives it one
+        :return: Name of its baseline
         """
-        methods = self.grid["methods"]
-        described = methods.get(method) if isinstance(methods, dict) else None
-        return str(described.get("baseline", self.baseline)) if isinstance(described, dict) else self.baseline
+        return self.grid["methods"].get(method, {}).get("baseline") or self.baseline
 
     @property
     def tasks(self) -> list[str]:
@@ -131,6 +135,11 @@ class Experiment:
         return list(dict.fromkeys(method for _, method, _ in self.cells))
 
     @property
+    def arms(self) -> list[tuple[str, str]]:
+        """All pairs of a task and a method."""
+        return [(task, method) for task in self.tasks for method in self.methods]
+
+    @property
     def seeds(self) -> list[int]:
         return sorted({seed for _, _, seed in self.cells})
 
@@ -139,19 +148,20 @@ class Experiment:
         return [cell for cell in self.cells.values() if cell.done]
 
     def of_arm(self, task: str, method: str) -> dict[int, CellResult]:
-        """
+        """Cells of an arm on a task.
+
         :param task: Short name of the task
         :param method: Name of the arm
-        :return: The cells of an arm on a task, by seed
+        :return: Cells by seed
         """
-        found = {seed: cell for (at, arm, seed), cell in self.cells.items() if (at, arm) == (task, method)}
-        return dict(sorted(found.items()))
+        return {seed: self.cells[key] for seed in self.seeds if (key := (task, method, seed)) in self.cells}
 
     def done(self, task: str, method: str) -> dict[int, CellResult]:
-        """
+        """Finished cells of an arm on a task.
+
         :param task: Short name of the task
         :param method: Name of the arm
-        :return: The finished cells of an arm on a task, by seed
+        :return: Cells by seed
         """
         return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}
 
@@ -169,8 +179,6 @@ def read_results(folder: str | Path) -> list[Experiment]:
     :raises ResultsError: with one sentence that names the folder or file and what is wrong with it
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise ResultsError(f"{folder} is no folder: give the one that `sb3-cure experiment` wrote.")
     if (folder / "grid.json").exists():
         return [_read_experiment(folder / "grid.json")]
     grids = sorted(folder.rglob("grid.json"))
@@ -178,126 +186,87 @@ def read_results(folder: str | Path) -> list[Experiment]:
     if lost:
         raise ResultsError(f"{min(lost)} holds finished cells, but no grid.json: run the grid again, which writes it.")
     if not grids:
-        raise ResultsError(
-            f"{folder} holds no experiment (no grid.json in it, nor anywhere below it): give the folder that "
-            "`sb3-cure experiment` wrote."
-        )
+        raise ResultsError(f"{folder} holds no experiment: give the folder that `sb3-cure experiment` wrote.")
     return [_read_experiment(path, path.parent.relative_to(folder).as_posix()) for path in grids]
 
 
 def _read_experiment(path: Path, name: str | None = None) -> Experiment:
-    grid, root = _read_json(path, "remove it and run the grid again, which writes it"), path.parent
-    try:
-        tasks, methods, seeds = [short_name(str(task)) for task in grid["tasks"]], list(grid["methods"]), grid["seeds"]
-        budget, own_name = int(grid["budget"]), str(grid["experiment"])
-        kind, baseline = str(grid["kind"]), str(grid["baseline"])
-        seeds = list(range(seeds)) if isinstance(seeds, int) else list(map(int, seeds))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ResultsError(f"{path} describes no grid ({error!r}): remove it and run the grid again.") from None
-    for part in (*tasks, *methods):
-        if Path(part).name != part:
-            raise ResultsError(f"{path} names {part!r}, which cannot be the name of a folder: correct it.")
-    keys = [(task, method, seed) for task in tasks for method in methods for seed in seeds]
+    grid, root = _read_json(path, "experiment", "kind", "budget", "tasks", "methods", "seeds", "baseline"), path.parent
+    tasks = [short_name(task) for task in grid["tasks"]]
+    keys = [(task, method, seed) for task in tasks for method in grid["methods"] for seed in grid["seeds"]]
     for found in sorted(root.glob("*/*/seed*")):
         if (seed := seed_of(found)) is not None:
             keys.append((found.parent.parent.name, found.parent.name, seed))
-    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, budget, kind) for key in keys}
-    _check_alike(cells.values())
-    order = list(dict.fromkeys(task for task, _, _ in cells))
-    in_order = dict(sorted(cells.items(), key=lambda item: order.index(item[0][0])))
-    return Experiment(name or own_name, root, grid, kind, budget, baseline, in_order)
+    order = list(dict.fromkeys(task for task, _, _ in keys))
+    keys = sorted(dict.fromkeys(keys), key=lambda key: order.index(key[0]))
+    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid) for key in keys}
+    experiment = Experiment(name or grid["experiment"], root, grid, cells)
+    for task, method in experiment.arms:
+        done = list(experiment.done(task, method).values())
+        for cell in done[1:]:
+            _check_settings(done[0], cell, (*SETTINGS, "task", "budget"))
+    for task in experiment.tasks:
+        done = [cell for cell in experiment.finished if cell.task == task]
+        for cell in done[1:]:
+            _check_settings(done[0], cell, ("eval_every", "eval_episodes", "coverage"))
+    return experiment
 
 
-def _check_alike(cells: Iterable[CellResult]) -> None:
-    """Whether the seeds of an arm were run with the same settings, and all arms of a task evaluated alike."""
-    first: dict[tuple[str, ...], CellResult] = {}
-    for cell in (cell for cell in cells if cell.done):
-        keys = (cell.config.keys() | {"arguments"}) - {"seed", "method"}
-        for arm, compared in (
-            ((cell.task, cell.method), keys),
-            ((cell.task,), {"eval_every", "eval_episodes", "coverage"}),
-        ):
-            other = first.setdefault(arm, cell)
-            for key in sorted(compared & other.config.keys()):
-                here, there = comparable(key, cell.config.get(key), other.config[key])
-                if here != there:
-                    raise ResultsError(
-                        f"{cell.folder} was run with {key} {here!r}, but {other.folder} with {there!r}, so that they "
-                        "cannot be compared: put one of them into another folder."
-                    )
+def _check_settings(first: CellResult, other: CellResult, keys: tuple[str, ...]) -> None:
+    """Refuse to average over cells that were run with different settings."""
+    for key in keys:
+        if first.config.get(key) != other.config.get(key):
+            raise ResultsError(
+                f"{other.folder} was run with {key} {other.config.get(key)!r}, but {first.folder} with "
+                f"{first.config.get(key)!r}: put one of them into another folder."
+            )
 
 
-def _read_cell(folder: Path, task: str, method: str, seed: int, budget: int, kind: str) -> CellResult:
+def _read_cell(folder: Path, task: str, method: str, seed: int, grid: dict[str, Any]) -> CellResult:
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
         return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
-    config, run = _read_json(folder / "config.json"), _read_json(folder / "run.json")
-    own = (short_name(str(config.get("task", task))), config.get("method", method), config.get("seed", seed))
-    if own != (task, method, seed):
-        raise ResultsError(
-            f"{folder / 'config.json'} is of task {own[0]!r}, method {own[1]!r} and seed {own[2]!r}, which its folder "
-            "is not: put it back."
-        )
-    own_budget = config.get("budget", budget)
-    if own_budget not in (budget, 0):  # 0: representation learning alone, without training on the task
-        return CellResult(task, method, seed, folder, f"other budget: {own_budget} steps", config, run)
-    needed = ["visitation.csv", "visits.npz"] if kind == "visitation" else ["eval.csv"] if own_budget > 0 else []
-    for name in needed:
-        if not (folder / name).exists():
-            raise ResultsError(f"{folder} is marked as DONE, but has no {name}: {_AGAIN}.")
-    evaluations = _read_table(folder / "eval.csv", "environment_steps", "return_mean")
-    if "eval.csv" in needed or (own_budget > 0 and len(evaluations)):
-        _check_whole(folder / "eval.csv", evaluations, own_budget, config)
-    visits = _read_table(folder / "visitation.csv", "error_min", "error_mean", "error_max", text=("actor", "head"))
-    covered = _read_table(folder / "coverage.csv", "environment_steps", "cells")
+    config = _read_json(folder / "config.json", "task", "method", "seed", "budget", "env_kwargs", "arguments")
+    run = _read_json(folder / "run.json")
+    if (short_name(config["task"]), config["method"], config["seed"]) != (task, method, seed):
+        raise ResultsError(f"{folder / 'config.json'} is of another cell than its folder: put it back.")
+    budget = config["budget"]
+    if budget not in (grid["budget"], 0):  # 0: representation learning alone, without training on the task
+        return CellResult(task, method, seed, folder, f"other budget: {budget} steps", config, run)
+    is_visitation = grid["kind"] == "visitation"
+    evaluations = _read_table(folder / "eval.csv", budget > 0 and not is_visitation, "environment_steps", "return_mean")
+    visits = _read_table(folder / "visitation.csv", is_visitation, "error_min", "error_mean", "error_max")
+    covered = _read_table(folder / "coverage.csv", False, "environment_steps", "cells")
+    if budget > 0 and len(evaluations):
+        _check_whole(folder / "eval.csv", evaluations, budget, config["arguments"].get("task", True))
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits, covered)
 
 
-def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, config: dict[str, Any]) -> None:
-    """Whether a learning curve goes from 0 to the budget, no row is left out, and all have a return (but those of a
-    curious agent alone)."""
-    steps, known = evaluations["environment_steps"].to_numpy(), np.isfinite(evaluations["return_mean"].to_numpy())
-    # Evaluations are due at multiples of `eval_every`, and are made before the next rollout.
-    every, train_freq = config.get("eval_every", np.inf), config.get("arguments", {}).get("train_freq", 1)
-    rollout = (
-        config.get("action_repeat", 1) * config.get("n_envs", 1) * train_freq if isinstance(train_freq, int) else np.inf
-    )
-    gaps = np.flatnonzero(np.diff(steps // every) > max(1, np.ceil(rollout / every)))
-    if not len(steps) or steps[0] > 0 or steps[-1] < budget:
-        found = f"from {steps[0]:.0f} to {steps[-1]:.0f}" if len(steps) else "no"
-        reason = f"has evaluations of {found} environment steps, but the cell was trained for {budget}"
-    elif not (np.diff(steps) > 0).all():
-        reason = "has environment_steps that do not grow from row to row"
-    elif len(gaps):
-        reason = f"has no evaluation between {steps[gaps[0]]:.0f} and {steps[gaps[0] + 1]:.0f} environment steps"
-    elif not known.all() and (known.any() or config.get("arguments", {}).get("task", True)):
-        reason = f"has no return_mean in line {np.flatnonzero(~known)[0] + 2}"
-    else:
-        return
-    raise ResultsError(f"{path} {reason}: {_AGAIN}.")
+def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, learns_task: bool) -> None:
+    """Refuse a curve that does not go from 0 to the budget, or lacks returns: its area would be wrong."""
+    steps = evaluations["environment_steps"]
+    if steps.iloc[0] > 0 or steps.iloc[-1] < budget or not (steps.diff().dropna() > 0).all():
+        raise ResultsError(f"{path} does not go step by step from 0 to {budget} environment steps: {_FIX}.")
+    if learns_task and not np.isfinite(evaluations["return_mean"]).all():
+        raise ResultsError(f"{path} has a row without return_mean: {_FIX}.")
 
 
-def _read_json(path: Path, fix: str = _AGAIN) -> dict[str, Any]:
+def _read_json(path: Path, *needed: str) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:  # ValueError: also of text that is no UTF-8
-        raise ResultsError(f"{path} cannot be read ({error}): {fix}.") from None
-    if not isinstance(content, dict):
-        raise ResultsError(f"{path} holds a {type(content).__name__}, but it must hold an object: {fix}.")
+        if missing := [name for name in needed if name not in content]:
+            raise ValueError(f"it has no {missing[0]!r}")
+    except (OSError, ValueError, TypeError) as error:
+        raise ResultsError(f"{path} cannot be read ({error}): run the grid again, which writes it.") from None
     return content
 
 
-def _read_table(path: Path, *numbers: str, text: tuple[str, ...] = ()) -> pd.DataFrame:
-    """A CSV file with at least these columns; an empty table if there is none."""
-    if not path.exists():
-        return pd.DataFrame({**dict.fromkeys(numbers, np.zeros(0)), **{name: [] for name in text}})
+def _read_table(path: Path, is_needed: bool, *numbers: str) -> pd.DataFrame:
+    """A CSV file with at least these columns of numbers; an empty table if there is none and none is needed."""
+    if not path.exists() and not is_needed:
+        return pd.DataFrame(columns=list(numbers), dtype=float)
     try:
-        rows = [
-            {name: np.nan if value == "" else value for name, value in row.items()}
-            for row in read_rows(path, (*numbers, *text))
-        ]
-        table = pd.DataFrame(rows or {name: [] for name in (*numbers, *text)})
-        return table.astype({name: float for name in table if name not in text})
-    except (OSError, ValueError, csv.Error) as error:
-        raise ResultsError(f"{path} cannot be read ({error}): {_AGAIN}.") from None
+        return pd.read_csv(path).astype(dict.fromkeys(numbers, float))
+    except (OSError, KeyError, ValueError) as error:  # pandas' own errors are ValueErrors
+        raise ResultsError(f"{path} cannot be read ({error}): {_FIX}.") from None

@@ -5,32 +5,23 @@ import os
 import platform
 import re
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-from rich.console import Console
-from rich.live import Live
-
 from sb3_cure.evaluation.result_files import write_json, write_text
-from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_settings, is_held, run_cell
-from sb3_cure.experiments.grid import Cell, Grid, GridError, check_arms, load_grid, read_kept
+from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
+from sb3_cure.experiments.grid import Grid, GridError, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 from sb3_cure.networks.allocator import tune_allocator
 
 ENGINES = ("local", "ray")
-#: In the log of a job, between two lines about the whole
-SUMMARY_SECONDS = 300.0
-_PLURALS = {Cell: "cells", CommonHeads: "tasks' common heads"}
-_ALL, _ENDED = Path("all"), re.compile(": (done|failed)")
 #: Folder of results, minutes between checkpoints, whether to draw
 Settings: TypeAlias = tuple[Path, float, bool]
-#: Runs all of some units, and returns those that failed
+#: Runs units, and returns those that failed
 RunAll: TypeAlias = Callable[[Sequence[Unit], Settings], list[Unit]]
 
 
@@ -46,35 +37,34 @@ def run_grid(
     gpus_per_cell: float | None = None,
     retries: int = 3,
 ) -> list[Unit]:
-    """Run the cells that are not done; started again after any interruption, it goes on.
+    """Run the cells that are not done; after an interruption, the same call continues.
 
-    Of a grid of kind ``"visitation"`` common heads follow when all cells are run.
+    In a grid of kind ``"visitation"`` common heads follow when all cells are done.
 
     :param grid: The grid
     :param results: Folder of all results; with several machines one that they share
     :param engine: ``"local"``: one after the other in this process; ``"ray"``: side by side in worker processes
-    :param checkpoint_minutes: At most so many minutes of a cell are lost by an interruption
+    :param checkpoint_minutes: Minutes between two checkpoints, the most that an interruption loses of a cell
     :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
         only where no machine has a GPU: Ray would start a cell per core, all on the first card
-    :param retries: Ray: how often a cell whose worker died is begun again, from its checkpoint
-    :return: The cells and common heads that failed; each has its traceback in ``error.txt``, if it can be written
-    :raises GridError: with one sentence, before anything is written, for what cannot be run
+    :param retries: Ray: how often a cell whose worker died is started again, from its checkpoint
+    :return: The cells and common heads that failed; each has its traceback in ``error.txt``
+    :raises GridError: with one sentence, before anything is written, if the grid cannot be run
     """
     if engine not in ENGINES:
-        raise GridError(f"engine is {engine!r}, but it must be one of {', '.join(ENGINES)}: choose one.")
+        raise GridError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
     settings = (results, checkpoint_minutes, pictures)
     resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
     with _ray(address, resources) if engine == "ray" else nullcontext(_run_here) as run_all:
-        _keep_grid(grid, results / grid.experiment)
-        with _live_progress(lambda: [*grid.cells, *common_heads(grid, results, grid.cells)], results):
-            failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], settings)
-            heads = common_heads(grid, results)
-            failed += run_all([each for each in heads if not each.is_done(results)], settings)
+        _write_grid(grid, results / grid.experiment)
+        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], settings)
+        heads = common_heads(grid, results)
+        failed += run_all([each for each in heads if not each.is_done(results)], settings)
     lacking = {cell.task for cell in grid.cells if grid.kind == "visitation"} - {each.task for each in heads}
     for task in sorted(lacking):
         print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
@@ -82,84 +72,85 @@ def run_grid(
 
 
 def check_grid(grid: Grid, results: Path) -> None:
-    """
+    """Refuse an arm that cannot be built, and a folder with results of other settings.
+
+    Results of other seeds and arms count, too, as they will be compared.
+
     :param grid: A grid
     :param results: Folder of all results, whether it exists or not
-    :raises GridError: with one sentence, if an arm cannot work, or the folder holds cells of other settings: also of
-        other seeds and arms, as they are to be compared with those that are run now
+    :raises GridError: with one sentence
     """
     shared = {key: grid.description.get(key) for key in ("kind", "budget", "evaluation", "coverage")}
-    check_settings(results / grid.experiment, shared, "grid.json")
+    check_settings(results / grid.experiment / "grid.json", shared)
     for cell in grid.with_seeds_in(results):
-        check_settings(results / cell.folder, cell.config())
+        check_cell(results / cell.folder, cell)
     check_arms(cell for cell in grid.cells if not cell.is_done(results))
 
 
-def _keep_grid(grid: Grid, folder: Path) -> None:
-    """Write ``grid.json``; what an earlier call ran besides stays part of the experiment."""
+def _write_grid(grid: Grid, folder: Path) -> None:
+    """Write ``grid.json``; seeds, tasks and methods of earlier calls stay part of the experiment."""
     path = folder / "grid.json"
     description = dict(grid.description)
     if path.exists():
-        before = read_kept(path, "seeds", "tasks", "methods")
+        before = read_kept(path)
         description["seeds"] = sorted({*before["seeds"], *description["seeds"]})
         description["tasks"] = list(dict.fromkeys([*before["tasks"], *description["tasks"]]))
         description["methods"] = {**before["methods"], **description["methods"]}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(path, description)
-    except OSError as error:
-        raise GridError(f"{folder} cannot be written to ({error.strerror}): give another --out.") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(path, description)
 
 
-# --------------------------------------------------------------------- engines
+# ---------------------------------------------------------------- engines
 
 
 def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
     left, failed = list(units), []
     while left:
-        # What other processes are making comes last: common heads are waited for.
+        # Units of other processes come last: common heads wait for them.
         left.sort(key=lambda unit: is_held(settings[0] / unit.folder))
         unit = left.pop(0)
-        if not _run_and_tell(unit, *settings):
+        if not _run_unit(unit, *settings):
             failed.append(unit)
     return failed
 
 
-def _run_and_tell(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
-    """Whether it could be run; a failure must not stop the others."""
+def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
+    """Run a unit; a failure is written into its folder and does not stop the others.
+
+    :return: Whether it succeeded
+    """
     tune_allocator()
     try:
         if isinstance(unit, CommonHeads):
             run_heads(unit, results)
         else:
             run_cell(unit, results, checkpoint_minutes, pictures)
+        print(f"{unit.folder}: done", flush=True)
     except CellIsRunning as elsewhere:
-        print(elsewhere)
+        print(elsewhere, flush=True)
     except Exception:
-        _keep_error(unit, results, traceback.format_exc())
+        _write_error(unit, results, traceback.format_exc())
         return False
     return True
 
 
 def _run_on_worker(unit: Unit, settings: Settings, has_gpu: bool) -> bool:
-    """The same in a process of Ray's, which leaves all GPUs to see for whoever has asked for none."""
+    """Run a unit in a process of Ray, which does not hide the GPUs from a task that asks for none."""
     if not has_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
-    return _run_and_tell(unit, *settings)
+    return _run_unit(unit, *settings)
 
 
-def _keep_error(unit: Unit, results: Path, text: str) -> None:
-    path = results / unit.folder / ERROR
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
-    except OSError as error:
-        print(f"{path} cannot be written ({error.strerror}); it would tell: {text.strip().splitlines()[-1]}")
+def _write_error(unit: Unit, results: Path, text: str) -> None:
+    print(f"{unit.folder}: failed: {text.strip().splitlines()[-1]}", flush=True)
+    with suppress(OSError):  # such as a full disk, which may have been the reason
+        (results / unit.folder).mkdir(parents=True, exist_ok=True)
+        write_text(results / unit.folder / ERROR, text)
 
 
 @contextmanager
 def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
-    """Connect to a cluster that has what a cell needs."""
+    """Connect to a cluster with the resources that a cell needs."""
     try:
         import ray
     except ImportError:
@@ -167,15 +158,12 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
     try:
         ray.init(address=address or "local", **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (ConnectionError, ValueError, RuntimeError) as error:  # also where RAY_AUTH_TOKEN is missing
         reason = " ".join(str(error).split())
-        fix = "start one (ray start --head), or leave --address out for this machine alone"
-        if "auth" in reason.lower():
-            fix = "set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or ~/.ray/auth_token to what its nodes were started with"
-        raise GridError(f"--address is {address!r}, but Ray does not connect there ({reason}): {fix}.") from None
+        raise GridError(f"Ray does not connect to --address {address!r} ({reason}).") from None
     try:
         _check_resources(ray.nodes(), resources)
-        # A process for each: what one leaves behind does not burden the next.
+        # One process per unit, so that nothing of a unit burdens the next.
         remote = ray.remote(max_calls=1, **{**resources, "num_gpus": resources["num_gpus"] or 0})(_run_on_worker)
 
         def run_all(units: Sequence[Unit], settings: Settings) -> list[Unit]:
@@ -187,12 +175,12 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
                     error = ""
                     try:
                         succeeded = ray.get(reference)
-                    except ray.exceptions.RayError as died:  # more often than `retries`: nobody else could have told
+                    except ray.exceptions.RayError as died:  # more often than `retries`
                         succeeded, error = False, f"{died}\n"
                     if succeeded and not (settings[0] / unit.folder).exists():
                         error = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
                     if error:
-                        _keep_error(unit, settings[0], error)
+                        _write_error(unit, settings[0], error)
                     if error or not succeeded:
                         failed.append(unit)
             return failed
@@ -203,118 +191,41 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
 
 
 def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
-    """A cell that fits on no machine would wait for ever, and Ray keeps no account of GPUs that nobody asks for."""
+    """Refuse cells that fit on no machine, which would wait for ever, and GPUs that Ray would not share out."""
     for kind, amount in {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"]}.items():
+        flag = f"--{kind.lower()}s-per-cell"
         largest = max((node["Resources"].get(kind, 0) for node in nodes if node["Alive"]), default=0)
         if amount is None and largest > 0:
-            raise GridError(
-                f"--gpus-per-cell is not given, but a machine of this Ray cluster has {largest:g}: give the share of "
-                "one per cell (0.25: four cells on a card), or 0 to compute on the CPU."
-            )
+            raise GridError(f"The cluster has GPUs: give {flag}, the share of one per cell (0: compute on the CPU).")
         if amount is not None and amount > largest:
-            raise GridError(
-                f"--{kind.lower()}s-per-cell is {amount:g}, but no machine of this Ray cluster has more than "
-                f"{largest:g}: ask for less."
-            )
+            raise GridError(f"{flag} is {amount:g}, but no machine of the cluster has more than {largest:g}.")
 
 
-# -------------------------------------------------------------------- progress
+# ---------------------------------------------------------------- progress
 
 
-def read_progress(unit: Unit, results: Path) -> tuple[str, dict[str, Any]]:
-    """
-    :param unit: A cell or a task's common heads
-    :param results: Folder of all results
-    :return: ``"done"``, ``"failed"``, ``"running"``, ``"interrupted"`` or ``"waiting"``, and its ``progress.json``
-    """
-    folder = results / unit.folder
-    try:
-        progress = read_kept(folder / "progress.json", "time")
-    except GridError:  # or there is none
-        progress = {}
-    # Another machine's lock may be unknown here; evaluations and bursts of updates are silent.
-    may_run = progress and progress.get("machine") != platform.node() and time.time() - progress["time"] < 600
-    if unit.is_done(results):
-        return "done", progress
-    if is_held(folder):
-        return "running", progress
-    if (folder / ERROR).exists():
-        return "failed", progress
-    return ("running" if may_run else "interrupted" if progress else "waiting"), progress
+def status_lines(units: Sequence[Unit], results: Path) -> list[str]:
+    """State of each unit, and of those that have begun how far they are.
 
-
-def tell(units: Sequence[Unit], results: Path) -> dict[Path, str]:
-    """
     :param units: Cells and common heads
     :param results: Folder of all results
-    :return: By folder, the state of each and, where it has begun, how far it is, how fast it goes, when it will be
-        finished, and its best return; last, as if of a unit, the same of all
+    :return: One line for each
     """
-    lines: dict[Path, str] = {}
-    states: dict[type, list[str]] = {}
-    left, made, spent, best = 0, 0, 0.0, (-np.inf, "")
-    for unit in units:
-        state, progress = read_progress(unit, results)
-        states.setdefault(type(unit), []).append(state)
-        done, seconds = progress.get("done", 0), progress.get("seconds", 0)
-        total = unit.budget + unit.pretraining_steps if isinstance(unit, Cell) else progress.get("total", 0)
-        rate = done / seconds if seconds else 0.0
-        line = f"{unit.folder}: {state}"
-        if state in ("running", "interrupted", "failed"):
-            line += f", {done:,} of {total:,}" + (f", {rate:.1f}/s, {_duration((total - done) / rate)}" if rate else "")
-        if (own := progress.get("best_return")) is not None:
-            line += f", best return {own:.4g}"
-            best = max(best, (own, str(unit.folder)))
-        lines[unit.folder] = line
-        if isinstance(unit, Cell):
-            left += 0 if state in ("done", "failed") else total - done
-            made, spent = made + done, spent + seconds
-    told = [f"{each.count('done')} of {len(each)} {_PLURALS[kind]} done" for kind, each in states.items()]
-    running = sum(each.count("running") for each in states.values())
-    told += [f"{running} running"] if running else []
-    # As fast as all cells so far, on average: one that has just begun tells little of its speed.
-    speed = states.get(Cell, []).count("running") * made / spent if spent else 0.0
-    told += [f"{speed:.1f} environment steps/s, about {_duration(left / speed)} left"] if speed else []
-    told += [f"best return {best[0]:.4g} ({best[1]})"] if best[1] else []
-    return {**lines, _ALL: ", ".join(told)}
+    return [f"{unit.folder}: {_status(unit, results)}" for unit in units]
 
 
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
-
-
-@contextmanager
-def _live_progress(list_units: Callable[[], list[Unit]], results: Path) -> Iterator[None]:
-    """Show how far all units are: on a terminal all the time; elsewhere a line when one ends, and one now and then."""
-    live = Live(auto_refresh=False) if Console().is_terminal else None
-    stopped = threading.Event()
-    told = tell(list_units(), results)
-
-    def watch() -> None:
-        told_at, over = time.monotonic(), False
-        while not over:
-            over = stopped.wait(1.0)
-            lines = tell(list_units(), results)
-            if live is not None:
-                live.update("\n".join(line for line in lines.values() if ": waiting" not in line), refresh=True)
-                continue
-            for folder, line in lines.items():
-                if _ENDED.search(line) and told.get(folder) != line:
-                    told[folder] = line
-                    print(line, flush=True)
-            if over or time.monotonic() - told_at >= SUMMARY_SECONDS:
-                told_at = time.monotonic()
-                print(lines[_ALL], flush=True)
-
-    with live or nullcontext():
-        thread = threading.Thread(target=watch, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stopped.set()
-            thread.join()
+def _status(unit: Unit, results: Path) -> str:
+    folder = results / unit.folder
+    if unit.is_done(results):
+        return "done"
+    if not (folder / "progress.json").exists():
+        return "running" if is_held(folder) else "failed" if (folder / ERROR).exists() else "waiting"
+    progress = read_kept(folder / "progress.json")
+    # Locks of other machines may be invisible; evaluations and bursts of updates report nothing for a while.
+    reports = progress["machine"] != platform.node() and time.time() - progress["time"] < 600
+    is_running = is_held(folder) or reports
+    state = "running" if is_running else "failed" if (folder / ERROR).exists() else "interrupted"
+    return f"{state}, {progress['text']}"
 
 
 # ---------------------------------------------------------------- command line
@@ -339,16 +250,16 @@ def _names(text: str) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sb3-cure experiment",
-        description="Run a grid of experiments; what is done is not run again, what was interrupted goes on.",
+        description="Run a grid of experiments; finished cells are not run again, interrupted ones continue.",
     )
     add = parser.add_argument
     add("grid", help="YAML file, or the name of one of the package's grids, such as curves or fast/curves")
     add("--out", type=Path, default=Path("results"), help="folder of results (default: results)")
-    seeds = "how many (5: the first ones, where the grid lists its seeds), or which (0,3,4; one alone: 3,)"
+    seeds = "a number of seeds (5: the first ones, where the grid lists its seeds), or a list (0,3,4; one alone: 3,)"
     add("--seeds", type=_seed_choice, metavar="SEEDS", help=seeds)
     add("--tasks", type=_names, help="some of the grid's tasks: cartpole-swingup,finger-spin")
     add("--methods", type=_names, help="some of the grid's methods")
-    budget = "environment steps of training, for example 100k; those of pretraining in proportion"
+    budget = "environment steps of training, for example 100k; those of pretraining change in proportion"
     add("--budget", type=_steps, help=budget)
     add("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
@@ -362,46 +273,37 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """``sb3-cure experiment``.
+    """Run the command ``sb3-cure experiment``.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0 if nothing failed, 1 if something did, 2 for what cannot be run as it was written
+    :return: 0 if nothing failed, 1 if something did, 2 if the grid or the command line is wrong
     """
     parser = _parser()
     options = vars(parser.parse_args(arguments))
     if "" not in sys.path:
-        sys.path.append("")  # a grid may name a head of a module in the working directory
-    of_ray = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
-    given = [name for name in of_ray if options[name] != parser.get_default(name)]
+        sys.path.append("")  # a grid may name a class of a module in the working directory
+    ray_only = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
+    given = [name for name in ray_only if options[name] != parser.get_default(name)]
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
     try:
         grid = load_grid(path, **choice)
         if options["engine"] == "local" and given:
-            raise GridError(f"--{given[0].replace('_', '-')} is of Ray: add --engine ray.")
+            raise GridError(f"--{given[0].replace('_', '-')} needs --engine ray.")
         if dry_run:
             check_grid(grid, out)
-            units: list[Unit] = [*grid.cells, *common_heads(grid, out, grid.cells)]
-            print("\n".join(list(tell(units, out).values())[:-1]), flush=True)
+            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out, grid.cells)], out)), flush=True)
             return 0
         failed = run_grid(grid, out, **options)
-        print("".join(f"{_failure(unit, out)}\n" for unit in failed), end="", flush=True)
     except GridError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("Stopped; the same command goes on from the last checkpoints.")
+        print("Stopped; the same command continues from the last checkpoints.")
         return 130
+    for unit in failed:
+        print(f"{unit.folder} failed, see {out / unit.folder / ERROR}", flush=True)
     return 1 if failed else 0
-
-
-def _failure(unit: Unit, results: Path) -> str:
-    path = results / unit.folder / ERROR
-    try:
-        reason = path.read_text().strip().splitlines()[-1]
-    except (OSError, IndexError):  # begun anew by another process meanwhile, or never written
-        reason = "there is no file any more that tells why"
-    return f"{unit.folder} failed: {reason} ({path})"
 
 
 if __name__ == "__main__":

@@ -1,29 +1,29 @@
-"""Turns learning curves into numbers: areas, paired differences, aggregates over tasks.
+"""Turn learning curves into numbers: areas, paired differences, aggregates over tasks.
 
 Intervals are 95 %. Two kinds are used, and named wherever they are shown:
 
 - *t*: each task's mean difference is drawn from Student's t around the mean of its pairs (seeds), tasks are averaged
   with equal weights, and the interval is the middle 95 % of the draws: a parametric bootstrap, stratified by task.
   With one task it is the paired t interval, exactly. It is wide with two or three seeds, as it should be.
-- *percentile*: seeds are resampled with replacement within each task, as rliable does. It cannot reach beyond the seeds
-  that were run, so that with 2-5 of them it covers the truth in about 50-85 % of cases instead of 95.
+- *percentile*: seeds are resampled with replacement within each task (Agarwal et al. 2021, ``scipy.stats.bootstrap``).
+  It cannot reach beyond the seeds that were run: with 2-5 of them it covers the truth in 50-85 % of cases, not in 95.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from rliable import library
 from scipy import integrate, stats
 
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError
 
-#: The highest return of an episode in the DeepMind Control suite: scores of rliable are returns divided by it.
+#: The highest return of an episode in the DeepMind Control suite: scores are returns divided by it
 HIGHEST_RETURN = 1000.0
 DRAWS = 100_000
-RLIABLE_REPS = 2000
+RESAMPLES = 2000
 
 
 # Learning curves
@@ -42,29 +42,28 @@ def area_under_curve(steps: np.ndarray, values: np.ndarray) -> float:
 
 
 def steps_to_threshold(steps: np.ndarray, values: np.ndarray, threshold: float) -> float:
-    """
+    """Environment steps of the first evaluation at or above a return.
+
     :param steps: Environment steps, [n]
     :param values: Returns, [n]
     :param threshold: A return
-    :return: Environment steps of the first evaluation at or above it; infinity if there is none
+    :return: The steps; infinity if there is no such evaluation
     """
     reached = np.flatnonzero(values >= threshold)
     return float(steps[reached[0]]) if len(reached) else float("inf")
 
 
 def interquartile_range(values: Sequence[float] | np.ndarray) -> float:
-    """
+    """Interquartile range over seeds.
+
     :param values: One per seed
     :return: 75th - 25th percentile; nan with fewer than two
     """
-    if len(values) < 2:
-        return float("nan")
-    low, high = np.percentile(values, [25, 75])
-    return float(high - low)
+    return float(stats.iqr(values)) if len(values) > 1 else float("nan")
 
 
 def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
-    """The curves of several seeds on the same steps (linear in between, where evaluations fell on different ones).
+    """Interpolate the curves of several seeds to common steps.
 
     :param cells: Finished cells
     :param column: As of ``CellResult.curve``
@@ -84,8 +83,6 @@ def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tu
 class ArmSummary:
     """One arm on one task.
 
-    :param task: Short name of the task (``"cartpole-swingup"``)
-    :param method: Name of the arm
     :param seeds: Seeds that are done and have a curve
     :param areas: Area under the curve by seed
     :param starts: Return of the first evaluation by seed, before training
@@ -94,8 +91,6 @@ class ArmSummary:
     :param reached: For each threshold the steps of each seed
     """
 
-    task: str
-    method: str
     seeds: tuple[int, ...]
     areas: np.ndarray
     starts: np.ndarray
@@ -105,9 +100,10 @@ class ArmSummary:
 
 
 def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Sequence[float] = ()) -> ArmSummary:
-    """
+    """Summarise an arm on a task.
+
     :param experiment: An experiment
-    :param task: Short name
+    :param task: Short name of the task
     :param method: Name of the arm
     :param thresholds: Returns
     :return: Its numbers; empty arrays if no cell with a curve is done
@@ -115,10 +111,8 @@ def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Se
     cells = {seed: cell for seed, cell in experiment.done(task, method).items() if len(cell.curve()[0]) > 1}
     curves = [cell.curve() for cell in cells.values()]
     _, stacked = stack_curves(list(cells.values()))
-    spread = float(np.mean([interquartile_range(column) for column in stacked.T])) if len(cells) > 1 else float("nan")
+    spread = float(stats.iqr(stacked, axis=0).mean()) if len(cells) > 1 else float("nan")
     return ArmSummary(
-        task,
-        method,
         tuple(cells),
         np.array([area_under_curve(*curve) for curve in curves]),
         np.array([values[0] for _, values in curves]),
@@ -135,7 +129,7 @@ def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Se
 class Estimate:
     """A number with its 95 % interval.
 
-    :param value: The estimate
+    :param value: Its value
     :param low: Lower end, None where no interval can be given (one seed)
     :param high: Upper end
     :param n: How many seeds (pairs of them, for differences) it rests on
@@ -148,20 +142,18 @@ class Estimate:
 
     @property
     def verdict(self) -> str:
-        """What a difference says: ``"better"``, ``"worse"`` or ``"inconclusive"`` (as few equal pairs are, too)."""
+        """What a difference says: ``"better"``, ``"worse"`` or ``"inconclusive"``."""
         if self.low is None or self.high is None:
             return "one seed: no interval"
-        if self.low > 0:
-            return "better"
-        if self.high < 0:
-            return "worse"
-        return "inconclusive (all pairs equal)" if self.low == self.high == 0 else "inconclusive"
+        if self.low == self.high == 0:
+            return "inconclusive (all pairs equal)"
+        return "better" if self.low > 0 else "worse" if self.high < 0 else "inconclusive"
 
 
 def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
-    """Mean of the groups' means, with the stratified t interval that this module's head describes.
+    """Mean of the groups' means, with the stratified t interval that this module's docstring describes.
 
-    Groups of one value have no spread to judge by: where others have more, only those count.
+    Groups of one value have no spread: where others have more, only those count.
 
     :param groups: Differences between the arms, seed by seed: one array per task
     :param draws: How many, with more than one group
@@ -170,33 +162,39 @@ def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
     judged, estimate = _judged(groups)
     if estimate.n == len(judged):  # one value each
         return estimate
-    errors = np.array([group.std(ddof=1) / np.sqrt(len(group)) for group in judged])
     if len(judged) == 1:
-        reach = float(stats.t.ppf(0.975, len(judged[0]) - 1) * errors[0])
+        reach = float(stats.t.ppf(0.975, len(judged[0]) - 1) * stats.sem(judged[0]))
     else:
         rng = np.random.default_rng(0)
-        drawn = sum(
-            error * rng.standard_t(len(group) - 1, draws) for error, group in zip(errors, judged, strict=True)
-        ) / len(judged)
+        drawn = np.mean([stats.sem(group) * rng.standard_t(len(group) - 1, draws) for group in judged], axis=0)
         # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
         reach = float(np.percentile(np.abs(drawn), 95))
     return replace(estimate, low=estimate.value - reach, high=estimate.value + reach)
 
 
-def percentile_interval(groups: Sequence[np.ndarray], draws: int = 20_000) -> Estimate:
-    """The same mean with the percentile bootstrap, seeds resampled within tasks: too narrow for few seeds.
+def percentile_interval(groups: Sequence[np.ndarray]) -> Estimate:
+    """Mean of the groups' means with the percentile bootstrap, seeds resampled within tasks: too narrow for few seeds.
 
     :param groups: As in ``t_interval``
-    :param draws: How many
     :return: The estimate
     """
     judged, estimate = _judged(groups)
     if estimate.n == len(judged):
         return estimate
-    rng = np.random.default_rng(0)
-    means = [group[rng.integers(len(group), size=(draws, len(group)))].mean(axis=1) for group in judged]
-    low, high = np.percentile(np.mean(means, axis=0), [2.5, 97.5])
+    low, high = _bootstrap(_mean_of_means, judged)
     return replace(estimate, low=float(low), high=float(high))
+
+
+def _bootstrap(statistic: Callable[..., np.ndarray], groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """95 % percentile interval, values resampled within each group."""
+    found = stats.bootstrap(
+        groups, statistic, n_resamples=RESAMPLES, vectorized=True, method="percentile", random_state=0
+    )
+    return found.confidence_interval
+
+
+def _mean_of_means(*groups: np.ndarray, axis: int) -> np.ndarray:
+    return np.mean([group.mean(axis=axis) for group in groups], axis=0)
 
 
 def _judged(groups: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Estimate]:
@@ -208,11 +206,11 @@ def _judged(groups: Sequence[np.ndarray]) -> tuple[list[np.ndarray], Estimate]:
 
 
 def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Estimate:
-    """
+    """Geometric mean of ours / theirs over the seeds that have both, with the t interval of the logarithms.
+
     :param ours: A positive number by seed
     :param theirs: Another
-    :return: Geometric mean of ours / theirs over the seeds that have both, with the t interval of the logarithms; nan
-        without such a seed
+    :return: The estimate; nan without a common seed
     """
     ratios = [ours[seed] / theirs[seed] for seed in ours if ours[seed] > 0 and theirs.get(seed, 0) > 0]
     found = t_interval([np.log(ratios)])
@@ -221,38 +219,38 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
 
 
 def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
-    """
+    """Cells of the true state that an arm reached in the end, over those of its baseline, see ``paired_ratio``.
+
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
-    :return: Cells of the true state that it had reached in the end, over those of its baseline, see ``paired_ratio``
+    :return: The ratio
     """
-    return paired_ratio(
-        *(final_values(experiment, task, arm, "cells") for arm in (method, experiment.baseline_of(method)))
-    )
+    arms = method, experiment.baseline_of(method)
+    return paired_ratio(*(final_values(experiment, task, arm, "cells") for arm in arms))
 
 
 def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Estimate:
-    """
+    """log(1 + c), c the sum of rewards that training met, minus that of the arm's baseline.
+
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
-    :return: log(1 + c), c the sum of rewards that training met, minus that of its baseline: mean over the seeds that
-        both have done, with its t interval
+    :return: Mean over the seeds that both have done, with its t interval
     """
-    ours, theirs = (
-        final_values(experiment, task, arm, "rewards_met") for arm in (method, experiment.baseline_of(method))
-    )
+    arms = method, experiment.baseline_of(method)
+    ours, theirs = (final_values(experiment, task, arm, "rewards_met") for arm in arms)
     return t_interval([np.array([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours if seed in theirs])])
 
 
 def final_values(experiment: Experiment, task: str, method: str, column: str) -> dict[int, float]:
-    """
+    """Last value of a column, by seed.
+
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
     :param column: As of ``CellResult.curve``
-    :return: The last value of each finished cell that has one, by seed
+    :return: The last value of each finished cell that has one
     """
     curves = {seed: cell.curve(column)[1] for seed, cell in experiment.done(task, method).items()}
     return {seed: float(values[-1]) for seed, values in curves.items() if len(values)}
@@ -260,7 +258,7 @@ def final_values(experiment: Experiment, task: str, method: str, column: str) ->
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """An arm minus another, seed by seed.
+    """Difference between two arms, seed by seed.
 
     :param method: The arm
     :param other: The arm that is subtracted
@@ -269,7 +267,7 @@ class PairedDifference:
     :param t: Mean difference with the t interval
     :param percentile: Mean difference with the percentile interval
     :param same_starts: In how many pairs both arms earn the same before training, as they do from equal weights
-    :param left_out: Tasks that do not count where others have more than one pair, as theirs tells no spread
+    :param left_out: Tasks with a single pair, which do not count where others have more
     """
 
     method: str
@@ -294,41 +292,36 @@ class PairedDifference:
 def paired_differences(
     experiment: Experiment, measure: str = "areas", baseline: str | None = None
 ) -> list[PairedDifference]:
-    """Every arm against another: per task, and over all tasks where there are several.
+    """Every arm minus another: per task, and over all tasks where there are several.
 
     :param experiment: An experiment
     :param measure: ``"areas"`` or ``"finals"``
     :param baseline: The arm that is subtracted from all others, by default of each its baseline in the grid
     :return: Arm by arm, all tasks together first; arms without a single pair are left out
     """
-    arms = {
-        (task, method): summarise_arm(experiment, task, method)
-        for task in experiment.tasks
-        for method in experiment.methods
-    }
+    arms = {arm: summarise_arm(experiment, *arm) for arm in experiment.arms}
     found = []
     for method in experiment.methods:
-        other = experiment.baseline_of(method) if baseline is None else baseline
+        other = baseline or experiment.baseline_of(method)
         by_task, same = {}, {}
-        for task in experiment.tasks if (experiment.tasks[0], other) in arms and method != other else ():
+        for task in experiment.tasks if method != other and other in experiment.methods else ():
             ours, theirs = arms[task, method], arms[task, other]
             _, mine, its = np.intersect1d(ours.seeds, theirs.seeds, assume_unique=True, return_indices=True)
             if len(mine):
                 by_task[task] = getattr(ours, measure)[mine] - getattr(theirs, measure)[its]
                 same[task] = int((ours.starts[mine] == theirs.starts[its]).sum())
-        rows = [{task: values} for task, values in by_task.items()]
-        # As t_interval does, so that what is counted is what the interval rests on
+        # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
-        for row in [judged, *rows] if len(rows) > 1 else rows:
-            groups, name = list(row.values()), None if row is judged else next(iter(row))
+        rows: list[tuple[str | None, dict[str, np.ndarray]]] = [(None, judged)] if len(by_task) > 1 else []
+        for name, row in [*rows, *((task, {task: values}) for task, values in by_task.items())]:
             left_out = tuple(task for task in by_task if name is None and task not in judged)
             starts_alike = sum(same[task] for task in row)
-            intervals = t_interval(groups), percentile_interval(groups)
+            intervals = t_interval(list(row.values())), percentile_interval(list(row.values()))
             found.append(PairedDifference(method, other, name, row, *intervals, starts_alike, left_out))
     return found
 
 
-# Aggregates over tasks, by rliable
+# Aggregates over tasks (Agarwal et al. 2021, as in rliable)
 
 
 @dataclass(frozen=True)
@@ -352,7 +345,7 @@ class Aggregates:
 
 
 def score_matrices(experiment: Experiment) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """What rliable works on. It needs equally many seeds everywhere: the first that all tasks have.
+    """Scores of all arms on the tasks that every arm has done, with equally many seeds everywhere.
 
     :param experiment: An experiment
     :return: Scores [seeds, tasks] by arm, and the tasks; both empty if no task has two seeds of every arm
@@ -374,9 +367,10 @@ def score_matrices(experiment: Experiment) -> tuple[dict[str, np.ndarray], tuple
 
 
 def aggregate(experiment: Experiment) -> Aggregates | None:
-    """
+    """Aggregate final returns over tasks.
+
     :param experiment: An experiment
-    :return: rliable's aggregates, None if no task has two seeds of every arm
+    :return: The aggregates, None if no task has two seeds of every arm
     :raises ResultsError: if there are returns that are no scores between 0 and 1
     """
     scores, tasks = score_matrices(experiment)
@@ -390,54 +384,49 @@ def aggregate(experiment: Experiment) -> Aggregates | None:
             )
     n, taus = len(next(iter(scores.values()))), np.linspace(0, 1, 1001)
 
-    def estimates(values: Mapping[str, Any], function: Any) -> dict[str, Estimate]:
-        points, intervals = library.get_interval_estimates(
-            values, lambda *x: np.array([function(*x)]), reps=RLIABLE_REPS
-        )
-        ends = {name: (float(low), float(high)) for name, ((low,), (high,)) in intervals.items()}
-        return {name: Estimate(float(points[name][0]), *ends[name], n) for name in values}
+    def interval(statistic: Callable[..., Any], *matrices: np.ndarray) -> tuple[Any, Any, Any]:
+        columns = [column for matrix in matrices for column in matrix.T]
+        low, high = _bootstrap(statistic, columns)
+        return statistic(*columns, axis=-1), low, high
 
-    state = np.random.get_state()  # rliable 1.2 draws from numpy's global generator, whatever it is given
-    np.random.seed(0)
-    try:
-        iqm = estimates(scores, interquartile_mean)
-        others = {name: experiment.baseline_of(name) for name in scores}
-        pairs = {name: (scores[name], scores[other]) for name, other in others.items() if name != other in scores}
-        improvement = estimates(pairs, probability_of_improvement)
-        points, intervals = library.create_performance_profile(
-            scores, taus, custom_profile_func=share_above, reps=RLIABLE_REPS
-        )
-    finally:
-        np.random.set_state(state)
-    profiles = {name: (points[name], intervals[name][0], intervals[name][1]) for name in scores}
+    iqm, improvement, profiles = {}, {}, {}
+    for method, matrix in scores.items():
+        iqm[method] = Estimate(*interval(interquartile_mean, matrix), n)
+        profiles[method] = interval(partial(share_above, taus=taus), matrix)
+        if method != (other := experiment.baseline_of(method)) and other in scores:
+            improvement[method] = Estimate(*interval(probability_of_improvement, matrix, scores[other]), n)
     return Aggregates(tasks, n, iqm, improvement, taus, profiles)
 
 
-# rliable's three measures, whose own calls of scipy and loops take a minute for 2000 resamples of a few arms.
+def interquartile_mean(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Mean of the middle half of all scores.
 
-
-def interquartile_mean(scores: np.ndarray) -> float:
+    :param scores: For each task, scores [..., seeds]
+    :param axis: The seeds' axis
+    :return: The mean, [...]
     """
-    :param scores: [seeds, tasks]
-    :return: Mean of the middle half of all scores
-    """
-    cut = scores.size // 4
-    return float(np.sort(scores, axis=None)[cut : scores.size - cut].mean())
+    return stats.trim_mean(np.concatenate(scores, axis=axis), 0.25, axis=axis)
 
 
-def probability_of_improvement(scores: np.ndarray, baseline: np.ndarray) -> float:
+def probability_of_improvement(*scores: np.ndarray, axis: int = -1) -> np.ndarray:
+    """How often a run of an arm beats one of the baseline on the same task (ties count half).
+
+    :param scores: For each task the arm's, then for each task the baseline's [..., seeds]
+    :param axis: The seeds' axis, the last
+    :return: The probability, [...]
     """
-    :param scores: Of the arm, [seeds, tasks]
-    :param baseline: Of the baseline, [seeds, tasks]
-    :return: How often a run of the arm beats one of the baseline on the same task (ties count half)
-    """
-    return float((np.sign(scores[:, None] - baseline[None]).mean() + 1) / 2)
+    n = len(scores) // 2
+    pairs = zip(scores[:n], scores[n:], strict=True)
+    return np.mean([(np.sign(a[..., :, None] - b[..., None, :]).mean((-2, -1)) + 1) / 2 for a, b in pairs], axis=0)
 
 
-def share_above(scores: np.ndarray, taus: np.ndarray) -> np.ndarray:
-    """
-    :param scores: [seeds, tasks]
+def share_above(*scores: np.ndarray, taus: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Share of the scores above each threshold: the performance profile.
+
+    :param scores: For each task, scores [..., seeds]
     :param taus: Thresholds, [n]
-    :return: Share of the scores above each: the performance profile, [n]
+    :param axis: The seeds' axis
+    :return: The shares, [n, ...]
     """
-    return (scores.reshape(-1, 1) > taus).mean(axis=0)
+    together = np.concatenate(scores, axis=axis)
+    return np.stack([(together > tau).mean(axis=axis) for tau in taus])

@@ -1,4 +1,4 @@
-"""Tables of reports: statistics in words and numbers. How they look, and what is said about them, is in templates."""
+"""Tables of reports. Their notes, and how they look, are in templates."""
 
 import base64
 import json
@@ -35,23 +35,25 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """
-        :return: Title, table and note in Markdown
+        """Title, table and note in Markdown.
+
+        :return: The text
         """
         return render("table.md.j2", table=self)
 
 
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], note: str = "") -> Table:
-    return Table(title, pd.DataFrame(rows, columns=list(columns), dtype=object), note)
+def _table(title: str, columns: str, rows: Sequence[Sequence[str]], note: str = "") -> Table:
+    return Table(title, pd.DataFrame(rows, columns=columns.split("; "), dtype=object), note)
 
 
 # Templates
 
 
 def markdown_text(text: str) -> str:
-    """
+    """Escape plain text for Markdown: nothing of it ends a cell of a table, or becomes HTML, a link or a picture.
+
     :param text: Plain text
-    :return: The same in Markdown: nothing of it ends a cell of a table, or becomes HTML, a link or a picture
+    :return: Markdown
     """
     text = re.sub(r"([\\`*_{}\[\]|!#~])", r"\\\1", " ".join(str(text).split()))
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
@@ -74,31 +76,34 @@ _TEMPLATES.filters |= {
 
 
 def render(template: str, **facts: Any) -> str:
-    """
-    :param template: A file in ``templates``
-    :param facts: What it shows
+    """Render a file of ``templates``.
+
+    :param template: Its name
+    :param facts: Its variables
     :return: Its text
     """
     return _TEMPLATES.get_template(template).render(**facts)
 
 
-def words(name: str, *facts: Any) -> str:
-    """
-    :param name: A macro of ``templates/words.j2``
+def render_text(name: str, *facts: Any) -> str:
+    """Render a macro of ``templates/words.j2`` in one line.
+
+    :param name: Name of the macro
     :param facts: Its arguments
-    :return: What it says, in one line
+    :return: Its text
     """
     return " ".join(str(getattr(_TEMPLATES.get_template("words.j2").module, name)(*facts)).split())
 
 
-# Numbers in words
+# Numbers as text
 
 
 def number_text(value: float, digits: int = 0) -> str:
-    """
+    """Format a number with a true minus sign; a dash for one that is not finite.
+
     :param value: A number
     :param digits: Behind the point
-    :return: With a true minus sign; a dash for what is not finite
+    :return: Its text
     """
     if not math.isfinite(value):
         return NONE
@@ -106,10 +111,11 @@ def number_text(value: float, digits: int = 0) -> str:
 
 
 def return_digits(experiment: Experiment, task: str | None = None) -> int:
-    """
+    """Digits behind the point that returns need: none from 10 on, else three significant ones.
+
     :param experiment: An experiment
     :param task: Short name, or None for all tasks
-    :return: How many digits behind the point its returns need: none from 10 on, else three significant ones
+    :return: Number of digits
     """
     cells = [cell for cell in experiment.cells.values() if task in (None, cell.task)]
     highest = max((float(np.abs(cell.curve()[1]).max(initial=0)) for cell in cells), default=0.0)
@@ -122,10 +128,11 @@ def _mean_std(values: np.ndarray, digits: int = 0) -> str:
 
 
 def interval_text(estimate: Estimate, digits: int = 0) -> str:
-    """
+    """Format an interval, or say why there is none.
+
     :param estimate: A number
     :param digits: Behind the point
-    :return: Its interval, or why there is none
+    :return: The text
     """
     if estimate.low is None or estimate.high is None:
         return "one seed: no interval" if estimate.n else NONE
@@ -137,9 +144,10 @@ def _value_and_interval(estimate: Estimate, digits: int) -> tuple[str, str]:
 
 
 def ratio_text(estimate: Estimate) -> str:
-    """
+    """Format a ratio and its interval.
+
     :param estimate: A ratio
-    :return: It and its interval
+    :return: The text
     """
     shown = "(one seed)" if estimate.low is None else interval_text(estimate, 2)
     return f"{number_text(estimate.value, 2)} {shown}" if math.isfinite(estimate.value) else NONE
@@ -152,10 +160,11 @@ def _published(value: published.MeanStd | None) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """
-    :param count: How many
+    """Count and noun: ``"1 seed"``, ``"2 seeds"``.
+
+    :param count: Number of things
     :param noun: In the singular
-    :return: ``"1 seed"``, ``"2 seeds"``
+    :return: The text
     """
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
@@ -164,8 +173,8 @@ def _list(values: Iterable[Any]) -> str:
     return ", ".join(dict.fromkeys(str(value) for value in values if value not in (None, ""))) or NONE
 
 
-def _duration(seconds: Any) -> str:
-    if not isinstance(seconds, int | float):
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
         return NONE
     if seconds < 60:
         return f"{seconds:.0f} s"
@@ -175,17 +184,14 @@ def _duration(seconds: Any) -> str:
 # Tables
 
 
-def _arms(experiment: Experiment) -> list[tuple[str, str]]:
-    return [(task, method) for task in experiment.tasks for method in experiment.methods]
-
-
 def status_table(experiment: Experiment) -> Table:
-    """
+    """Which cells are done.
+
     :param experiment: An experiment
-    :return: Which cells are done
+    :return: The table
     """
     rows = [[task, *(_state(experiment, task, method) for method in experiment.methods)] for task in experiment.tasks]
-    return _table("Cells", ["task", *experiment.methods], rows, words("cells"))
+    return Table("Cells", pd.DataFrame(rows, columns=["task", *experiment.methods]), render_text("cells"))
 
 
 def _state(experiment: Experiment, task: str, method: str) -> str:
@@ -199,15 +205,14 @@ def _state(experiment: Experiment, task: str, method: str) -> str:
 
 
 def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
-    """
+    """Area under the curve, final return, spread over seeds, steps to thresholds.
+
     :param experiment: An experiment
     :param thresholds: Returns, for the steps to reach them
-    :return: Area under the curve, final return, spread over seeds, steps to thresholds
+    :return: The table
     """
-    columns = ["task", "arm", ">seeds", ">area under curve", ">final return", ">IQR, final", ">IQR, curve"]
-    columns += [f">steps to {limit:,.15g}".replace("-", "\N{MINUS SIGN}") for limit in thresholds]
     rows = []
-    for task, method in _arms(experiment):
+    for task, method in experiment.arms:
         digits = return_digits(experiment, task)
         arm = statistics.summarise_arm(experiment, task, method, thresholds)
         row = [_mean_std(values, digits) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
@@ -215,7 +220,9 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
         row += [number_text(spread, digits) for spread in spreads]
         row += [_reached(arm.reached[limit], experiment.budget) for limit in thresholds]
         rows.append([task, method, str(len(arm.seeds)), *row])
-    return _table("Learning curves", columns, rows, words("curves"))
+    steps = "".join(f"; >steps to {limit:,.15g}".replace("-", "\N{MINUS SIGN}") for limit in thresholds)
+    columns = "task; arm; >seeds; >area under curve; >final return; >IQR, final; >IQR, curve" + steps
+    return _table("Learning curves", columns, rows, render_text("curves"))
 
 
 def _reached(steps: np.ndarray, budget: int) -> str:
@@ -234,85 +241,92 @@ def difference_table(
     note: str | None = None,
     compared: str | None = None,
 ) -> Table:
-    """
+    """Paired differences with both intervals.
+
     :param experiment: An experiment
     :param rows: Its paired differences
     :param measure: Of what
     :param note: What to know about them, by default everything
     :param compared: From which arm: by default the baseline; each row of another one names it
-    :return: The differences with both intervals
+    :return: The table
     """
-    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >95 % percentile; >above; verdict".split("; ")
+    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >95 % percentile; >above; verdict"
     shown = []
     for row in rows:
         digits = difference_digits(row, experiment)
         label = difference_label(row, None if compared else experiment.baseline)
         numbers = [str(row.pairs), str(row.same_starts), *_value_and_interval(row.t, digits)]
         numbers += [interval_text(row.percentile, digits), str(row.wins)]
-        shown.append([label, of_tasks(row), *numbers, row.t.verdict])
+        shown.append([label, tasks_text(row), *numbers, row.t.verdict])
     title = f"Paired difference {compared or f'from {compared_with(rows, experiment)}'}: {measure}"
-    return _table(title, columns, shown, words("differences") if note is None else note)
+    return _table(title, columns, shown, render_text("differences") if note is None else note)
 
 
 def difference_label(row: PairedDifference, baseline: str | None) -> str:
-    """
+    """The arm, and the arm that it is compared with unless that is the baseline.
+
     :param row: A paired difference
-    :param baseline: What goes without saying
-    :return: The arm, and what it is compared with if that is another than the baseline
+    :param baseline: The arm that needs no name
+    :return: The label
     """
     return row.method if row.other == baseline else f"{row.method} minus {row.other}"
 
 
 def compared_with(rows: Sequence[PairedDifference], experiment: Experiment) -> str:
-    """
+    """The baseline, and where to find the others.
+
     :param rows: Paired differences, each with its ``difference_label``
     :param experiment: Of which experiment
-    :return: The baseline, and where to find the others
+    :return: The text
     """
     has_others = any(row.other != experiment.baseline for row in rows)
     return experiment.baseline + (', or the arm after "minus"' if has_others else "")
 
 
 def difference_digits(row: PairedDifference, experiment: Experiment) -> int:
-    """
-    :param row: A paired difference in return
+    """Digits behind the point that a difference in return needs, at least one.
+
+    :param row: A paired difference
     :param experiment: Of which experiment
-    :return: How many digits behind the point it needs, at least one
+    :return: Number of digits
     """
     return max(1, return_digits(experiment, row.task))
 
 
-def of_tasks(row: PairedDifference) -> str:
-    """
+def tasks_text(row: PairedDifference) -> str:
+    """The task of a difference, or the number of its tasks.
+
     :param row: A paired difference
-    :return: Of which task, or of how many
+    :return: The text
     """
     left_out = f" (left out, with a single pair: {', '.join(row.left_out)})" if row.left_out else ""
     return row.task or plural(len(row.differences), "task") + left_out
 
 
 def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Table:
-    """
+    """Interquartile means and probabilities of improvement.
+
     :param experiment: An experiment
     :param found: Its aggregates
-    :return: Interquartile means and probabilities of improvement
+    :return: The table
     """
     varied = any(experiment.baseline_of(method) != experiment.baseline for method in found.improvement)
     better = {method: found.improvement.get(method, Estimate(math.nan)) for method in found.iqm}
-    columns = ["arm", ">IQM", ">95 %", f">P(arm > {'its baseline' if varied else experiment.baseline})", ">95 %"]
     rows = [
         [method, *_value_and_interval(iqm, 3), *_value_and_interval(better[method], 2)]
         for method, iqm in found.iqm.items()
     ]
-    note = words("aggregates", found, statistics.HIGHEST_RETURN, _baselines(experiment) if varied else "")
-    return _table("Aggregates over tasks (rliable)", columns, rows, note)
+    columns = ["arm", ">IQM", ">95 %", f">P(arm > {'its baseline' if varied else experiment.baseline})", ">95 %"]
+    note = render_text("aggregates", found, statistics.HIGHEST_RETURN, _baselines(experiment) if varied else "")
+    return Table("Aggregates over tasks", pd.DataFrame(rows, columns=columns), note)
 
 
 def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Table:
-    """
+    """SRL error by policy and head, and the paper's.
+
     :param experiment: An experiment
-    :param summaries: What its policies meet
-    :return: SRL error by policy and head, beside the paper's
+    :param summaries: SRL errors that its policies meet
+    :return: The table
     """
     compares, rows = experiment.sees_published_pixels, []
     for row in summaries:
@@ -321,8 +335,9 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
         errors = [f"{value:.2e}" for value in (row.error_min, row.mean, row.error_max)]
         policy = [row.task, row.method, row.head.replace("_", " "), row.actor, str(len(row.values))]
         rows.append([*policy, *errors, ratio_text(row.ratio), ratio_text(row.task_ratio), shown])
-    columns = ["task", "arm", "head", "actor", ">seeds", ">min", ">mean", ">max", *_RATIOS, ">paper"]
-    return _table("SRL error per step", columns, rows, words("errors", published, _baselines(experiment), compares))
+    columns = "; ".join(["task; arm; head; actor; >seeds; >min; >mean; >max", *_RATIOS, ">paper"])
+    note = render_text("errors", published, _baselines(experiment), compares)
+    return _table("SRL error per step", columns, rows, note)
 
 
 def _baselines(experiment: Experiment) -> str:
@@ -331,32 +346,33 @@ def _baselines(experiment: Experiment) -> str:
 
 
 def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
-    """
+    """Occupied cells and entropy.
+
     :param experiment: An experiment
     :param rows: Coverage by actor
-    :return: Occupied cells and entropy
+    :return: The table
     """
-    columns = ["task", "arm", "actor", ">seeds", ">states", ">occupied cells", *_RATIOS, ">entropy, bits"]
     shown = []
     for row in rows:
         numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), ratio_text(row.ratio)]
         numbers += [ratio_text(row.task_ratio), number_text(float(row.entropy.mean()), 2)]
         shown.append([row.task, row.method, row.actor, *numbers])
+    columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS, ">entropy, bits"])
     dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
-    note = words("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
+    note = render_text("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
     return _table("Coverage of the true state space", columns, shown, note)
 
 
 def cells_reached_table(
     experiment: Experiment, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 ) -> Table:
-    """
+    """Cells reached by then, and the final ratio to the baseline's.
+
     :param experiment: An experiment
     :param curves: By task and arm: environment steps [n], and cells reached until then [seeds, n]
-    :return: Cells at these steps, and how many of the baseline's in the end
+    :return: The table
     """
     steps = next(iter(next(iter(curves.values())).values()))[0]
-    columns = ["task", "arm", ">seeds", *(f">at {number_text(step)}" for step in steps), ">/ baseline"]
     shown = []
     for task, arms in curves.items():
         for method, (_, cells) in arms.items():
@@ -364,49 +380,51 @@ def cells_reached_table(
             if method != experiment.baseline_of(method):
                 ratio = ratio_text(statistics.cells_ratio(experiment, task, method))
             shown.append([task, method, str(len(cells)), *map(_mean_std, cells.T), ratio])
-    return _table("Cells of the true state", columns, shown, words("cells_note", _baselines(experiment)))
+    columns = "; ".join(["task; arm; >seeds", *(f">at {number_text(step)}" for step in steps), ">/ baseline"])
+    return _table("Cells of the true state", columns, shown, render_text("cells_note", _baselines(experiment)))
 
 
 def rewards_met_table(experiment: Experiment) -> Table:
-    """
+    """Rewards that training met, and the difference of their logarithm from the baseline's.
+
     :param experiment: An experiment
-    :return: Rewards that training met, and their logarithm beside the baseline's; no row where they were not recorded
-        or are negative
+    :return: The table; without a row where rewards were not recorded or are negative
     """
     shown = []
-    for task, method in _arms(experiment):
+    for task, method in experiment.arms:
         met = np.array(list(statistics.final_values(experiment, task, method, "rewards_met").values()))
         if len(met) and (met >= 0).all():
             against = statistics.rewards_met_difference(experiment, task, method)
             text = NONE if method == experiment.baseline_of(method) else ratio_text(against)
-            logarithms = f"{np.log1p(met).mean():.2f}"
-            shown.append([task, method, str(len(met)), _mean_std(met), logarithms, text])
-    columns = ["task", "arm", ">seeds", ">rewards met, c", ">log(1 + c)", ">minus baseline's"]
-    return _table("Rewards met in training", columns, shown, words("rewards_met", _baselines(experiment)))
+            shown.append([task, method, str(len(met)), _mean_std(met), f"{np.log1p(met).mean():.2f}", text])
+    columns = "task; arm; >seeds; >rewards met, c; >log(1 + c); >minus baseline's"
+    return _table("Rewards met in training", columns, shown, render_text("rewards_met", _baselines(experiment)))
 
 
 def pretraining_table(experiment: Experiment) -> Table:
-    """
+    """Final returns and the paper's.
+
     :param experiment: An experiment of kind ``"pretraining"``
-    :return: Final returns beside the paper's
+    :return: The table
     """
     rows, compares = [], experiment.sees_published_pixels
-    for task, method in _arms(experiment):
+    for task, method in experiment.arms:
         finals = statistics.summarise_arm(experiment, task, method).finals
         papers = published.PRETRAINING.get(method.lower().replace("-", "_"), {}) if compares else {}
         theirs = papers.get(published.task_key(task))
         difference = number_text(float(finals.mean()) - theirs.mean) if len(finals) and theirs else NONE
         ours = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
         rows.append([task, method, str(len(finals)), ours, _published(theirs), difference])
-    columns = ["task", "arm", ">seeds", ">ours", ">paper", ">difference"]
-    note = words("pretraining", published.PAPER, experiment.budget, compares)
-    return _table("Final return after pretraining, beside the paper's", columns, rows, note)
+    note = render_text("pretraining", published.PAPER, experiment.budget, compares)
+    title = "Final return after pretraining, beside the paper's"
+    return _table(title, "task; arm; >seeds; >ours; >paper; >difference", rows, note)
 
 
 def published_table(comparisons: Sequence[published.Comparison]) -> Table:
-    """
-    :param comparisons: Arms beside published numbers
-    :return: Ours, theirs, difference
+    """Our returns, published ones, and the difference.
+
+    :param comparisons: Arms compared with published numbers
+    :return: The table
     """
     rows = []
     for row in comparisons:
@@ -416,48 +434,45 @@ def published_table(comparisons: Sequence[published.Comparison]) -> Table:
             if name != row.published_as and (value := tables[row.steps].get(published.task_key(row.task)))
         ]
         ours = number_text(row.ours) + (f" ± {number_text(row.std)}" if math.isfinite(row.std) else "")
-        beside = [NONE, NONE, NONE]
+        theirs = [NONE, NONE, NONE]
         if row.theirs is not None:
-            beside = [f"{row.published_as} {_published(row.theirs)}", number_text(row.ours - row.theirs.mean)]
-            beside.append(f"{row.ours / row.theirs.mean:.3f}")
+            theirs = [f"{row.published_as} {_published(row.theirs)}", number_text(row.ours - row.theirs.mean)]
+            theirs.append(f"{row.ours / row.theirs.mean:.3f}")
         run = [row.experiment, row.task, row.method, number_text(row.steps), str(row.seeds), ours]
-        rows.append([*run, *beside, words("judgement", row, published.SUSPECT_BELOW), "; ".join(others) or NONE])
-    columns = ["experiment", "task", "arm", ">steps", ">seeds", ">ours", ">theirs", ">difference", ">ratio"]
-    note = words("beside_published", published)
-    return _table("Beside published returns", [*columns, "judgement", "other methods"], rows, note)
+        judgement = render_text("judgement", row, published.SUSPECT_BELOW)
+        rows.append([*run, *theirs, judgement, "; ".join(others) or NONE])
+    columns = "experiment; task; arm; >steps; >seeds; >ours; >theirs; >difference; >ratio; judgement; other methods"
+    return _table("Beside published returns", columns, rows, render_text("beside_published", published))
 
 
 def conditions_table(experiment: Experiment) -> Table:
-    """
+    """Conditions of each curve; seeds of an arm that had the same ones share a row.
+
     :param experiment: An experiment
-    :return: Under which conditions each curve was obtained; seeds of an arm that had the same ones share a row
+    :return: The table
     """
     letters: dict[str, str] = {}
     rows = []
     for cell in experiment.finished:
-        packages = ", ".join(f"{name} {number}" for name, number in (cell.run.get("versions") or {}).items())
+        run, phase, steps = cell.run, cell.config.get("pretrain"), cell.curve("environment_steps")[0]
+        packages = ", ".join(f"{name} {number}" for name, number in run.get("versions", {}).items())
         letter = letters.setdefault(packages, chr(ord("A") + len(letters))) if packages else NONE
-        steps, phase = cell.curve("environment_steps")[0], cell.config.get("pretrain")
         trained = number_text(float(steps[-1])) if len(steps) else NONE
         pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
-        seconds, machine = cell.run.get("seconds"), [_told(cell, key) for key in ("device", "precision", "machine")]
-        row = [cell.task, cell.method, str(cell.seed), trained, pretrained, _duration(seconds), *machine, letter]
-        rows.append([*row, _commits(cell), _told(cell, "attempts")])
+        machine = [str(run.get(key) or NONE) for key in ("device", "precision", "machine")]
+        row = [cell.task, cell.method, str(cell.seed), trained, pretrained, _duration(run.get("seconds")), *machine]
+        rows.append([*row, letter, _commits(cell), str(run.get("attempts") or NONE)])
     columns = "task; arm; seeds; >environment steps; >pretraining steps; >wall-clock; device; precision; machine"
-    frame = _table("", [*columns.split("; "), "versions", "commit", ">attempts"], rows).rows
+    frame = _table("", columns + "; versions; commit; >attempts", rows).rows
     commits = frame.groupby(["task", "seeds"], sort=False).commit.nunique()
     mixed = sorted(f"{task} seed {seed}" for (task, seed), count in commits.items() if count > 1)
     own = ["seeds", ">wall-clock"]
     alike = frame.groupby([name for name in frame if name not in own], sort=False)
     merged = alike[own].agg(", ".join).reset_index()[list(frame)]
-    return Table("Run conditions", merged, words("conditions", letters, mixed))
-
-
-def _told(cell: CellResult, key: str) -> str:
-    return str(cell.run.get(key) or NONE)
+    return Table("Run conditions", merged, render_text("conditions", letters, mixed))
 
 
 def _commits(cell: CellResult) -> str:
-    """Of all attempts at a cell, and of what measured it in the end."""
+    """Commits of all attempts at a cell, and of its last measurement."""
     attempts: Sequence[Mapping[str, Any]] = cell.run.get("history", ())
     return _list([*(each.get("commit") or "unknown" for each in attempts), cell.run.get("commit")])

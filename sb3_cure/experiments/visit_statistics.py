@@ -1,4 +1,4 @@
-"""What SRL error policies meet, and how much of the true state space they cover."""
+"""SRL error that policies meet, and coverage of the true state space."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ _Key: TypeAlias = tuple[str, str, int]
 
 @dataclass(frozen=True, kw_only=True)
 class Measured:
-    """A number of a policy, by seed, beside those of the policies that it is compared with.
+    """A number of a policy by seed, with its ratios to those of other policies.
 
     :param task: Short name of the task (``"cartpole-swingup"``)
     :param method: Name of the arm
@@ -47,10 +47,10 @@ class Measured:
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSummary(Measured):
-    """SRL error per step (mean over the episodes of a seed), judged by one head.
+    """SRL error per step (mean over the episodes of a seed) under one head.
 
-    Measured errors are free of dither, so that ratios are those of the excesses over the dither floor. Own heads differ
-    from policy to policy: under them there is no ``task_ratio``.
+    Errors are free of dither: ratios are those of the excesses over the dither floor. Own heads differ from policy to
+    policy: under them there is no ``task_ratio``.
 
     :param head: ``"own"``, ``"common"`` or a yardstick: ``"zero"``, ``"mean_image"``
     :param error_min: Lowest error of all steps
@@ -64,7 +64,7 @@ class ErrorSummary(Measured):
 
 @dataclass(frozen=True, kw_only=True)
 class Coverage(Measured):
-    """Occupied cells of a grid over two coordinates of the true state, mean over all pairs of them.
+    """Occupied cells of a grid over two coordinates of the true state, averaged over all pairs of them.
 
     :param entropy: Entropy of the visits over these cells in bits, mean over all pairs, [seeds]
     :param steps: States counted, of each seed and actor alike
@@ -77,7 +77,7 @@ class Coverage(Measured):
 
 
 def _compare(experiment: Experiment, task: str, numbers: Mapping[_Key, float]) -> Iterator[dict[str, Any]]:
-    """What all ``Measured`` have, of numbers by (method, actor, seed), in the order of tables."""
+    """Fields of ``Measured`` from numbers by (method, actor, seed), in the order of tables."""
     by_policy: dict[tuple[str, str], dict[int, float]] = {}
     for (method, actor, seed), value in numbers.items():
         by_policy.setdefault((method, actor), {})[seed] = value
@@ -97,7 +97,8 @@ def _compare(experiment: Experiment, task: str, numbers: Mapping[_Key, float]) -
 
 
 def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
-    """
+    """Summarise the SRL errors that policies meet.
+
     :param experiment: An experiment
     :return: One row per task, arm, head and actor
     """
@@ -123,12 +124,11 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
 def state_coverage(experiment: Experiment) -> list[Coverage]:
     """Coverage of the true states by every actor.
 
-    States are counted on grids over two coordinates at a time: one over all of them has either a few cells per
-    coordinate or so many that each step has its own. The random policy is the yardstick of a task: ``GRID_INTERVALS``
-    make up the range between the 1st and the 99th percentile of each coordinate over its episodes of all seeds (the
-    whole circle of an angle), and cells of that size go on without end. Thus nobody's cells depend on where the other
-    arms went. Of every actor and seed equally many states are counted (drawn at random): else the longer run covers
-    more.
+    States are counted on grids over two coordinates at a time: a grid over all of them has either a few cells per
+    coordinate or so many that each step has its own. ``GRID_INTERVALS`` cells span the range between the 1st and the
+    99th percentile of each coordinate over the random policy's episodes of all seeds (of an angle, the circle), and
+    cells of that size continue without end, so that no arm's cells depend on the other arms. Of every actor and seed
+    equally many states are counted (drawn at random): else the longer run covers more.
 
     :param experiment: An experiment
     :return: One row per task, arm and actor
@@ -154,11 +154,12 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
 
 
 def visits_by_pair(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> list[np.ndarray]:
-    """
+    """Count states on grids over two coordinates at a time.
+
     :param states: True states, [n, d]
-    :param low: Where a cell of the grid begins, [d]; the grid has no end on any side
-    :param width: Of its cells, > 0, [d]
-    :return: For each pair of coordinates (if there is but one: for it), how many states lie in each occupied cell
+    :param low: Lower edge of a cell, [d]; the grid has no end on any side
+    :param width: Width of the cells, > 0, [d]
+    :return: For each pair of coordinates (with one coordinate: for it), the states in each occupied cell
     """
     places = np.floor((states - low) / width).astype(np.int64)
     places -= places.min(axis=0)
@@ -168,9 +169,10 @@ def visits_by_pair(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> li
 
 
 def entropy_bits(counts: np.ndarray) -> float:
-    """
+    """Entropy of a distribution.
+
     :param counts: Visits of each cell
-    :return: Entropy of the distribution in bits
+    :return: Entropy in bits
     """
     shares = counts / counts.sum()
     return float(-(shares * np.log2(shares)).sum()) + 0.0
@@ -192,7 +194,7 @@ def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], 
 
 
 def _grid_of_random(visits: Mapping[_Key, np.ndarray], units: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Where the grid begins and how wide its cells are: by the random policy's episodes, those of each seed once.
+    """Lower edge and width of the cells, by the random policy's episodes, those of each seed once.
 
     (All arms of a seed have the same ones.)
     """
@@ -200,6 +202,6 @@ def _grid_of_random(visits: Mapping[_Key, np.ndarray], units: Sequence[str]) -> 
     low, high = np.percentile(np.concatenate(list((randoms or visits).values())), [1, 99], axis=0)
     largest = np.max([np.abs(states).max(axis=0) for states in visits.values()], axis=0)
     is_angle = np.array([unit == "rad" for unit in units]) & (largest < np.pi + 1e-3)
-    # A little beyond, so that what rounding puts behind the seam has no cells of its own.
+    # A little beyond the circle, so that rounding at the seam opens no new cells.
     low, high = np.where(is_angle, -np.pi - 1e-3, low), np.where(is_angle, np.pi + 1e-3, high)
     return low, np.where(high > low, (high - low) / GRID_INTERVALS, 1.0)

@@ -1,6 +1,6 @@
-"""What policies visit: the SRL error they meet (paper, Figure 2), and the true states they reach.
+"""SRL error that policies meet (paper, Figure 2), and the true states that they reach.
 
-A policy's own head is one yardstick, but heads differ from run to run: see ``heads`` for another.
+Own heads differ from run to run: see ``heads`` for common ones.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,19 +27,20 @@ COLUMNS = ("actor", "head", "episode", "error_min", "error_mean", "error_max", "
 
 
 def visiting_actors(model: CuReSAC, cell: Cell) -> list[str]:
-    """
+    """Policies to measure: those that the cell has trained (none if it was only pretrained), and the random one.
+
     :param model: The cell's model
     :param cell: A cell
-    :return: The policies to measure: those that it has trained (none if it was only pretrained), and the random one
+    :return: Their names
     """
     return [*(trained_actors(model) if cell.budget > 0 else []), "random"]
 
 
 def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
-    """Roll out each policy, as it acts in training, and write ``visitation.csv`` and ``visits.npz``.
+    """Roll out each policy as it acts in training, and write ``visitation.csv`` and ``visits.npz``.
 
-    Errors are those of the model's own head, and of two predictions that know nothing: ``zero``, the middle grey,
-    and ``mean_image``, the mean of everything that the policies saw in these episodes (of vectors: 0, and their mean).
+    Errors are those of the model's own head and of two constant predictions: ``zero``, the middle grey, and
+    ``mean_image``, the mean of all observations of these episodes (of vectors: 0, and their mean).
 
     :param model: A trained model
     :param cell: Its cell
@@ -71,13 +72,13 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
 
 
 def roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool = False) -> list[Episode]:
-    """Episodes of a policy as it acts in training, with sampled actions; always the same ones.
+    """Roll out a policy as it acts in training, with sampled actions; always the same episodes.
 
     :param model: A trained model
     :param cell: Its cell
     :param env: The cell's environment
     :param actor: The policy
-    :param states: Whether to note the true states
+    :param states: Whether to record the true states
     :return: The episodes
     """
     seed = VISIT_SEED + cell.seed
@@ -86,7 +87,7 @@ def roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool 
 
 
 def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
-    """What an autoencoder is to draw of observations, float32 [n, ...], some at a time."""
+    """Targets of an autoencoder, float32 [n, ...], in batches."""
     head = getattr(model.policy, "srl", None)
     for start in range(0, len(observations), 128):
         images = th.as_tensor(observations[start : start + 128], device=model.device)
@@ -99,20 +100,22 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def mean_target(model: CuReSAC, episodes: Sequence[Episode]) -> np.ndarray:
-    """
-    :param model: A model, whose autoencoder says what is to be drawn
+    """Mean image of all steps.
+
+    :param model: A model, whose autoencoder defines the targets
     :param episodes: Episodes with observations
-    :return: The mean image of all steps, in the scale of the autoencoder's target
+    :return: The image in the scale of the autoencoder's target
     """
     sums = [part.sum(axis=0) for each in episodes for part in _targets(model, each.observations)]
     return np.sum(sums, axis=0) / sum(len(each.observations) for each in episodes)
 
 
 def constant_errors(model: CuReSAC, observations: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """
-    :param model: A model, whose autoencoder says what is to be drawn
+    """Errors of a constant prediction.
+
+    :param model: A model, whose autoencoder defines the targets
     :param observations: Images in 0-255, [n, *shape]
-    :param image: What is drawn, whatever is seen, in the scale of the autoencoder's target
+    :param image: The prediction, in the scale of the autoencoder's target
     :return: Error of each observation, [n]
     """
     parts = [np.square(part - image).reshape(len(part), -1).mean(axis=1) for part in _targets(model, observations)]
@@ -120,13 +123,14 @@ def constant_errors(model: CuReSAC, observations: np.ndarray, image: np.ndarray)
 
 
 def visit_row(actor: str, head: str, number: int, errors: np.ndarray, episode: Episode) -> Row:
-    """
-    :param actor: Who acted
-    :param head: Whose errors these are
-    :param number: Of the episode
+    """A row of ``visitation.csv``.
+
+    :param actor: Policy that acted
+    :param head: Head that the errors are measured by
+    :param number: Number of the episode
     :param errors: SRL error of each step
     :param episode: The episode
-    :return: A row of ``visitation.csv``
+    :return: The row
     """
     numbers = map(float, (errors.min(), errors.mean(), errors.max(), episode.total_reward))
     return dict(zip(COLUMNS, (actor, head, number, *numbers), strict=True))

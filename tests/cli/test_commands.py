@@ -11,13 +11,6 @@ import pytest
 from sb3_cure.cli import main
 
 
-@pytest.mark.parametrize("arguments", [[], ["--help"]])
-def test_usage_names_every_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main.main(arguments) == 0
-    usage = capsys.readouterr().out
-    assert all(f"  {command} " in usage for command in main.COMMANDS)
-
-
 def test_unknown_command_fails_and_lists_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert main.main(["fly", "--env", "CartPole-v1"]) == 2
     error = capsys.readouterr().err

@@ -14,7 +14,7 @@ def test_doctor_on_a_machine_that_works(capsys: pytest.CaptureFixture[str]) -> N
     """System, versions, choices, and the time of a frame with both renderers; status 0."""
     assert main(["doctor"]) == 0
     report = capsys.readouterr().out
-    versions = [f"{name} {metadata.version(name)}" for name in ("torch", "mujoco", "rl_zoo3", "rliable")]
+    versions = [f"{name} {metadata.version(name)}" for name in ("torch", "mujoco", "rl_zoo3", "scipy")]
     choices = ['precision="auto": ']
     for text in ["Python version: ", *versions, *choices, '(renderer="fast")', "MUJOCO_GL=", "Training can work here."]:
         assert text in report

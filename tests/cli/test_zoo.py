@@ -5,8 +5,6 @@ import pickle
 import re
 import shutil
 import sys
-import tracemalloc
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -103,15 +101,6 @@ def train(*arguments: str, task: str = TASK, **changes: Any) -> None:
     assert main(["train", "--env", task, "--conf-file", config, "--device", "cpu", *arguments]) == 0
 
 
-def test_settings_are_cure_by_default(folder: Path) -> None:
-    """As rl-zoo3's commands name no file either."""
-    few = "n_timesteps:20 learning_starts:10 warmup_updates:1 batch_size:4 buffer_size:100".split()
-    small = "policy_kwargs:dict(net_arch=[8],features_extractor_kwargs=dict(n_filters=2))"
-    assert main(["train", "--env", TASK, "--device", "cpu", "-params", *few, small]) == 0
-    [run] = (folder / "logs" / "cure_sac").glob("*_1")
-    assert "srl" in next(run.rglob("config.yml")).read_text()
-
-
 @pytest.fixture
 def set_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[CuReSAC, zoo.ExperimentManager]]:
     """Function that trains as ``train`` does, but returns the model and the manager before the first step."""
@@ -138,15 +127,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ------------------------------------------------------------------ training
 
 
-@pytest.mark.parametrize("program", ["train", "optimize", "enjoy", "record"])
-def test_help_lists_the_algorithms(program: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main([program, "--help"])
-    shown = capsys.readouterr().out
-    assert f"usage: sb3-cure {'train' if program == 'optimize' else program}" in shown
-    assert all(algorithm in shown for algorithm in zoo.ALGORITHMS)
-
-
 def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
     assert (run / f"{RUN}.zip").is_file() and (run / "best_model.zip").is_file()
     assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
@@ -161,44 +141,11 @@ def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
     assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
 
 
-def test_linear_learning_rate_is_saved(set_up: Callable[..., Any], folder: Path) -> None:
-    """As one of SB3's schedules, so that the archive needs no object from the user."""
-    model, _ = set_up(learning_rate="lin_1e-3")
-    model.save(folder / "model.zip")
-    for each in (model, CuReSAC.load(folder / "model.zip")):
-        assert [each.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
-
-
-def test_namespace_and_atari_have_their_entries(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The environment's own id goes first, then the id with its module, the namespace, Atari, and the default."""
-    order = [f"my_module:{TASK}", TASK, "tests", "atari", "default"]
-    zoo.register()
-    for first in range(5):
-        config = write({name: {**SETTINGS, "gamma": 0.5 + 0.01 * order.index(name)} for name in order[first:]})
-        arguments = type("Arguments", (), {"gym_packages": ["my_module"]})()
-        manager = zoo.ExperimentManager(arguments, "cure_sac", TASK, "logs", config=config)
-        manager._is_atari = True
-        hyperparams, _ = manager.read_hyperparameters()
-        assert hyperparams["gamma"] == pytest.approx(0.5 + 0.01 * first) and manager.env_name.gym_id == TASK
-
-
-def test_training_goes_on_with_a_trained_agent(set_up: Callable[..., Any], run: Path) -> None:
-    trained = CuReSAC.load(run / f"{RUN}.zip", custom_objects={"srl": Gentle}).policy.state_dict()
-    model, _ = set_up("-i", str(run / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
-    assert all(np.array_equal(value.cpu(), trained[name]) for name, value in model.policy.state_dict().items())
-
-
 def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
     """They are pickled, and their run's settings did not ask for them."""
     copied = hostile(run, folder, "vecnormalize.pkl", "cos\nmkdir\n(S'pwned'\ntR.")
     model, _ = set_up("-i", str(copied / f"{RUN}.zip"), srl="heads_of_mine.Gentle")
     assert model.get_vec_normalize_env() is None and not Path("pwned").exists()
-
-
-def test_callback_of_the_file_writes_exact_checkpoints(folder: Path) -> None:
-    checkpoint = {"sb3_cure.evaluation.callbacks.ExactCheckpoint": {"save_freq": 10, "path": "checkpoints"}}
-    train("--eval-freq", "-1", callback=[checkpoint])
-    assert CuReSAC.resume("checkpoints", Filmed(episode_length=7)).num_timesteps == 20
 
 
 @pytest.mark.parametrize(
@@ -213,58 +160,6 @@ def test_normalizing_what_is_stored_otherwise_is_refused(set_up: Callable[..., A
     """Images in floats; rewards normalised within what stacks frames or moves channels, where the buffer looks."""
     with pytest.raises(ValueError, match=r"VecNormalize|this buffer stores"):
         set_up(**changes)[0].learn(20)
-
-
-def test_rewards_of_stacked_frames_can_be_normalized(set_up: Callable[..., Any]) -> None:
-    """By wrappers in the right order."""
-    stack = "stable_baselines3.common.vec_env.VecFrameStack"
-    wrappers = ["stable_baselines3.common.vec_env.VecTransposeImage", {stack: {"n_stack": 3}}]
-    kwargs = {"channels_last": True, "frame_stack": 1}
-    model, _ = set_up(env_kwargs=kwargs, normalize={"norm_obs": False}, vec_env_wrapper=wrappers)
-    model.learn(20)
-    assert model.observation_space.shape == (9, 36, 36)
-
-
-def test_modules_of_the_working_directory_are_found(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Environment, head and buffer lie in one; it is named by either flag, and the entry of the file as well."""
-    Path("camera_of_mine.py").write_text(CAMERA)
-    settings = {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}
-    settings.update(srl="camera_of_mine.Head", replay_buffer_class="camera_of_mine.Buffer")
-    config = write({"camera_of_mine:Camera-v0": settings})
-    flags = (["--env", "camera_of_mine:Camera-v0"], ["--env", "Camera-v0", "--gym-packages", "camera_of_mine"])
-    try:
-        for number, names in enumerate(flags, start=1):
-            gym.registry.pop("Camera-v0", None)
-            sys.modules.pop("camera_of_mine", None)
-            assert main(["train", *names, "--conf-file", config, "--eval-freq", "-1"]) == 0
-            assert main(["enjoy", *names, "-n", "20", "--no-render", "--srl", "camera_of_mine.Head"]) == 0
-            assert f"Camera-v0_{number}/Camera-v0.zip" in capsys.readouterr().out
-    finally:
-        gym.registry.pop("Camera-v0", None)
-        sys.modules.pop("camera_of_mine", None)
-
-
-def test_settings_may_be_python(folder: Path) -> None:
-    """Then they hold classes; the run, of a unique name, can be watched."""
-    Path("settings.py").write_text(
-        f"import torch\nfrom sb3_cure.srl import RAE\nhyperparams = {{'default': {SETTINGS}}}\n"
-        "hyperparams['default'].update(srl=RAE, n_envs=1)\n"
-        "hyperparams['default']['policy_kwargs']['activation_fn'] = torch.nn.Tanh"
-    )
-    assert main(["train", "--env", TASK, "--conf-file", "settings.py", "--eval-freq", "-1", "--uuid"]) == 0
-    assert main(["enjoy", "--env", TASK, "-n", "7", "--no-render"]) == 0
-
-
-def test_unknown_names_of_settings_tell_those_there_are(folder: Path) -> None:
-    with pytest.raises(ValueError, match=r"'cure_sac' is neither .*: cure_curl, cure_sac_ae, .*, fast/cure_curl, "):
-        main(["train", "--env", TASK, "--conf-file", "cure_sac"])
-
-
-def test_rl_zoos_own_algorithms_still_train(folder: Path) -> None:
-    assert main(["train", "--algo", "dqn", "-n", "8", "--eval-freq", "-1", "--device", "cpu"]) == 0
-    assert Path("logs/dqn/CartPole-v1_1/CartPole-v1.zip").is_file()
 
 
 # -------------------------------------------------------------------- tuning
@@ -320,13 +215,6 @@ def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str
     assert {name: getattr(model, name) for name in asked[0]} == asked[0]
 
 
-def test_quantiles_are_tuned_for_tqc() -> None:
-    trial = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0)).ask()
-    arguments = zoo.sample_params(trial, 2, 1, {}, quantiles=True)
-    assert 0 <= arguments["top_quantiles_to_drop_per_net"] <= 5
-    assert zoo.convert_params(trial.params) == arguments
-
-
 # ----------------------------------------------------------------- replaying
 
 
@@ -363,51 +251,10 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
         replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40")
 
 
-@pytest.mark.parametrize("flags", [[], ["--stochastic"]])
-def test_actions_are_means_unless_asked(flags: list[str], run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def predict(model: CuReSAC, observation: np.ndarray, deterministic: bool) -> tuple[np.ndarray, None]:
-        asked.append(deterministic)
-        return np.zeros((1, 2), np.float32), None
-
-    monkeypatch.setattr(CuReSAC, "predict", predict)
-    assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", *flags) == 0
-    assert asked == 14 * [not flags]
-
-
-def test_seed_decides_what_is_played(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The environment's starts and the sampled actions."""
-    outputs = []
-    for flags in (["--seed", "1"], ["--seed", "1"], ["--seed", "2"]):
-        for sampled in ([], ["--stochastic"]):
-            assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", *flags, *sampled) == 0
-            outputs.append(re.findall(r"Mean reward: .*", capsys.readouterr().out))
-    assert outputs[:2] == outputs[2:4]
-    assert outputs[0] != outputs[4] and outputs[1] != outputs[5] and outputs[0] != outputs[1]
-
-
-def test_env_kwargs_of_the_command_line_are_remembered(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Also where the file has none."""
-    config = write({"default": {key: value for key, value in SETTINGS.items() if key != "env_kwargs"}})
-    flags = ["--env-kwargs", "episode_length:5", "--eval-freq", "-1"]
-    assert main(["train", "--env", TASK, "--conf-file", config, *flags]) == 0
-    assert replay("enjoy", Path("logs/cure_sac", f"{RUN}_1")) == 0
-    assert "2 Episodes" in capsys.readouterr().out
-
-
 def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
     assert replay("record", run, "--srl", "heads_of_mine.Gentle", "--load-best", "-o", str(tmp_path)) == 0
     (video,) = tmp_path.glob("best_model-*.mp4")
     assert video.stat().st_size > 1000
-
-
-@pytest.mark.filterwarnings("ignore:.*HumanRendering.*:UserWarning")
-def test_window_can_show_the_agent() -> None:
-    """`enjoy` asks for render_mode="human", which Gymnasium grants to environments that can be filmed."""
-    env = gym.make(TASK, render_mode="human")
-    assert env.render_mode == "human" and env.get_wrapper_attr("frame_stack") == 2
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -445,19 +292,6 @@ def test_model_is_the_one_that_flags_name(
     with pytest.raises(SystemExit if model is None else Found) as found:
         main(["enjoy", "--env", TASK, "--no-render", *flags])
     assert model is None or str(found.value) == str(runs / model)
-
-
-def test_replaying_needs_no_replay_buffer(folder: Path, played: list[Any]) -> None:
-    """Whatever the size and the class of the one that it was trained with."""
-    run = folder / "logs" / "cure_sac" / f"{RUN}_1"
-    run.mkdir(parents=True)
-    tiny_model("CnnPolicy", Filmed(), buffer_size=10_000).save(run / f"{RUN}.zip")
-    tracemalloc.start()
-    replay("enjoy", run)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert played[0].observation_space.shape == (6, 36, 36)
-    assert peak < 10_000 * 3 * 36 * 36 / 10
 
 
 def hostile(run: Path, folder: Path, file: str, text: str) -> Path:
@@ -519,10 +353,3 @@ def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) 
     assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
     (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
     assert video.stat().st_size > 1000
-
-
-def test_what_rl_zoo_writes_is_read_as_data() -> None:
-    """Tuples and ordered dictionaries are what they were, classes their names."""
-    settings = OrderedDict([("env", TASK), ("frames", (1, 2)), ("kwargs", OrderedDict(a=1.5)), ("class", Filmed)])
-    read = yaml.load(yaml.dump(settings), Loader=zoo.RunLoader)
-    assert read == {**settings, "class": f"{Filmed.__module__}.Filmed"}

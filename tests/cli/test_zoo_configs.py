@@ -1,231 +1,50 @@
-"""The YAML files hold the paper's settings, or the demo's, and rl-zoo3 trains from each of them."""
+"""rl-zoo3 trains from each of the package's YAML files, and grids read their entries."""
 
-import copy
-import inspect
 import re
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import pytest
 import yaml
-from envs_for_tests import PixelBox
-from gymnasium.envs.registration import EnvSpec
 
-from sb3_cure import CuReSAC
-from sb3_cure.cli import zoo
 from sb3_cure.cli.main import main
-from sb3_cure.experiments.demo import ENV_KWARGS, PROFILE
 from sb3_cure.experiments.grid import load_grid
 
 FOLDER = Path(__file__).parents[2] / "zoo_configs"
-METHODS = {
-    "sac_ae": {"srl": "rae", "curiosity": None},
-    "curl": {"srl": "curl", "curiosity": None},
-    "vae": {"srl": "vae", "curiosity": None},
-    "spr": {"srl": "spr", "curiosity": None},
-    "drq_single_view": {"srl": None, "curiosity": None},
-    "cure_sac_ae": {"srl": "rae", "curiosity": "separate"},
-    "cure_curl": {"srl": "curl", "curiosity": "separate"},
-    **{
-        name: {"srl": "rae", "curiosity": "separate", "intrinsic": name}
-        for name in ("rnd", "icm", "disagreement", "particle")
-    },
-}
-# Task: action repeat
-SIX_TASKS = {
-    "dmc_pixels/cartpole-swingup-v0": 8,
-    "dmc_pixels/finger-spin-v0": 2,
-    "dmc_pixels/finger-turn_easy-v0": 2,
-    "dmc_pixels/reacher-easy-v0": 4,
-    "dmc_pixels/reacher-hard-v0": 4,
-    "dmc_pixels/ball_in_cup-catch-v0": 4,
-}
-# A task that no file names
-ANY_OTHER = "dmc_pixels/cheetah-run-v0"
-# What a file says nothing of
-CURE_DEFAULTS = {name: each.default for name, each in inspect.signature(CuReSAC).parameters.items()}
+METHODS = sorted(path.stem for path in FOLDER.glob("*.yml"))
 # Networks of the files' own sizes take a second to initialise.
-SMALL = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4}}
+SMALL = "policy_kwargs:dict(net_arch=[16],features_extractor_kwargs=dict(n_filters=4))"
 
 
-class Dots(PixelBox):
-    """Images that are not as those of DeepMind Control."""
-
-    def __init__(self, **kwargs: Any):
-        super().__init__(frame_stack=1, size=52, channels_last=True, tells_frame_stack=False, **kwargs)
-
-
-def entries(folder: Path) -> list[tuple[str, str]]:
-    """Method and task of every entry for DeepMind Control of the files in a folder, and a task that has none."""
-    found = [(path.stem, name) for path in sorted(folder.glob("*.yml")) for name in yaml.safe_load(path.read_text())]
-    methods = sorted({method for method, _ in found})
-    return [*(each for each in found if "/" in each[1]), *((method, ANY_OTHER) for method in methods)]
-
-
-def entry_of(path: Path, task: str) -> dict[str, Any]:
-    """What the file says about a task."""
-    content = yaml.safe_load(path.read_text())
-    return content.get(task, content.get("dmc_pixels", content["default"]))
-
-
-def set_up(
-    config: Path, task: str, log_folder: Path, algorithm: str = "cure_sac", **changes: Any
-) -> tuple[CuReSAC, zoo.ExperimentManager]:
-    """The model and the manager of a training from this file, as ``sb3-cure train`` makes them."""
-    zoo.register()
-    changes = copy.deepcopy(changes)  # SB3 adds to policy_kwargs
-    arguments = type("Arguments", (), {"gym_packages": []})()
-    n_timesteps = changes.pop("n_timesteps", 0)
-    manager = zoo.ExperimentManager(
-        arguments, algorithm, task, str(log_folder), n_timesteps=n_timesteps, config=str(config),
-        hyperparams=changes, eval_freq=-1, log_interval=-1, device="cpu", verbose=0,
-    )  # fmt: skip
-    model, _ = manager.setup_experiment()  # type: ignore[misc]
-    return model, manager  # type: ignore[return-value]
-
-
-def test_the_files_and_their_entries() -> None:
-    """Each method twice; the paper's six tasks and a default, all registered ids."""
-    for folder in (FOLDER, FOLDER / "fast"):
-        assert {path.stem for path in folder.glob("*.yml")} == METHODS.keys()
-    for method, settings in METHODS.items():
-        names = yaml.safe_load((FOLDER / f"{method}.yml").read_text()).keys()
-        # CURL's crops need larger images, which only DeepMind Control's tasks can be asked for.
-        assert names == SIX_TASKS.keys() | {"default"} | ({"dmc_pixels"} if settings["srl"] == "curl" else set())
-        assert {"default", "dmc_pixels"} <= yaml.safe_load((FOLDER / "fast" / f"{method}.yml").read_text()).keys()
-    assert {task for folder in (FOLDER, FOLDER / "fast") for _, task in entries(folder)} <= gym.registry.keys()
-
-
-@pytest.mark.parametrize(("method", "task"), entries(FOLDER))
-def test_every_entry_is_the_papers_table(method: str, task: str, tmp_path: Path) -> None:
-    """rl-zoo3 builds each entry: the paper's numbers, action repeats, image sizes, and 500k environment steps."""
-    path = FOLDER / f"{method}.yml"
-    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
-    draws = model.srl in ("rae", "vae")
-    table = dict(
-        **METHODS[method], batch_size=128, buffer_size=80_000, gamma=0.99, learning_starts=1000, tau=0.01,
-        encoder_tau=0.05, target_update_interval=2, actor_update_interval=2, ent_coef="auto_0.1", gradient_steps=-1,
-        warmup_updates=1000 if draws else 0, curiosity_prob=0.2, curiosity_gamma=0.99, curiosity_beta=1.0,
-    )  # fmt: skip
-    assert {name: getattr(model, name) for name in table} == table
-    assert model.lr_schedule(1) == 1e-3
-    if model.srl != "curl":  # whose images are larger
-        assert model.augmentation == ("auto" if draws else "shift")
-    assert entry_of(path, task)["policy_kwargs"] == {"net_arch": [1024, 1024]}
-    repeat = model.env.get_attr("action_repeat")[0]  # type: ignore[union-attr]
-    assert repeat == SIX_TASKS.get(task, 4)
-    assert manager.n_timesteps * repeat == 500_000
-    # CURL crops 84 pixels out of 100; the encoder of all methods sees 84.
-    size = 100 if model.srl == "curl" else 84
-    assert model.observation_space.shape == (9, size, size)
-
-
-@pytest.mark.parametrize(("method", "task"), entries(FOLDER / "fast"))
-def test_every_fast_entry_has_the_demos_profile(method: str, task: str, tmp_path: Path) -> None:
-    """The demo's networks and, for cartpole, its camera, with the paper's reward; 100k environment steps."""
-    path = FOLDER / "fast" / f"{method}.yml"
-    model, manager = set_up(path, task, tmp_path, policy_kwargs=SMALL)
-    expected = {**PROFILE, **METHODS[method]}
-    if model.srl in ("rae", "vae"):
-        expected.update(augmentation="auto", augmentation_kwargs={}, warmup_updates=1000)
-    assert entry_of(path, task)["policy_kwargs"] == expected.pop("policy_kwargs")
-    assert {name: getattr(model, name) for name in expected} == expected
-    assert manager.env_kwargs == (ENV_KWARGS if "cartpole" in task else {"image_size": 48, "renderer": "fast"})
-    assert manager.n_timesteps * model.env.get_attr("action_repeat")[0] == 100_000  # type: ignore[union-attr]
-
-
-#: What tells that something was learned: with a head, without one
-LOSS_OF = ("train/srl_loss", "train/critic_loss")
-FILES = [f"{folder}{method}.yml" for folder in ("", "fast/") for method in METHODS]
-TRAINED = [("cure_sac", f"{method}.yml") for method in METHODS]  # the fast ones: from the command line, below
-TRAINED += [(algorithm, "cure_sac_ae.yml") for algorithm in zoo.ALGORITHMS if algorithm != "cure_sac"]
-
-
-@pytest.mark.parametrize(("algorithm", "path"), TRAINED)
-def test_each_file_trains(algorithm: str, path: str, tmp_path: Path) -> None:
-    """In two real environments; those of the evaluation show the same pixels."""
-    burst = min(entry_of(FOLDER / path, ANY_OTHER)["warmup_updates"], 3)
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=10, warmup_updates=burst, buffer_size=200)
-    model, manager = set_up(
-        FOLDER / path, "dmc_pixels/cartpole-swingup-v0", tmp_path, algorithm, n_timesteps=18, n_envs=2, **small
-    )
-    manager.learn(model)
-    assert type(model) is zoo.ALGORITHMS[algorithm] and model.num_timesteps == 18
-    # The burst, then an update per agent step.
-    assert model._n_updates == burst + 8
-    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
-    evaluation = manager.create_envs(1, eval_env=True, no_log=True)
-    assert evaluation.observation_space == model.observation_space
-    assert evaluation.get_attr("renderer") == ["dmc"]
-    evaluation.close()
+def updates(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> int:
+    """Number of updates that a training logs at last."""
+    flags = ["--eval-freq", "-1", "--log-interval", "1", "--device", "cpu"]
+    assert main(["train", "--env", "dmc_pixels/cartpole-swingup-v0", *arguments, *flags]) == 0
+    return int(re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)[-1])
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_each_fast_file_trains_from_the_command_line(
-    method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """By its name and with its own networks, as users type it; the log shows the burst and the updates after it."""
+def test_each_fast_file_trains(method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With its own networks; the log shows the burst and the updates after it."""
     small = ["learning_starts:100", "warmup_updates:20", "batch_size:16"]
-    arguments = ["train", "--env", "dmc_pixels/cartpole-swingup-v0", "--conf-file", f"fast/{method}"]
-    arguments += ["-n", "300", "-params", *small, "--eval-freq", "-1", "--log-interval", "1", "-f", str(tmp_path)]
-    assert main([*arguments, "--device", "cpu"]) == 0
-    printed = re.findall(r"n_updates +\| (\d+)", capfd.readouterr().out)
-    assert int(printed[-1]) == 20 + 149  # up to the last step of two episodes of 125
+    arguments = ["--conf-file", f"fast/{method}", "-n", "300", "-f", str(tmp_path), "-params", *small]
+    assert updates(arguments, capfd) == 20 + 149  # up to the last step of two episodes of 125
 
 
-@pytest.mark.parametrize("path", FILES)
-def test_default_serves_any_task_with_pixels(path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of whatever size and order of channels, here 52 pixels, channels last; with that file's head."""
-    monkeypatch.setitem(gym.registry, "Dots-v0", EnvSpec("Dots-v0", Dots))
-    small = dict(policy_kwargs=SMALL, batch_size=4, learning_starts=20, warmup_updates=2, buffer_size=200)
-    model, manager = set_up(FOLDER / path, "Dots-v0", tmp_path, n_timesteps=25, **small)
-    manager.learn(model)
-    assert (model.num_timesteps, model._n_updates) == (25, 2 + 5)
-    assert model.srl == METHODS[path.removeprefix("fast/").removesuffix(".yml")]["srl"]
-    assert float(model.logger.name_to_value[LOSS_OF[model.srl is None]]) > 0
+@pytest.mark.parametrize(("algo", "method"), [*(("cure_sac", method) for method in METHODS), ("cure_tqc", "cure_curl")])
+def test_each_file_trains(algo: str, method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    small = ["learning_starts:100", "warmup_updates:0", "batch_size:4", "buffer_size:200", SMALL]
+    arguments = ["--algo", algo, "--conf-file", method, "-n", "130", "-f", str(tmp_path), "-params", *small]
+    assert updates(arguments, capfd) == 24  # up to the end of the episode of 125
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in (FOLDER / "experiments").glob("*.yml")))
-def test_every_grid_has_a_fast_one(name: str) -> None:
-    """Which asks the same: the same methods from the fast files, pretrained in the same proportion."""
-    slow, fast = (load_grid(folder / name) for folder in (FOLDER / "experiments", FOLDER / "experiments" / "fast"))
-    assert (fast.kind, fast.baseline) == (slow.kind, slow.baseline)
-    methods = copy.deepcopy(slow.description["methods"])
-    for method in methods.values():
-        method["config"] = method["config"].replace("../", "../../fast/")
-        if "pretrain" in method:
-            share = method["pretrain"]["budget"] / slow.description["budget"]
-            method["pretrain"]["budget"] = share * fast.description["budget"]
-    assert list(fast.description["methods"].items()) == list(methods.items())
+def test_tasks_of_all_files_are_registered() -> None:
+    for path in (*FOLDER.glob("*.yml"), *FOLDER.glob("fast/*.yml")):
+        tasks = {name for name in yaml.safe_load(path.read_text()) if "/" in name}
+        assert tasks <= gym.registry.keys()
 
 
 def test_grids_read_the_entry_of_the_namespace() -> None:
     """As ``train`` does: a task without an entry of its own has that of ``dmc_pixels``, not the default."""
     cells = load_grid(FOLDER / "experiments" / "fast" / "visitation.yml", tasks=["reacher-easy"], seeds=1).cells
     assert [cell.env_kwargs for cell in cells] == [{"image_size": 48, "renderer": "fast"}] * 4
-
-
-@pytest.mark.parametrize("folder", ["experiments", "experiments/fast"])
-def test_an_ablation_is_one_change(folder: str) -> None:
-    """Against the method that its difference is taken from."""
-    grid = load_grid(FOLDER / folder / "ablations.yml", seeds=1)
-    settings = {cell.method: {**CURE_DEFAULTS, **cell.arguments} for cell in grid.cells}
-    changes = {}
-    for arm, method in grid.description["methods"].items():
-        other = settings[method.get("baseline", grid.baseline)]
-        changes[arm] = [name for name in other if settings[arm][name] != other[name]]
-    assert changes.pop(grid.baseline) == []
-    assert changes == {
-        "prob_005": ["curiosity_prob"],
-        "prob_05": ["curiosity_prob"],
-        "beta_01": ["curiosity_beta"],
-        "beta_10": ["curiosity_beta"],
-        "gamma_0": ["curiosity_gamma"],
-        "next_observation": ["curiosity_target"],
-        "not_normalized": ["normalize_curiosity"],
-        "bonus": ["curiosity"],
-        "no_encoder_gradient": ["curiosity_encoder_grad"],
-        "sequential": ["update"],
-        "alternating": ["srl_schedule"],
-    }

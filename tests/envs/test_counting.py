@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure import make_dmc_env
 from sb3_cure.envs import physics_state, physics_state_names, rendering
-from sb3_cure.envs.counting import Cells, CountReward, TellCell
+from sb3_cure.envs.counting import Cells, CountReward, CellInfo
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 
 WIDTHS = {"slider": 0.05, "hinge_1": 0.3}
@@ -48,7 +48,7 @@ def test_reward_is_one_by_the_root_of_visits() -> None:
 
 
 def test_counts_are_resumed() -> None:
-    first, second = (DummyVecEnv([lambda: TellCell(CountReward(cartpole(), WIDTHS), WIDTHS)]) for _ in range(2))
+    first, second = (DummyVecEnv([lambda: CellInfo(CountReward(cartpole(), WIDTHS), WIDTHS)]) for _ in range(2))
     first.reset()
     for action in actions(30):
         first.step(action[None])

@@ -17,7 +17,7 @@ from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
-from sb3_cure.evaluation import decoding, plots
+from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, media, run, visitation
 from sb3_cure.experiments.cells import run_cell
@@ -72,22 +72,6 @@ def test_cell_keeps_its_curve(finished: tuple[Cell, Path]) -> None:
     assert not (out / cell.folder / "checkpoint").exists()
 
 
-def test_cell_keeps_the_rewards_that_training_met(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stored: list[float] = []
-    save = CuReSAC.save
-
-    def noting_save(model: CuReSAC, path: Any) -> None:
-        stored.append(float(model.replay_buffer.rewards[: model.num_timesteps].sum()))
-        save(model, path)
-
-    monkeypatch.setattr(CuReSAC, "save", noting_save)
-    cell = only_cell(tmp_path)
-    run_cell(cell, tmp_path, pictures=False)
-    rows = read_rows(tmp_path / cell.folder / "eval.csv")
-    assert rows[0]["rewards_met"] == 0 != rows[1]["rewards_met"] != rows[-1]["rewards_met"]
-    assert rows[-1]["rewards_met"] == pytest.approx(stored[-1], abs=1e-3)
-
-
 def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
     """Versions, commit, and every argument: as given, by default, and as the model resolved it."""
     cell, out = finished
@@ -99,7 +83,6 @@ def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
     assert arguments["tensorboard_log"] is None, "what is switched off is told as well"
     config = json.loads((out / cell.folder / "config.json").read_text())
     assert config["action_repeat"] == 4 and config["arguments"]["batch_size"] == 8
-    assert config["defaults"]["curiosity_prob"] == 0.2 and config["defaults"]["gamma"] == 0.99
 
 
 def test_finished_cell_is_not_run_twice(finished: tuple[Cell, Path]) -> None:
@@ -167,7 +150,7 @@ def test_infinite_returns_end_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return observation, math.nan if truncated else reward, terminated, truncated, info
 
     monkeypatch.setattr(PixelBox, "step", step_or_nan)
-    with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: mend its rewards"):
+    with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: correct its rewards"):
         run_cell(only_cell(tmp_path, methods={"a": method(on_bad_transition="skip")}), tmp_path, pictures=False)
 
 
@@ -192,16 +175,6 @@ def test_arms_of_a_seed_are_paired(tmp_path: Path) -> None:
     assert [row for row in first if row["actor"] == "task"] == second
 
 
-def test_arms_have_the_same_warm_up(tmp_path: Path) -> None:
-    """The replay buffers of paired arms are equal when learning starts."""
-    buffers = []
-    for curiosity in ("separate", "random", None):
-        model = CuReSAC("CnnPolicy", PixelBox(), seed=4, curiosity=curiosity, **{**TINY, "warmup_updates": 0})
-        model.learn(20)
-        buffers.append((model.replay_buffer.actions[:20].copy(), model.replay_buffer.rewards[:20].copy()))  # type: ignore[union-attr]
-    assert differences(buffers[0], buffers[1]) == differences(buffers[0], buffers[2]) == []
-
-
 def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **changes: Any) -> Grid:
     """The three arms of the paper's table, in two environments each; every phase has the same budget."""
     phases: dict[str, Any] = {"vanilla": {}}
@@ -217,14 +190,14 @@ def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **change
 def warm_ups(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Filled by each cell: what its replay buffer holds of the first steps."""
     found: list[Any] = []
-    finish = cells._CellRun._keep_results
+    finish = cells._CellRun._write_results
 
     def keep(run_of_cell: Any) -> None:
         buffer = run_of_cell.model.replay_buffer
         found.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy()))
         finish(run_of_cell)
 
-    monkeypatch.setattr(cells._CellRun, "_keep_results", keep)
+    monkeypatch.setattr(cells._CellRun, "_write_results", keep)
     return found
 
 
@@ -252,42 +225,6 @@ def test_pretrained_arms_have_the_same_warm_up(
     assert differences(begun[0], begun[1]) == differences(begun[0], begun[2]) == []
     assert differences(warm_ups[0], warm_ups[1]) == differences(warm_ups[0], warm_ups[2]) == []
     assert len(differences(warm_ups[0], warm_ups[3])) == 2, "another seed has another warm-up"
-
-
-@pytest.mark.usefixtures("few_rows")
-def test_common_generators_do_not_break_pairs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, warm_ups: list[Any]
-) -> None:
-    """Where environments draw from Python's and NumPy's own numbers, neither evaluations, of one policy or two, nor
-    pictures change a training; evaluations start alike all along."""
-    starts: list[float] = []
-    reset, evaluated, evaluations = PixelBox.reset, cells._Record.evaluate, set()
-
-    def careless(self: PixelBox, *, seed: int | None = None, options: Any = None) -> Any:
-        reset(self, seed=seed)
-        self.position = np.array([random.uniform(-1, 1), np.random.uniform(-1, 1)])
-        starts.append(self.position.sum())
-        return self.observe(first=True), {}
-
-    def evaluate(self: Any) -> None:
-        before = len(starts)
-        evaluated(self)
-        n_actors = len(cells.trained_actors(self.model))
-        assert starts[before:] == starts[before : before + 2] * n_actors
-        evaluations.add(tuple(starts[before:][:2]))
-
-    monkeypatch.setattr(PixelBox, "reset", careless)
-    monkeypatch.setattr(cells._Record, "evaluate", evaluate)
-    methods = {name: method(curiosity=name or None, n_envs=2, learning_starts=40) for name in ("separate", "")}
-    methods["none"] = methods.pop("")
-    grid = load_grid(write_grid(tmp_path, methods=methods, budget=200, evaluation=dict(every=120, episodes=2)))
-    for out, pictures in (("with", True), ("without", False)):
-        for cell in grid.cells:
-            run_cell(cell, tmp_path / out, pictures=pictures)
-    assert differences(warm_ups[0], warm_ups[1]) == [] and len(evaluations) == 1
-    for cell in grid.cells:
-        tables = [(tmp_path / out / cell.folder / "episodes.csv").read_text() for out in ("with", "without")]
-        assert tables[0] == tables[1]
 
 
 # --------------------------------------------------------------- interruptions
@@ -387,31 +324,6 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
 # -------------------------------------------------------------------- pictures
 
 
-def test_drawn_arms_train_alike_and_show_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reconstructed observations are those of all arms, so that their errors compare; and a cell that is drawn is
-    trained as one that is not."""
-    fit = decoding.fit_decoder
-    monkeypatch.setattr(decoding, "fit_decoder", lambda model, sample, *rest: fit(model, sample, 1))  # not 500
-    observed, rows, titles = [], [], []
-
-    def keep(path: Path, shown: np.ndarray, drawn: Any, title: str) -> None:
-        observed.append(shown)
-        rows.append([steps for steps, _ in drawn])
-        titles.append(title)
-
-    monkeypatch.setattr(plots, "reconstructions_over_training", keep)
-    methods = {"cure": method(), "curl": method(srl="curl", srl_kwargs={"bank_size": 8})}
-    for cell in load_grid(write_grid(tmp_path, budget=160, methods=methods)).cells:
-        both = [run_cell(cell, tmp_path / name, pictures=name == "drawn") for name in ("drawn", "not drawn")]
-        drawn, plain = (CuReSAC.load(folder / "model.zip").get_parameters() for folder in both)
-        assert differences(drawn, plain) == []
-    assert rows[8] == [0, 5, 10, 15, 20, 25, 30, 35, 40], "with the untrained autoencoder"
-    assert rows[9] == [40], "drawn at the end where no picture was left by training"
-    assert titles[8].endswith("\nPixelBox, cure, seed 0") and titles[-1].endswith("\nPixelBox, curl, seed 0")
-    assert all(np.array_equal(shown, observed[0]) for shown in observed) and len(observed) == 10 + 9
-    assert len(np.unique(observed[0], axis=0)) == len(observed[0]) == 8
-
-
 @pytest.mark.usefixtures("few_rows")
 def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Films of both policies; the map is that of the measured visits, of sampled and random actions."""
@@ -437,48 +349,6 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert len(states) == len(errors) == 25
     draw(tmp_path / "map.png", drawn, [str(number) for number in range(4)], "", coordinates=("0", "1"))
     assert (tmp_path / "map.png").exists()
-
-
-@pytest.mark.usefixtures("few_rows")
-@pytest.mark.parametrize(("channels", "wraps", "shown"), [(3, False, 3), (4, True, 1), (4, False, 1)])
-def test_pictures_are_drawn_of_any_channels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, channels: int, wraps: bool, shown: int
-) -> None:
-    """Whether or not an environment tells its frames: four channels are not a picture with transparency."""
-
-    class Channels(PixelBox):
-        def __init__(self) -> None:
-            super().__init__(frame_stack=3, tells_frame_stack=False)
-            self.observation_space = gym.spaces.Box(0, 255, (36, 36) if wraps else (channels, 36, 36), np.uint8)
-
-        def observe(self, first: bool = False) -> np.ndarray:
-            seen = super().observe(first)
-            return seen[0] if wraps else seen[:channels]
-
-    def make() -> gym.Env:
-        return gym.wrappers.FrameStackObservation(Channels(), channels) if wraps else Channels()
-
-    monkeypatch.setitem(gym.registry, TASK, gym.envs.registration.EnvSpec(TASK, make))
-    drawn: list[int] = []
-    draw = plots._picture
-    monkeypatch.setattr(plots, "_picture", lambda image: (drawn.append(image.shape[-1]), draw(image))[1])
-    folder = run_cell(only_cell(tmp_path, budget=100), tmp_path / "out")
-    assert (folder / "uncomfortable.png").is_file() and (folder / "DONE").is_file()
-    assert set(drawn) == {shown}
-
-
-@pytest.mark.usefixtures("few_rows")
-def test_failing_pictures_cost_no_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    def fail(*_: Any) -> None:
-        raise RuntimeError("no\nfont")
-
-    monkeypatch.setattr(plots, "highest_error_frames", fail)
-    cell = only_cell(tmp_path, budget=80)
-    folder = run_cell(cell, tmp_path / "out")
-    assert cell.is_done(tmp_path / "out") and (folder / "run.json").is_file()
-    assert f"{folder} is without some of its pictures: RuntimeError: no font\n" in capsys.readouterr().out
 
 
 # -------------------------------------------------------------------- visits

@@ -5,7 +5,6 @@ import re
 import subprocess
 from pathlib import Path
 
-import pytest
 import yaml
 
 from sb3_cure.experiments.run import main
@@ -53,29 +52,6 @@ def test_grids_command_of_the_manifest_is_understood(tmp_path: Path, capsys) -> 
     arguments[arguments.index("--out") + 1] = str(tmp_path)
     assert main([str(grid), *arguments[1:], "--dry-run"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 60
-
-
-@pytest.mark.parametrize(
-    ("told", "fix"),
-    [
-        ("Could not find any running Ray instance.", "start one (ray start --head)"),
-        ("InvalidAuthToken: RAY_AUTH_MODE is currently\n'disabled' (not 'token')", "set RAY_AUTH_MODE=token"),
-    ],
-)
-def test_unreachable_clusters_tell_what_to_do(
-    told: str, fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """A cluster that only wants its token is not said to be absent."""
-    ray = pytest.importorskip("ray")
-
-    def refuse(**arguments: object) -> None:
-        raise ConnectionError(told)
-
-    monkeypatch.setattr(ray, "init", refuse)
-    grid = str(ROOT / "zoo_configs" / "experiments" / "fast" / "curves.yml")
-    assert main([grid, "--engine", "ray", "--address", "10.0.0.1:6379", "--out", str(tmp_path), "--seeds", "1"]) == 2
-    (sentence,) = capsys.readouterr().err.splitlines()
-    assert "'10.0.0.1:6379'" in sentence and " ".join(told.split()) in sentence and fix in sentence
 
 
 def test_slurm_script_starts_ray_on_all_nodes_and_passes_the_grid_on(tmp_path: Path) -> None:

@@ -63,24 +63,3 @@ def test_demo_ends_at_the_time_limit() -> None:
     progress = demo.Progress(demo.make_dmc_env(demo.DOMAIN, demo.TASK, **demo.ENV_KWARGS), 10_000, seconds=1.0)
     model.learn(10_000, callback=progress)
     assert 0 < model.num_timesteps < 10_000
-
-
-def test_demo_tells_how_far_it_is(capsys: pytest.CaptureFixture) -> None:
-    """Step, returns, and what is left: the shorter of the time limit and what the remaining steps take."""
-    model = tiny_model("CnnPolicy", PixelBox()).learn(20)
-    progress = demo.Progress(demo.make_dmc_env(demo.DOMAIN, demo.TASK, **demo.ENV_KWARGS), 100, seconds=1000.0)
-    progress.init_callback(model)
-    progress.num_timesteps, progress.rows = 20, [{"task_return": 12.0}]
-    progress._tell(30.0)
-    progress._tell(990.0)
-    first, second = capsys.readouterr().out.splitlines()
-    assert "step 20 of 100" in first and "evaluated 12" in first and "2 min 00 s" in first
-    assert "0 min 10 s" in second
-
-
-def test_demo_refuses_nonsense(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """A negative time limit is one sentence, and nothing is written."""
-    with pytest.raises(SystemExit):
-        demo.main(["--out", str(tmp_path / "demo"), "--minutes", "-1"])
-    assert "--minutes is -1.0" in capsys.readouterr().err
-    assert not (tmp_path / "demo").exists()

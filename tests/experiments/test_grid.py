@@ -10,10 +10,10 @@ import pytest
 import torch as th
 import yaml
 from envs_for_tests import PixelBox
-from grids_for_tests import DMC_TASK, TASK, TINY, method, write_grid
+from grids_for_tests import DMC_TASK, TASK, method, write_grid
 
 from sb3_cure.experiments import run
-from sb3_cure.experiments.grid import Cell, GridError, check_arms, load_grid, short_name
+from sb3_cure.experiments.grid import Cell, GridError, check_arms, load_grid
 
 GRIDS = Path(__file__).parents[2] / "zoo_configs" / "experiments"
 
@@ -32,33 +32,6 @@ def test_grid_is_every_task_method_and_seed(tmp_path: Path) -> None:
     assert [(cell.seed, cell.method, cell.budget) for cell in few.cells] == [(5, "b", 40)]
     assert few.description["methods"].keys() == {"a", "b"}, "what was not chosen is still part of the experiment"
     assert few.description["seeds"] == [3, 5] and few.baseline == few.description["baseline"] == "b"
-
-
-def test_number_of_seeds_counts_those_listed(tmp_path: Path) -> None:
-    listed = write_grid(tmp_path, seeds=[5, 3, 4])
-    assert [cell.seed for cell in load_grid(listed, seeds=2).cells] == [3, 5]
-    assert [cell.seed for cell in load_grid(listed, seeds=[0]).cells] == [0]
-    with pytest.raises(GridError, match=r"--seeds asks for 4, but .* lists 3: say which"):
-        load_grid(listed, seeds=4)
-    assert [cell.seed for cell in load_grid(write_grid(tmp_path, seeds=2), seeds=3).cells] == [0, 1, 2]
-
-
-def test_overrides_leave_other_keys_of_networks_and_environment(tmp_path: Path) -> None:
-    """Else an ablation of one setting would change all others, too; arguments of a head go with the head."""
-    changed = dict(
-        policy_kwargs={"features_extractor_kwargs": {"n_filters": 8}}, env_kwargs={"image_size": 40}, srl_kwargs={}
-    )
-    zoo = dict(
-        policy_kwargs={"net_arch": [16], "features_extractor_kwargs": {"n_filters": 4, "n_layers": 2}},
-        env_kwargs={"image_size": 36, "grayscale": True},
-        srl_kwargs={"decoder_latent_lambda": 0.1},
-    )
-    path = write_grid(tmp_path, methods={"cure": {"config": "own.yml", "overrides": changed}})
-    (tmp_path / "own.yml").write_text(yaml.safe_dump({"default": zoo}))
-    (cell,) = load_grid(path).cells
-    assert cell.env_kwargs == {"image_size": 40, "grayscale": True}
-    networks = {"net_arch": [16], "features_extractor_kwargs": {"n_filters": 8, "n_layers": 2}}
-    assert (cell.arguments["policy_kwargs"], cell.arguments["srl_kwargs"]) == (networks, {})
 
 
 def test_grids_and_settings_of_the_package_by_name(tmp_path: Path) -> None:
@@ -92,25 +65,6 @@ def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int,
     assert "pretrain" not in described["none"] and grid.description["budget"] == asked
     assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}
     assert load_grid(path).description["methods"] == methods
-
-
-def test_nothing_is_proportional_to_no_training(tmp_path: Path) -> None:
-    """A file's budget of 0 is pretraining alone; another one can be asked for if there is no pretraining."""
-    pretrained = {"config": "zoo.yml", "pretrain": {"collector": "random", "budget": 100}}
-    path = write_grid(tmp_path, budget=0, methods={"p": pretrained})
-    assert [(cell.budget, cell.pretraining_steps) for cell in load_grid(path).cells] == [(0, 100)]
-    with pytest.raises(GridError, match=r"is 0 \(pretraining alone\), to which no other"):
-        load_grid(path, budget=80)
-
-
-def test_method_may_have_its_own_baseline(tmp_path: Path) -> None:
-    """Reports find it in ``grid.json``; the cells, which it does not change, are those without it."""
-    methods: dict[str, Any] = {name: {"config": "zoo.yml"} for name in "abc"}
-    cells_without = load_grid(write_grid(tmp_path, methods=methods)).cells
-    methods["c"]["baseline"] = "b"
-    grid = load_grid(write_grid(tmp_path, methods=methods))
-    assert grid.baseline == "a" and grid.description["methods"] == methods
-    assert grid.cells == cells_without
 
 
 def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:
@@ -155,7 +109,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no config": (dict(methods={"a": {}}), "methods.a.config: Field required"),
     "a method's key": (dict(methods={"a": {"config": "zoo.yml", "override": {}}}), "methods.a.override: Extra inputs"),
     "a list of overrides": (dict(methods={"a": {"config": "zoo.yml", "overrides": [1]}}), "a.overrides: .*dictionary"),
-    "an unknown algorithm": (dict(methods={"a": {"config": "zoo.yml", "algo": "ppo"}}), "a.algo: it must be one of"),
+    "an unknown algorithm": (
+        dict(methods={"a": {"config": "zoo.yml", "algo": "ppo"}}),
+        "a.algo: Input should be",
+    ),
     "a collector": (
         dict(methods={"a": {"config": "zoo.yml", "pretrain": {"collector": "task", "budget": 8}}}),
         "a.pretrain.collector: Input should be 'curious' or 'random'",
@@ -201,17 +158,8 @@ def test_settings_that_cannot_work_are_refused(
     path = write_grid(tmp_path, methods={"right": {"config": "zoo.yml"}, "wrong": method(**overrides)})
     for more in ([], ["--dry-run"]):
         assert run.main([str(path), "--out", str(tmp_path / "out"), *more]) == 2
-        assert f"method 'wrong' on {TASK} cannot work: " in capsys.readouterr().err
+        assert f"method 'wrong' on {TASK} cannot be built: " in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_environment_that_raises_is_told_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def no_display(self: PixelBox, **_: Any) -> None:
-        raise RuntimeError("no display")
-
-    monkeypatch.setattr(PixelBox, "__init__", no_display)
-    with pytest.raises(GridError, match=f"'cure' on {TASK} cannot work: RuntimeError: no display"):
-        check_arms(load_grid(write_grid(tmp_path)).cells)
 
 
 def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -225,9 +173,8 @@ def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.Captu
         "--seeds ,": "seeds: List should have at least 1 item",
         "--tasks ,": "'' is not in",
         "--seeds 0": "seeds: List should have at least 1 item",
-        "--retries 1": "--retries is of Ray: add --engine ray",
-        "--address auto": "--address is of Ray: add --engine ray",
-        "--out grid.yml/results": "cannot be written to (Not a directory): give another --out",
+        "--retries 1": "--retries needs --engine ray",
+        "--address auto": "--address needs --engine ray",
     }.items():
         try:
             status = run.main([path, "--out", str(tmp_path / "out"), *wrong.replace("grid.yml", path).split()])
@@ -246,14 +193,7 @@ def test_unlimited_episodes_are_warned_of(tmp_path: Path, capsys: pytest.Capture
     finally:
         del gym.registry["grids/LimitedBox-v0"]
     (told,) = capsys.readouterr().out.splitlines()
-    assert told.startswith(f"{TASK} tells no time limit: if its episodes do not end by themselves")
-
-
-def test_visitation_of_dictionaries_is_refused_before_training(tmp_path: Path) -> None:
-    sensors = method(policy="MultiInputPolicy", env_kwargs={"proprioception": True, "action_repeat": 40})
-    grid = load_grid(write_grid(tmp_path, kind="visitation", tasks=[DMC_TASK], methods={"sensors": sensors}))
-    with pytest.raises(GridError, match="visitation compares errors of one image or vector"):
-        check_arms(grid.cells)
+    assert told.startswith(f"{TASK} has no time limit")
 
 
 def test_checking_arms_leaves_randomness_and_memory_alone(tmp_path: Path) -> None:
@@ -301,32 +241,3 @@ def test_project_pretraining_trains_in_miniature() -> None:
         model.learn(40)
         assert model.num_timesteps == 40
         assert float(model.logger.name_to_value["train/srl_loss"]) > 0
-
-
-def test_changed_default_is_another_setting(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """Of a newer version: its seeds are not mixed with those of before; further arguments are no difference."""
-    out = tmp_path / "out"
-    arguments = [str(write_grid(tmp_path)), "--out", str(out), "--dry-run"]
-    (cell,) = load_grid(tmp_path / "grid.yml").cells
-    config = cell.config()
-    assert config["defaults"]["update"] == "joint" and config["defaults"]["target_entropy"] == "auto"
-    assert not config["defaults"].keys() & {*TINY, "seed", "env", "support_multi_env"}
-    (out / cell.folder).mkdir(parents=True)
-    kept = out / cell.folder / "config.json"
-    for defaults, status in (
-        ({"update": "joint", "gone": 1}, 0),
-        ({"update": "sequential"}, 2),
-        (None, 0),  # of before they were kept
-    ):
-        run.write_json(kept, {**config, "defaults": defaults})
-        assert run.main(arguments) == status
-    told = capsys.readouterr().err
-    assert "defaults is {'update': 'sequential'} there and {'update': 'joint'} now." in told
-
-
-def test_short_names_are_folder_names() -> None:
-    """Without module, namespace and version."""
-    assert short_name("dmc_pixels/ball_in_cup-catch-v0") == "ball_in_cup-catch"
-    assert short_name("my_module:HalfCheetah-v5") == "HalfCheetah"
