@@ -10,7 +10,6 @@ from gymnasium import spaces
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import Encoder, PixelEncoder
-from sb3_cure.networks.layers import preprocess
 from sb3_cure.srl import SRLHead
 
 
@@ -34,7 +33,7 @@ def batch_of(observations: th.Tensor, views: th.Tensor | None = None) -> Samples
 
 def encode(encoder: Encoder, views: th.Tensor) -> th.Tensor:
     """Latents of views, images in 0-255."""
-    return encoder(preprocess(views, encoder.view_space))
+    return encoder(views)
 
 
 def randomise(module: th.nn.Module, seed: int = 0) -> None:

@@ -101,17 +101,18 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
         ),
         (
             model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer),
-            f"optimize_memory_usage=True makes {buffer.__name__} return the next episode's first observation at the end "
-            "of an episode: leave replay_buffer_class out, which keeps each frame once anyway.",
+            f"optimize_memory_usage=True makes {buffer.__name__} return the next episode's first observation at the "
+            "end of an episode: leave replay_buffer_class out, which keeps each frame once anyway.",
         ),
         (
             not issubclass(model.policy_class, CuRePolicy),
-            f"the policy is {model.policy_class.__name__}, which has no shared encoder: use 'CnnPolicy', 'MlpPolicy' or "
-            "'MultiInputPolicy'.",
+            f"the policy is {model.policy_class.__name__}, which has no shared encoder: use 'CnnPolicy', 'MlpPolicy' "
+            "or 'MultiInputPolicy'.",
         ),
         (
             model.use_sde,
-            "use_sde=True explores by noise on one actor's own features, which the shared encoder changes: leave it out.",
+            "use_sde=True explores by noise on the features of one actor, which the shared encoder changes: leave it "
+            "out.",
         ),
         (
             "share_features_extractor" in model.policy_kwargs,

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -20,6 +20,7 @@ from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.envs import check_observation_space
+from sb3_cure.envs.sharing import share_environment
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -266,6 +267,10 @@ class CuReBase(OffPolicyAlgorithm):
         if seed is not None:
             self._mixer.rng = np.random.default_rng(seed)
 
+    def _train(self, gradient_steps: int, batch_size: int) -> None:
+        """Sample and update; implemented by the algorithm."""
+        raise NotImplementedError
+
     # ---------------------------------------------------------- environments
 
     @staticmethod
@@ -309,6 +314,18 @@ class CuReBase(OffPolicyAlgorithm):
             return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
         finally:
             self._overlapped = None
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        initialised = super()._init_callback(callback, progress_bar)
+        queue: list[Any] = [initialised]
+        for each in queue:
+            queue += [*getattr(each, "callbacks", []), *filter(None, [getattr(each, "callback", None)])]
+            if isinstance(each, EvalCallback) and share_environment(each.eval_env, self.env):
+                raise ValueError(
+                    "EvalCallback evaluates in the training environment, so that transitions would be stored that never "
+                    "happened: give it an eval_env of its own."
+                )
+        return initialised
 
     def _setup_learn(
         self,
@@ -385,7 +402,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._guard.report()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_guard", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]
+        made_anew = ["_guard", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]
+        return [*super()._excluded_save_params(), *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

@@ -1,8 +1,8 @@
 """CuRe: curiosity-driven representations for an off-policy actor-critic (Algorithm 1 of the paper).
 
-Reads beside SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which each
-update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says how
-several losses step the encoder that they share.
+Reads beside SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
+each update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says
+how several losses step the encoder that they share.
 """
 
 import warnings
@@ -257,7 +257,8 @@ class CuRe(CuReBase):
         """UpdateTaskAC and UpdateCuriousAC, each with its rewards and discounts."""
         if self.task:
             n_step, view = (batch, "next_observations") if batch.n_step is None else (batch.n_step, "n_step")
-            rewards = n_step.rewards if self.curiosity != "bonus" else n_step.rewards + curious_rewards
+            bonus = curious_rewards if self.curiosity == "bonus" else None
+            rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
             discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
             self._update_actor_critic("task", batch, rewards, discounts, view, metrics)
         if self._has_curious_agent:
@@ -358,13 +359,13 @@ class CuRe(CuReBase):
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]
             return policy.samples(sampled, random=False)
 
-        return RewardInputs(batch, None, read, self.replay_buffer, look_up, encode)
+        return RewardInputs(batch, None, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
 
 
 @th.no_grad()
 def _polyak_step(source: th.nn.Module, target: th.nn.Module, tau: float) -> None:
     """target <- target + tau (source - target), exactly unchanged where they are equal; buffers are copied."""
-    parameters = list(target.parameters())
+    parameters: list[th.Tensor] = list(target.parameters())
     if parameters:
         th._foreach_lerp_(parameters, list(source.parameters()), tau)
     for buffer, target_buffer in zip(source.buffers(), target.buffers(), strict=True):

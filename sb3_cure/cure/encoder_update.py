@@ -55,7 +55,7 @@ class EncoderUpdate:
     ):
         self.encoder, self.mode, self.learning_rate = encoder, mode, lr
         self._parameters = list(encoder.parameters())
-        self._make_optimizer = partial(optimizer_class, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
+        self._make_optimizer = partial(optimizer_class, self._parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
         self.weights: dict[str, float] = {}
@@ -72,7 +72,7 @@ class EncoderUpdate:
         """
         name = source if self.mode == "sequential" else "joint"
         if self._parameters and name not in self.optimizers:
-            self.optimizers[name] = self._make_optimizer(self._parameters)
+            self.optimizers[name] = self._make_optimizer()
         self.mean_squares[source], self.weights[source] = th.zeros(()), 0.0
 
     def remove_source(self, source: str) -> None:
@@ -175,7 +175,7 @@ class EncoderUpdate:
         for parameter in self._parameters:
             parameter.grad = None
         names = [name for name in self._latents if any(name in each for each in gradients)]
-        totals = [sum(each[name] for each in gradients if name in each) for name in names]
+        totals: Any = [sum(each[name] for each in gradients if name in each) for name in names]
         th.autograd.backward([self._latents[name] for name in names], totals, retain_graph=retain_graph)
         return [parameter.grad for parameter in self._parameters if parameter.grad is not None]
 

@@ -117,7 +117,7 @@ class CuRePolicy(BasePolicy):
         self.activation_fn = activation_fn
         critic_kwargs = dict(n_quantiles=n_quantiles, top_quantiles_to_drop_per_net=top_quantiles_to_drop_per_net)
         given = {name: value for name, value in critic_kwargs.items() if value is not None}
-        self._make_critic = functools.partial(critic_class, n_critics=n_critics, **given)
+        self._make_critic: Any = functools.partial(critic_class, n_critics=n_critics, **given)  # type: ignore[arg-type]
         #: Whether encoder and head stay as they are
         self.representation_frozen = False
         #: Who acts in ``predict``: ``"task"`` or ``"curious"``

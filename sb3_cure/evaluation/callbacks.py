@@ -22,7 +22,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tens
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
-from sb3_cure.data.buffers import frame_stack_of, transitions
+from sb3_cure.data.buffers import infer_frame_stack, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
@@ -349,7 +349,7 @@ class ReconstructionCallback(PeriodicCallback):
         if drawn is None:
             return
         title, *pair = drawn
-        frame_stack = self.frame_stack or frame_stack_of(self.training_env)
+        frame_stack = self.frame_stack or infer_frame_stack(self.training_env)
         seen, row = ({key: as_arrays(newest_frames(each[key], frame_stack)) for key in pair[1]} for each in pair)
         self.rows.append((self.num_timesteps, row.get("", row)))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))

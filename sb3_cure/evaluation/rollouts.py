@@ -10,12 +10,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import obs_as_tensor
 
-from sb3_cure.data.buffers import transitions, unmarked
+from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import copied, images_of, len_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
@@ -246,16 +245,6 @@ class HighestErrors(NamedTuple):
     errors: np.ndarray
     ages: np.ndarray
     mean_error: float
-
-
-def stored_places(buffer: ReplayBuffer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Places of all stored transitions, newest first.
-
-    :param buffer: A replay buffer
-    :return: Rows, environments and ages (in rows), [n] each
-    """
-    return unmarked(buffer)
 
 
 def as_arrays(observations: Any) -> Any:

@@ -280,6 +280,13 @@ class ExtractorEncoder(Encoder):
         self.trunk = ExtractorTrunk(extractor)
         self.projection = nn.Identity()
 
+    def make_projection(self) -> nn.Module:
+        """Build the projection of an actor, which reads the features as they are, as SB3's do.
+
+        :return: A module without parameters
+        """
+        return nn.Identity()
+
 
 def make_encoder(
     extractor_class: type[BaseFeaturesExtractor], observation_space: spaces.Space, **kwargs: object

@@ -127,7 +127,7 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
     segments: dict[str, list[_Segment]] = {}
     for key, ring in rings.items():
         sums = generation.sums
-        segments[key] = [_Segment(*own, sums.get(f"../segments/{own[0]}", "")) for own in state["segments"][key]]
+        segments[key] = [_Segment(*own, digest=sums.get(f"../segments/{own[0]}", "")) for own in state["segments"][key]]
         for name, first, last, digest in segments[key]:
             if not digest:
                 raise CheckpointError(f"{folder} lacks the checksum of {name}")

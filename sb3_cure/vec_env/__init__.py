@@ -1,7 +1,7 @@
 """Vectorised environments: checks, workers that may fail, and updates while workers step."""
 
 from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
-from sb3_cure.vec_env.checks import check_environments, same_environment
+from sb3_cure.vec_env.checks import check_environments
 from sb3_cure.vec_env.finite_check import BadTransitionError, FiniteCheck
 from sb3_cure.vec_env.frame_watch import FrameWatch
 from sb3_cure.vec_env.workers import EnvFaultError, FaultTolerantSubprocVecEnv, restarts_workers
@@ -15,5 +15,4 @@ __all__ = [
     "OverlappedVecEnv",
     "check_environments",
     "restarts_workers",
-    "same_environment",
 ]

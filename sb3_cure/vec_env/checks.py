@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import gymnasium as gym
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
 
@@ -28,21 +27,6 @@ def check_environments(venv: VecEnv) -> FiniteCheck:
     if isinstance(base, DummyVecEnv):
         base.envs = [env if isinstance(env, CopyObservations) else CopyObservations(env) for env in base.envs]
     return FiniteCheck(venv)
-
-
-def same_environment(first: gym.Env | VecEnv, second: gym.Env | VecEnv) -> bool:
-    """Check whether two environments, in any wrappers, share one that is stepped.
-
-    :param first: An environment, or several
-    :param second: Another one
-    :return: Whether a step of one changes the other
-    """
-    return not _innermost(first).isdisjoint(_innermost(second))
-
-
-def _innermost(env: Any) -> set[int]:
-    base = env.unwrapped
-    return {id(each.unwrapped) for each in base.envs} if isinstance(base, DummyVecEnv) else {id(base)}
 
 
 def _check_normalizer(venv: VecEnv) -> None:
