@@ -13,7 +13,7 @@ import psutil
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-from sb3_cure.persistence.checkpoints import CHUNK, CheckpointWriter
+from sb3_cure.persistence.checkpoints import CheckpointWriter
 
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
@@ -31,7 +31,7 @@ def _collect(model: CuReSAC, steps: int) -> None:
 
 def _write_frames(model: CuReSAC, n_frames: int, at_once: int, folder: Path, number: int) -> float:
     """Seconds to write so many frames, to wait for the disk, and to keep three such files."""
-    content = cast(FrameStackReplayBuffer, model.replay_buffer).frames[:n_frames].reshape(-1).data
+    content = cast(FrameStackReplayBuffer, model.replay_buffer).rings[""].frames[:n_frames].reshape(-1).data
     start = time.perf_counter()
     with (folder / f"bare-{at_once}-{number}").open("wb") as file:
         for first in range(0, len(content), at_once):

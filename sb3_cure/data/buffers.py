@@ -191,7 +191,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 self.rows[name][written] = value
             for key, ring in self.rings.items():
                 slots = self.rows[f"slots/{key}"]
-                while ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
+                while n_valid > 1 and ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
                     n_valid -= 1
             vars(self).update(pos=pos, full=full, counts=counts, _n_valid=n_valid, _breaks=False)
         except BaseException:  # KeyboardInterrupt, too
