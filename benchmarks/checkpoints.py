@@ -15,6 +15,9 @@ from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence.checkpoints import CheckpointWriter
 
+#: Bytes of frames that are written at once
+CHUNK = 2**22
+
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
 NETWORKS: dict[str, dict[str, Any]] = {
