@@ -94,7 +94,9 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.rows["actions"] = zeros(self.action_dim, dtype=self._maybe_cast_dtype(action_space.dtype))
         self.rows |= {name: zeros() for name in ("rewards", "dones", "timeouts")}
         self.rows["starts"] = zeros(dtype=bool)
-        vars(self).update({name: array for name, array in self.rows.items() if "/" not in name})
+        # SB3's names; `observations` and `next_observations` of single vectors, too
+        names = {name.removesuffix("/"): array for name, array in self.rows.items()}
+        vars(self).update({name: array for name, array in names.items() if "/" not in name})
         if frames_dir is None and psutil is not None and self.nbytes > (free := psutil.virtual_memory().available):
             warnings.warn(
                 f"The full replay buffer needs {self.nbytes / 1e9:.2f} GB of memory, but {free / 1e9:.2f} GB are "
@@ -193,7 +195,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 self.rows[name][written] = value
             for key, ring in self.rings.items():
                 slots = self.rows[f"slots/{key}"]
-                while ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
+                while n_valid > 1 and ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
                     n_valid -= 1
             vars(self).update(
                 pos=pos, full=full, counts=counts, n_added=self.n_added + 1, _n_valid=n_valid, _breaks=False

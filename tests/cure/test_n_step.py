@@ -44,7 +44,7 @@ def assert_sums_equal(ours: Any, reference: NStepReplayBuffer, n_steps: int, env
     assert_equal(found, NStep(*(getattr(expected, name) for name in NStep._fields)))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(streams())
 def test_sums_of_any_stream_equal_sb3s(twins: Twins) -> None:
     """At terminations, timeouts, the newest row, lost rows, lost steps and where a stream breaks."""

@@ -49,7 +49,7 @@ def row_of(obs: Any, next_obs: Any, n_envs: int = 1) -> Row:
 # ------------------------------------------------------------------------------------------ the same as SB3's buffers
 
 
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(streams())
 def test_any_stream_equals_sb3s(twins: Twins) -> None:
     """Breaks, jumps, ends, resets, copies and wrap-around, of images, vectors, numbers and dictionaries."""
