@@ -91,7 +91,7 @@ def on_disk(size: int, directory: str) -> dict[str, Any]:
     return {
         f"{size} transitions": {
             **summary(times["sample"]),
-            "file_gb": round(buffer.frames.nbytes / 1e9, 2),
+            "file_gb": round(buffer.rings[""].nbytes / 1e9, 2),
             "seconds_to_fill": seconds[0],
             "own_memory_full_mb": grown[0],
             "own_memory_one_round_later_mb": grown[1],

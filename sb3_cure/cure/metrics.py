@@ -64,7 +64,7 @@ class Metrics(KVWriter):
         """
         keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
         if keeps and model._n_updates % RECONSTRUCTION_INTERVAL == 1:
-            strips = reconstruction_strips(model.policy, batch, infer_frame_stack(model.get_env()))
+            strips = reconstruction_strips(model.policy, batch, infer_frame_stack(model.get_env()))  # type: ignore[arg-type]
             for key, strip in strips.items():
                 name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
                 model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))

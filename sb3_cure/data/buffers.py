@@ -1,10 +1,7 @@
 """A replay buffer that keeps each frame of stacked images once, and the look-up of stored transitions."""
 
-import math
-import os
-import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,140 +13,11 @@ from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, psutil
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
+from sb3_cure.data.frame_ring import FrameRing
 from sb3_cure.data.observations import by_key, image_spaces, rows_of
 from sb3_cure.data.samples import NStep
 
 Infos = list[dict[str, Any]]
-
-#: Share of frames beyond one per transition: an episode has one frame more than steps. With everything else that a row
-#: holds, images of 84x84 stay below 1.05 frames per transition.
-SPARE_FRAMES = 0.04
-
-
-class FrameRing:
-    """
-    Memory for the frames of one image, each kept once; the newest frame replaces the oldest one.
-
-    Frame number i, counted from the first one, lies in slot ``i % capacity``. A stack is given by the slots of its
-    frames. The ring does not know how many frames it holds: its buffer keeps that count.
-
-    :param shape: Shape of a stack, (frame_stack * c, height, width)
-    :param frame_stack: Frames per stack
-    :param n_rows: Rows of the replay buffer
-    :param n_envs: Number of environments
-    :param frames_dir: Directory for an unnamed file that holds the frames; None: memory
-    """
-
-    def __init__(self, shape: tuple[int, ...], frame_stack: int, n_rows: int, n_envs: int, frames_dir: Any = None):
-        if shape[0] % frame_stack:
-            raise ValueError(f"frame_stack={frame_stack} does not divide the {shape[0]} channels of images {shape}.")
-        self.shape, self.frame_stack, self.frames_dir = shape, frame_stack, frames_dir
-        self.frame_shape = (shape[0] // frame_stack, *shape[1:])
-        #: Frames that one ``add`` stores at most: two whole stacks per environment
-        self.max_new = 2 * frame_stack * n_envs
-        n_frames = math.ceil((1 + SPARE_FRAMES) * n_rows * n_envs)
-        self.capacity = n_frames + 2 * self.max_new + frame_stack * n_envs
-        # Zeros take no memory until they are written to. A file is made by the first `add`: acting needs none.
-        self.frames = np.zeros((self.capacity if frames_dir is None else 0, *self.frame_shape), np.uint8)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all frames of the full ring."""
-        return self.capacity * math.prod(self.frame_shape)
-
-    def reserve(self) -> None:
-        """Make the file for the frames, if there is to be one; it ends with the ring."""
-        if len(self.frames) > 0:
-            return
-        Path(self.frames_dir).mkdir(exist_ok=True)
-        with tempfile.TemporaryFile(dir=self.frames_dir) as file:
-            if hasattr(os, "posix_fallocate"):  # writing to a mapped file on a full disk would kill the process
-                os.posix_fallocate(file.fileno(), 0, self.nbytes)
-            self.frames = np.memmap(file, np.uint8, "w+", shape=(self.capacity, *self.frame_shape))
-
-    def store(self, obs: ndarray, next_obs: ndarray, tails: ndarray | None, count: int) -> tuple[ndarray, ndarray, int]:
-        """
-        Store what is new in the stacks of one row, in slots that no row reads.
-
-        :param obs: Stacks, uint8 [n_envs, *shape]
-        :param next_obs: Their successors
-        :param tails: Slots of the successors in the row before, [n_envs, frame_stack]; None: there is no such row
-        :param count: Frames stored before
-        :return: Slots of stacks and successors, [n_envs, 2, frame_stack]; whether each stack is the successor in the
-            row before, [n_envs]; frames stored after
-        """
-        self.reserve()
-        stacks, successors = (
-            np.ascontiguousarray(each).reshape(-1, self.frame_stack, *self.frame_shape) for each in (obs, next_obs)
-        )
-        slots = np.zeros((len(stacks), 2, self.frame_stack), np.int32)
-        continues = np.zeros(len(stacks), bool)
-        for i, (stack, successor) in enumerate(zip(stacks, successors, strict=True)):
-            if tails is not None:
-                continues[i] = np.array_equal(self.frames[tails[i]], stack)
-            # A shared frame must outlive this `add` and the next one.
-            if continues[i] and self._ages(tails[i], count).max() < self.capacity - 2 * self.max_new:  # type: ignore[index]
-                slots[i, 0] = tails[i]  # type: ignore[index]
-            else:
-                slots[i, 0], count = self._put(stack, count)
-            if np.array_equal(successor[:-1], stack[1:]):
-                slots[i, 1, :-1] = slots[i, 0, 1:]
-                slots[i, 1, -1:], count = self._put(successor[-1:], count)
-            else:
-                slots[i, 1], count = self._put(successor, count)
-        return slots, continues, count
-
-    def _put(self, frames: ndarray, count: int) -> tuple[list[int], int]:
-        """Store frames, of which those that repeat the one before (as after a reset) are stored once."""
-        slots: list[int] = []
-        for i, frame in enumerate(frames):
-            if i == 0 or not np.array_equal(frame, frames[i - 1]):
-                self.frames[count % self.capacity] = frame
-                count += 1
-            slots.append((count - 1) % self.capacity)
-        return slots, count
-
-    def _ages(self, slots: ndarray, count: int) -> ndarray:
-        """How many frames were stored after those in the slots."""
-        return (count - 1 - slots) % self.capacity
-
-    def is_lost(self, slots: ndarray, count: int) -> bool:
-        """
-        Whether the next ``add`` may overwrite a frame of a row.
-
-        :param slots: Slots of the row, [n_envs, 2, frame_stack]
-        :param count: Frames stored so far
-        :return: Whether it may
-        """
-        return bool(self._ages(slots[:, 0, 0], count).max() >= self.capacity - self.max_new)
-
-    def stacks(self, slots: ndarray) -> ndarray:
-        """
-        Stacks by the slots of their frames.
-
-        :param slots: [..., frame_stack]
-        :return: uint8 [..., *shape]
-        """
-        # `index_select` is threaded, unlike the fancy indexing of NumPy.
-        frames = th.from_numpy(self.frames).index_select(0, th.from_numpy(slots.ravel()))
-        return frames.view(*slots.shape[:-1], *self.shape).numpy()
-
-    def pieces(self, first: int, last: int, max_bytes: int = 2**22) -> Iterator[ndarray]:
-        """
-        Memory of the frames with the numbers ``first`` to ``last - 1``, to be read or written.
-
-        :param first: Number of the first frame
-        :param last: Number after the last frame
-        :param max_bytes: Size of a piece (at least one frame)
-        :return: Contiguous views, uint8 [n * c * height * width]
-        """
-        self.reserve()
-        at_once = max(max_bytes // math.prod(self.frame_shape), 1)
-        while first < last:
-            start = first % self.capacity
-            piece = self.frames[start : min(start + min(last - first, at_once), self.capacity)]
-            yield piece.reshape(-1)
-            first += len(piece)
 
 
 class FrameStackReplayBuffer(ReplayBuffer):
@@ -209,6 +77,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage, self.handle_timeout_termination = False, handle_timeout_termination
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
+        self._spaces = by_key(getattr(observation_space, "spaces", observation_space))
+        self._shapes = {key: (n_envs, *shape) for key, shape in by_key(self.obs_shape).items()}
         self.reset()
 
         def zeros(*shape: int, dtype: Any = np.float32) -> ndarray:
@@ -218,7 +88,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         for key, space in self._spaces.items():
             if key not in self.rings:
                 for name in ("observations", "next_observations"):
-                    self.rows[f"{name}/{key}"] = zeros(*by_key(self.obs_shape)[key], dtype=space.dtype)
+                    self.rows[f"{name}/{key}"] = zeros(*self._shapes[key][1:], dtype=space.dtype)
         self.rows["actions"] = zeros(self.action_dim, dtype=self._maybe_cast_dtype(action_space.dtype))
         self.rows |= {name: zeros() for name in ("rewards", "dones", "timeouts")}
         self.rows["starts"] = zeros(dtype=bool)
@@ -232,10 +102,6 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     #: Whether a row's observation is not the successor stored in the row before, bool [buffer_size, n_envs]
     starts: ndarray
-
-    @property
-    def _spaces(self) -> dict[str, spaces.Space]:
-        return by_key(getattr(self.observation_space, "spaces", self.observation_space))
 
     @property
     def nbytes(self) -> int:
@@ -301,7 +167,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         checked = {}
         for key, space in self._spaces.items():
             array = np.asarray(by_key(observations)[key])
-            shape = (self.n_envs, *by_key(self.obs_shape)[key])
+            shape = self._shapes[key]
             what = f"the observation {key!r}" if key else "the observation"
             if (array.size != self.n_envs) if isinstance(space, spaces.Discrete) else (array.shape != shape):
                 raise ValueError(f"{what} has shape {array.shape}, but the replay buffer stores {shape}.")
@@ -325,7 +191,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 self.rows[name][written] = value
             for key, ring in self.rings.items():
                 slots = self.rows[f"slots/{key}"]
-                while ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
+                while n_valid > 1 and ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
                     n_valid -= 1
             vars(self).update(pos=pos, full=full, counts=counts, _n_valid=n_valid, _breaks=False)
         except BaseException:  # KeyboardInterrupt, too
@@ -375,7 +241,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         parts: dict[str, Any] = {}
         for key in self._spaces:
             if key in self.rings:  # of both at once
-                parts[key] = self.rings[key].stacks(self.rows[f"slots/{key}"][rows, env_inds, which].swapaxes(0, 1))
+                parts[key] = self.rings[key].stacks(self.rows[f"slots/{key}"][rows, env_inds].swapaxes(0, 1)[which])
             else:
                 names = ("observations", "next_observations")[which]
                 parts[key] = [self.rows[f"{name}/{key}"][rows, env_inds] for name in names]

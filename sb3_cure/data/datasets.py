@@ -166,7 +166,8 @@ def fill(buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[
         present = [each for each in row if each is not None]
         n_rows, n_added = n_rows + 1, n_added + len(present)
         obs, next_obs, actions, rewards, dones, infos = zip(*(each or present[0] for each in row), strict=True)
-        buffer.add(stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)), list(infos))  # type: ignore[call-arg]
+        columns: Any = (stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)), list(infos))
+        buffer.add(*columns)
     if n_rows > buffer.buffer_size:
         side_by_side = f" (those of {buffer.n_envs} environments side by side)" if buffer.n_envs > 1 else ""
         warnings.warn(

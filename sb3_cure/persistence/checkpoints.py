@@ -10,7 +10,8 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer
+from sb3_cure.data.buffers import FrameStackReplayBuffer
+from sb3_cure.data.frame_ring import FrameRing
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
 from sb3_cure.persistence.files import flush_to_disk

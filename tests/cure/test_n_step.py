@@ -1,164 +1,84 @@
-"""Returns of several steps for the task's critic, beside a curious one of single steps."""
+"""Returns of several steps for the task's critic, while everything else sees single steps."""
 
-import warnings
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from dictionaries_for_tests import sensor_model
-from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
-from hypothesis import HealthCheck, event, given, settings
-from hypothesis import strategies as st
+from envs_for_tests import PixelBox, VectorBox, tiny_model
+from hypothesis import HealthCheck, given, settings
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
-from test_buffers import BETWEEN, KINDS, PALETTE, Twins, assert_equal, random_events, seeded_sample
+from twins_for_tests import Twins, assert_equal, seeded_sample, streams
 from updates_for_tests import ALGORITHMS
 
 from sb3_cure import CuReSAC
-from sb3_cure.data.buffers import FrameStackReplayBuffer, SkippingReplayBuffer, SkipsMarked
-from sb3_cure.data.samples import Samples
+from sb3_cure.data.buffers import FrameStackReplayBuffer
+from sb3_cure.data.samples import NStep, Samples
 
 GAMMA = 0.9
+pytestmark = pytest.mark.filterwarnings("ignore:Frames do not slide")
 both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
 
 
 def sb3s(twins: Twins, n_steps: int) -> NStepReplayBuffer:
-    """SB3's buffer with what its twin holds. It knows neither marks nor streams that break: there it gets timeouts."""
-    source = twins.sb3
+    """SB3's n-step buffer with what its twin holds, and timeouts where the stream breaks, of which it does not know."""
+    source: Any = twins.sb3
     arguments = (source.buffer_size * twins.n_envs, twins.space, twins.action_space, "cpu", twins.n_envs)
     buffer = NStepReplayBuffer(*arguments, n_steps=n_steps, gamma=GAMMA)
     names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full")
     vars(buffer).update({name: getattr(source, name) for name in names})
-    following = np.roll(np.arange(source.buffer_size), -1)
-    breaks = (source.next_observations != source.observations[following]).any(axis=(2, 3, 4))
-    buffer.timeouts = np.where((breaks | twins.ours.marked[following]) & (source.dones == 0), 1, source.timeouts)
+    breaks = np.roll(twins.ours.starts, -1, axis=0)
+    buffer.timeouts = np.where(breaks & (source.dones == 0), 1, source.timeouts)
     return buffer
 
 
-def assert_sums_equal(ours: SkipsMarked, reference: NStepReplayBuffer, n_steps: int, env: Any = None) -> None:
+def assert_sums_equal(ours: Any, reference: NStepReplayBuffer, n_steps: int, env: Any = None) -> None:
     """Of the batch that was sampled last."""
-    assert ours.last_sampled is not None
     rows, env_inds = ours.last_sampled
     with mock.patch("numpy.random.randint", return_value=env_inds):
         expected = reference._get_samples(rows, env)
-    ahead = ours.look_ahead(n_steps, GAMMA, env)
-    names = {"rewards": 0, "next_observations": 0, "dones": 0, "discounts": 0}
-    for name in names:
-        found, there = ahead[f"n_step_{name}"], getattr(expected, name)
-        assert (found.dtype, found.shape) == (there.dtype, there.shape), name
-        assert th.equal(found, there), name
-    assert ahead.keys() == {f"n_step_{name}" for name in names}
+    found = ours.n_step(n_steps, GAMMA, env)
+    assert_equal(found, NStep(*(getattr(expected, name) for name in NStep._fields)))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    st.data(), st.integers(1, 24), st.integers(1, 3), st.integers(1, 3), st.integers(2, 5), st.sampled_from(KINDS[:5])
-)
-def test_sums_of_any_stream_equal_sb3s(
-    data: st.DataObject, buffer_size: int, n_envs: int, frame_stack: int, n_steps: int, events: tuple[str, ...]
-) -> None:
-    """At terminations, timeouts, the ring's end, marks, lost rows and where a stream breaks."""
-    twins = Twins(buffer_size, n_envs, frame_stack)
-    code = st.integers(0, PALETTE**frame_stack - 1)
-    row = st.lists(st.tuples(st.sampled_from(events), code, code), min_size=n_envs, max_size=n_envs)
-    length = data.draw(st.integers(1, 40))
-    for between, envs in data.draw(
-        st.lists(st.tuples(st.sampled_from(BETWEEN), row), min_size=length, max_size=length)
-    ):
-        if between == "learn again":
-            twins.relearn(envs[0][1])
-        elif between == "save and load":
-            twins.save_and_load()
-        twins.step(envs)
-    event(f"wrapped: {twins.ours.full}, lost: {twins.ours.size() < twins.sb3.size()}, {len(twins.faulty) > 0}")
-    if twins.ours.marked[twins.valid_rows()].all():
-        return
-    for buffer in (twins.ours, twins.skipping):
-        seeded_sample(buffer, 40)
-        assert_sums_equal(buffer, sb3s(twins, n_steps), n_steps)
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(streams())
+def test_sums_of_any_stream_equal_sb3s(twins: Twins) -> None:
+    """At terminations, timeouts, the newest row, lost rows, lost steps and where a stream breaks."""
+    batch = seeded_sample(twins.ours, 40)
+    if twins.kind != "dictionary":  # which SB3's has not
+        assert_sums_equal(twins.ours, sb3s(twins, 3), 3)
+    one = twins.ours.n_step(1, GAMMA)
+    assert_equal(batch._replace(**one._asdict()), batch._replace(discounts=th.full((40, 1), GAMMA)))
 
 
-def test_sums_of_dictionaries() -> None:
-    """Of several images and a vector; where the stream breaks without an end, too."""
-    model = sensor_model(n_steps=3, gamma=GAMMA).learn(30)
-    model.env.reset()  # type: ignore[union-attr]
-    model._last_obs = None
-    model.learn(40, reset_num_timesteps=False)
-    buffer: Any = model.replay_buffer
-    rows = np.arange(70)
-    buffer.last_sampled = rows, np.zeros(70, int)
-    ahead = buffer.look_ahead(3, GAMMA)
-    for row in rows:
-        total, last = 0.0, row
-        for power in range(3):
-            last = row + power
-            total += GAMMA**power * float(buffer.rewards[last, 0])
-            if buffer.dones[last, 0] or last in (29, 69):
-                break
-        assert float(ahead["n_step_rewards"][row]) == pytest.approx(total, rel=1e-5)
-        _, expected = buffer.observations_at(np.array([last]), np.array([0]))
-        for key, part in expected.items():
-            np.testing.assert_array_equal(ahead["n_step_next_observations"][key][row].numpy(), part[0])
-
-
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_draws_are_sb3s(n_envs: int) -> None:
-    """With equal seeds, of a stream without marks: the same transitions, and the same sums."""
-    twins = Twins(40, n_envs, frame_stack=2)
-    for _ in range(70):
-        twins.step(random_events(twins.rng, n_envs, ("step",) * 40 + ("terminate", "truncate")))
-    expected = seeded_sample(sb3s(twins, 3), 64)
-    for buffer in (twins.ours, twins.skipping):
-        batch = seeded_sample(buffer, 64)
-        ahead = buffer.look_ahead(3, GAMMA)
-        assert_equal(batch._replace(**{name.removeprefix("n_step_"): value for name, value in ahead.items()}), expected)
-        assert set(ahead["n_step_discounts"].flatten().tolist()) == set(
-            (GAMMA ** np.arange(1, 4, dtype=np.float32)).tolist()
-        )
-
-
-def test_one_stack_is_gathered_per_sum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The observation of what comes last is never read."""
-    model = tiny_model("CnnPolicy", PixelBox(), n_steps=3, srl=None, curiosity=None, augmentation="shift").learn(10)
-    buffer: Any = model.replay_buffer
-    buffer.sample(8)
-    gathered, gather = [], th.Tensor.index_select
-    monkeypatch.setattr(th.Tensor, "index_select", lambda *args: gathered.append(len(args[2])) or gather(*args))
-    buffer.look_ahead(3, GAMMA)
-    assert gathered == [8 * buffer.frame_stack]
-
-
-def test_sums_end_before_a_mark() -> None:
-    """The last good observation is bootstrapped from, and nothing of the marked transition is in the sum."""
+def test_sums_end_before_a_lost_step() -> None:
+    """Also where the observation stands still, and only ``break_stream`` can know."""
     space = VectorBox().observation_space
-    buffer = SkippingReplayBuffer(10, space, VectorBox().action_space, "cpu")
+    buffer = FrameStackReplayBuffer(10, space, VectorBox().action_space, "cpu", frame_stack=1)
     for t in range(6):
-        obs, next_obs = (np.full((1, 2), each, np.float32) for each in (t, t + 1))
-        infos = [{"env_fault": "broken"} if t == 3 else {}]
-        buffer.add(obs, next_obs, np.zeros((1, 2)), np.array([10.0**t]), np.zeros(1), infos)
-    buffer.last_sampled = np.array([0, 1, 2, 4]), np.zeros(4, int)
-    ahead = buffer.look_ahead(5, 1.0)
-    assert ahead["n_step_rewards"].flatten().tolist() == [111, 110, 100, 110_000]
-    assert ahead["n_step_next_observations"][:, 0].tolist() == [3, 3, 3, 6]
-    assert ahead["n_step_dones"].sum() == 0
+        if t == 3:
+            buffer.break_stream()
+        still = np.zeros((1, 2), np.float32)
+        buffer.add(still, still, np.zeros((1, 2)), np.array([10.0**t]), np.zeros(1), [{}])
+    buffer.last_sampled = np.array([0, 1, 2, 3]), np.zeros(4, int)
+    found = buffer.n_step(5, 1.0)
+    assert found.rewards.flatten().tolist() == [111, 110, 100, 111_000] and found.dones.sum() == 0
 
 
 def test_normalised_rewards_and_observations() -> None:
     """Each reward is normalised before it is discounted, as SB3 does."""
     venv = VecNormalize(make_vec_env(lambda: VectorBox(), 2))
-    model = tiny_model("MlpPolicy", venv, n_steps=3, gamma=GAMMA).learn(40)
-    ours: Any = model.replay_buffer
-    reference = NStepReplayBuffer(
-        ours.buffer_size * 2, ours.observation_space, ours.action_space, "cpu", 2, n_steps=3, gamma=GAMMA
-    )
-    for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "pos", "full"):
+    ours: Any = tiny_model("MlpPolicy", venv, n_steps=3, gamma=GAMMA).learn(40).replay_buffer
+    arguments = (ours.buffer_size * 2, ours.observation_space, ours.action_space, "cpu", 2)
+    reference = NStepReplayBuffer(*arguments, n_steps=3, gamma=GAMMA)
+    for name in ("actions", "rewards", "dones", "timeouts", "pos", "full"):
         setattr(reference, name, getattr(ours, name))
-    assert type(ours) is SkippingReplayBuffer
+    for name in ("observations", "next_observations"):
+        setattr(reference, name, ours.rows[f"{name}/"])
     ours.sample(50, env=venv)
     assert_sums_equal(ours, reference, 3, venv)
 
@@ -205,8 +125,8 @@ def test_task_bootstraps_after_n_steps_and_curiosity_after_one(
     passes: list[int] = []
     model.policy.encoder_target.register_forward_hook(lambda *args: passes.append(1))
     batch, targets = recorded_targets(model, monkeypatch)
-    assert batch.n_step_rewards is not None and batch.n_step_next_observations is not None
-    assert not th.equal(batch.n_step_next_observations, batch.next_observations)
+    assert batch.n_step is not None
+    assert not th.equal(batch.n_step.next_observations, batch.next_observations)
     assert len(targets) == len(passes) == (1 if curiosity is None else 2), "one pass more, if one-step returns are read"
 
     def soft_value(observations: th.Tensor, agent: Any) -> th.Tensor:
@@ -215,8 +135,8 @@ def test_task_bootstraps_after_n_steps_and_curiosity_after_one(
             log_prob = model.policy.encoder.trunk(seen).mean(1, keepdim=True)
             return model.policy.encoder_target(seen).mean(1, keepdim=True) - agent.temperature() * log_prob
 
-    discounts = (1 - batch.n_step_dones) * batch.n_step_discounts  # type: ignore[operator]
-    expected = batch.n_step_rewards + discounts * soft_value(batch.n_step_next_observations, model.policy.task)
+    discounts = (1 - batch.n_step.dones) * batch.n_step.discounts
+    expected = batch.n_step.rewards + discounts * soft_value(batch.n_step.next_observations, model.policy.task)
     th.testing.assert_close(targets[0], expected)
     if curiosity is not None:
         after = model.curiosity_gamma * soft_value(batch.next_observations, model.policy.curious)
@@ -237,67 +157,12 @@ def test_heads_and_rewards_see_single_steps(algorithm: str, monkeypatch: pytest.
         np.random.seed(0)
         batches.append(recorded_targets(model, monkeypatch)[0])
     one, three = batches
-    assert one.n_step_rewards is one.n_step_next_observations is one.n_step_dones is one.n_step_discounts is None
+    assert one.n_step is None and three.n_step is not None
     for name in ("observations", "actions", "next_observations", "dones", "rewards"):
         assert th.equal(getattr(one, name), getattr(three, name)), name
-
-
-@both_algorithms
-def test_frames_are_kept_once_with_several_steps(algorithm: str) -> None:
-    """Nothing more is stored, and SB3 does not warn of a buffer that it does not know."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        one, three = (tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], n_steps=n) for n in (1, 3))
-    assert not [str(each.message) for each in caught if "n_steps" in str(each.message)]
-    assert type(three.replay_buffer) is FrameStackReplayBuffer
-    assert three.replay_buffer.nbytes == one.replay_buffer.nbytes  # type: ignore[union-attr]
-    assert type(tiny_model("MlpPolicy", VectorBox(), n_steps=3).replay_buffer) is SkippingReplayBuffer
 
 
 def test_buffer_that_looks_no_steps_ahead_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="is ignored because a custom `replay_buffer_class`"):
         model = tiny_model("MlpPolicy", VectorBox(), n_steps=3, replay_buffer_class=ReplayBuffer)
     model.learn(14)
-
-
-@both_algorithms
-def test_save_and_load_with_several_steps(algorithm: str, tmp_path: Path) -> None:
-    """An equal next update, also with other returns asked for."""
-    cls = ALGORITHMS[algorithm]
-    model = tiny_model("CnnPolicy", PixelBox(), cls, n_steps=3).learn(20)
-    model.save(tmp_path / "model")
-    model.save_replay_buffer(tmp_path / "buffer")
-    states = []
-    for changes in ({}, {}, {"n_steps": 2}, {"gamma": 0.5}):
-        loaded = cls.load(tmp_path / "model", env=PixelBox(), **changes)
-        loaded.load_replay_buffer(tmp_path / "buffer")
-        loaded.set_logger(model.logger)
-        np.random.seed(0)
-        th.manual_seed(0)
-        loaded.train(2, 8)
-        states.append(state_of(loaded))
-    assert differences(states[0], states[1]) == []
-    assert differences(states[0], states[2]) and differences(states[0], states[3])
-
-
-def test_single_steps_of_discrete_observations_stay_single() -> None:
-    """SB3's own n-step buffer would show heads and the curious agent what came n steps later."""
-    model = tiny_model("MlpPolicy", Numbers(), n_steps=3, srl="forward").learn(30)
-    batch = model.policy.samples(model.replay_buffer.sample(20))  # type: ignore[union-attr]
-    assert isinstance(model.replay_buffer, SkipsMarked)
-    assert ((batch.next_observations - batch.observations) % 5 == 1).all()
-
-
-class Numbers(gym.Env):
-    """Counts to 5 again and again."""
-
-    observation_space = gym.spaces.Discrete(5)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-
-    def reset(self, **kwargs: Any) -> Any:
-        self.n = 0
-        return 0, {}
-
-    def step(self, action: np.ndarray) -> Any:
-        self.n += 1
-        return self.n % 5, 1.0, False, self.n >= 12, {}

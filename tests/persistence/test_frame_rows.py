@@ -1,4 +1,4 @@
-"""What files hold of a frame-stack buffer: whatever stream it has seen, it goes on alike."""
+"""What files hold of a frame-stack buffer: it comes back whole after any stream, and others are refused."""
 
 import copy
 import io
@@ -6,34 +6,22 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
-from test_buffers import ACTIONS, Twins, assert_equal, random_events, seeded_sample
+from twins_for_tests import ACTIONS, EVENTS, Twins, random_events, streams
 
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-from sb3_cure.persistence import read_state, write_state
+from sb3_cure.persistence import ArchiveError, read_state, write_state
 from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
 
-FAULTS = ("step", "step", "terminate", "break", "jump", "fault", "fault")
-
-
-def filled(data: st.DataObject) -> Twins:
-    """A buffer after a random stream with faults, which was reset now and then."""
-    twins = Twins(data.draw(st.integers(1, 12)), data.draw(st.integers(1, 3)), data.draw(st.integers(1, 3)))
-    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
-    kinds = data.draw(st.sampled_from([FAULTS, ("fault",), ("break", "jump")]))
-    for _ in range(data.draw(st.integers(0, 30))):
-        if rng.random() < 0.03:
-            twins.ours.reset()
-        twins.step(random_events(rng, twins.n_envs, kinds))
-    return twins
+pytestmark = pytest.mark.filterwarnings("ignore:Frames do not slide")
 
 
 def model_of(twins: Twins) -> Any:
-    """What is asked of the model that a buffer is for."""
+    """The part of a model that a buffer is made from."""
     return SimpleNamespace(
-        replay_buffer_class=FrameStackReplayBuffer,
-        replay_buffer_kwargs={"frame_stack": twins.frame_stack},
+        replay_buffer_class=type(twins.ours),
+        replay_buffer_kwargs={"frame_stack": twins.ours.frame_stack},
         observation_space=twins.space,
         action_space=ACTIONS,
         n_envs=twins.n_envs,
@@ -42,33 +30,59 @@ def model_of(twins: Twins) -> Any:
     )
 
 
-def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
-
-
-def flat(buffer: FrameStackReplayBuffer) -> dict[str, Any]:
-    """State by name; without the slots of marked transitions, which are whatever was there."""
-    state = buffer_state(buffer)
-    arrays, counters = state.pop("arrays"), state.pop("counters")
-    arrays["frame_slots"] = np.where(arrays["marked"][..., None, None], 0, arrays["frame_slots"])
-    return {**state, **arrays, **counters}
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.data())
-def test_rows_come_back_as_written(data: st.DataObject) -> None:
-    twins, file = filled(data), io.BytesIO()
+def through_a_file(twins: Twins, change: Any = lambda state: None, model: Any = None) -> FrameStackReplayBuffer:
+    file = io.BytesIO()
     write_state(file, buffer_state(twins.ours))
-    loaded: Any = buffer_from_state(model_of(twins), read_state(file), "the file")
-    assert same(flat(loaded), flat(twins.ours))
-    if loaded.size() and not loaded.marked[twins.valid_rows()].all():
-        assert_equal(seeded_sample(loaded), seeded_sample(twins.ours))
-    events = [random_events(np.random.default_rng(i), twins.n_envs, FAULTS) for i in range(20)]
+    state = read_state(file)
+    change(state)
+    return buffer_from_state(model or model_of(twins), state, "the file")  # type: ignore[return-value]
+
+
+def same(one: FrameStackReplayBuffer, other: FrameStackReplayBuffer) -> bool:
+    first, second = one.state_dict(), other.state_dict()
+    arrays = first["arrays"].keys() == second["arrays"].keys()
+    arrays &= all(np.array_equal(array, second["arrays"][name]) for name, array in first["arrays"].items())
+    return arrays and first["counters"] == second["counters"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(streams())
+def test_rows_come_back_as_written(twins: Twins) -> None:
+    """Of any kind of observation, and the stream continues alike."""
+    loaded = through_a_file(twins)
+    assert same(loaded, twins.ours)
     other = copy.deepcopy(twins)
     other.ours = loaded
     for each in (twins, other):
         each.action_space.seed(0)
-        for row in events:
-            each.step(row)
-    assert same(flat(loaded), flat(twins.ours))
-    assert np.array_equal(loaded.frames, twins.ours.frames)
+        for i in range(20):
+            each.step(random_events(np.random.default_rng(i), twins.n_envs, EVENTS))
+        each.check()
+    assert same(other.ours, twins.ours)
+
+
+CHANGES: dict[str, Any] = {
+    "frames missing": lambda state: state["arrays"].pop("frames/goal"),
+    "rows missing": lambda state: state["arrays"].pop("rewards"),
+    "vectors missing": lambda state: state["arrays"].pop("observations/joints"),
+    "another array": lambda state: state["arrays"].update(more=np.zeros(3)),
+    "fewer rows": lambda state: state["counters"].update(pos=3, full=False),
+    "counts missing": lambda state: state["counters"].pop("counts"),
+    "another class": lambda state: state.update({"class": "ReplayBuffer"}),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_damaged_buffers_are_refused(name: str) -> None:
+    twins = Twins(12, kind="dictionary")
+    for _ in range(14):
+        twins.step([("step", 3, 0)])
+    with pytest.raises(ArchiveError, match="the file"):
+        through_a_file(twins, CHANGES[name])
+
+
+def test_buffer_of_other_environments_is_refused() -> None:
+    twins, other = Twins(12), Twins(12, kind="vector")
+    twins.step([("step", 3, 0)])
+    with pytest.raises(ArchiveError, match=r"does not fit this model .*missing.* same settings and environment"):
+        through_a_file(twins, model=model_of(other))
