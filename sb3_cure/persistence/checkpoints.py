@@ -88,8 +88,8 @@ class CheckpointWriter:
             digest = hashlib.sha256()
             with path.open("wb") as file:
                 for piece in ring.pieces(first, last):
-                    digest.update(piece)
-                    file.write(piece)
+                    digest.update(piece.data)
+                    file.write(piece.data)
             flush_to_disk(path)
             segments.append(_Segment(path.name, first, last, digest.hexdigest()))
         return segments
@@ -126,8 +126,10 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
     rings = rings_of(model.replay_buffer)
     segments: dict[str, list[_Segment]] = {}
     for key, ring in rings.items():
-        sums = generation.sums
-        segments[key] = [_Segment(*own, sums.get(f"../segments/{own[0]}", "")) for own in state["segments"][key]]
+        segments[key] = [
+            _Segment(name, first, last, generation.sums.get(f"../segments/{name}", ""))
+            for name, first, last in state["segments"][key]
+        ]
         for name, first, last, digest in segments[key]:
             if not digest:
                 raise CheckpointError(f"{folder} lacks the checksum of {name}")
@@ -135,7 +137,7 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
             with (writer.generations.segments / name).open("rb") as file:
                 file.seek((kept - first) * int(np.prod(ring.frame_shape)))
                 for piece in ring.pieces(kept, last):
-                    file.readinto(piece)
+                    file.readinto(piece.data)
     writer.remember(rings, segments)
     return state
 

@@ -488,8 +488,7 @@ BUFFERS: dict[str, Callable[[], bytes]] = {
     "another size": changed_buffer(lambda state: state.update(size=31)),
     "a row outside": changed_buffer(lambda state: state["counters"].update(pos=10**6)),
     "full although it is not": changed_buffer(lambda state: state["counters"].update(full=True)),
-    "fewer frames": changed_buffer(lambda state: state["counters"].update(_n_frames=3)),
-    "another ring": changed_buffer(lambda state: state.update(frame_capacity=10**6)),
+    "fewer frames": changed_buffer(lambda state: state["counters"].update(counts={"": 3})),
     "rows missing": changed_buffer(lambda state: state["arrays"].pop("rewards")),
     "rows of others": changed_buffer(lambda state: state["arrays"].update(rewards=state["arrays"]["actions"])),
 }
