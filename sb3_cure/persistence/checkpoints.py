@@ -88,8 +88,8 @@ class CheckpointWriter:
             digest = hashlib.sha256()
             with path.open("wb") as file:
                 for piece in ring.pieces(first, last):
-                    digest.update(piece.data)
-                    file.write(piece.data)
+                    digest.update(piece)
+                    file.write(piece)
             flush_to_disk(path)
             segments.append(_Segment(path.name, first, last, digest.hexdigest()))
         return segments
@@ -137,7 +137,7 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
             with (writer.generations.segments / name).open("rb") as file:
                 file.seek((kept - first) * int(np.prod(ring.frame_shape)))
                 for piece in ring.pieces(kept, last):
-                    file.readinto(piece.data)
+                    file.readinto(piece)
     writer.remember(rings, segments)
     return state
 
