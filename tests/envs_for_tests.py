@@ -240,6 +240,8 @@ def differences(first: Any, second: Any, path: str = "") -> list[str]:
         return [] if first.dtype == second.dtype and th.equal(first, second) else [path]
     if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         return [] if first.dtype == second.dtype and np.array_equal(first, second) else [path]
+    if isinstance(first, np.random.Generator) and isinstance(second, np.random.Generator):
+        return differences(first.bit_generator.state, second.bit_generator.state, path)
     return [] if first == second else [path]
 
 

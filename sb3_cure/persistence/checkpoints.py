@@ -126,8 +126,10 @@ def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter
     rings = rings_of(model.replay_buffer)
     segments: dict[str, list[_Segment]] = {}
     for key, ring in rings.items():
-        sums = generation.sums
-        segments[key] = [_Segment(*own, digest=sums.get(f"../segments/{own[0]}", "")) for own in state["segments"][key]]
+        segments[key] = [
+            _Segment(name, first, last, generation.sums.get(f"../segments/{name}", ""))
+            for name, first, last in state["segments"][key]
+        ]
         for name, first, last, digest in segments[key]:
             if not digest:
                 raise CheckpointError(f"{folder} lacks the checksum of {name}")

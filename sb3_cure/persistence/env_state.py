@@ -200,7 +200,7 @@ def _layers(outermost: Any) -> list[Any]:
 
 
 def _layer_states(layers: list[Any]) -> list[dict[str, Any]]:
-    states = [{"fingerprint": _fingerprint(layer), "error": None} for layer in layers]
+    states: list[dict[str, Any]] = [{"fingerprint": _fingerprint(layer), "error": None} for layer in layers]
     kept: list[Any] = []  # of foreign layers, as one may hold what belongs to another
     for layer, state in zip(layers, states, strict=True):
         try:

@@ -5,8 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.persistence.archive import Stateful
@@ -44,8 +46,16 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
         # Before the random streams, which a worker that is replaced meanwhile may use
         "environments": vec_env_state(model.env),
         "callbacks": [callback_state(callback) for callback in run.callbacks],
+        "recorded": _recorded(model.logger),
         "random": random_state(model),
     }
+
+
+def _recorded(logger: Logger) -> list[Any]:
+    """List what was recorded and not yet logged, which callbacks may read."""
+    kinds = bool | int | float | str | np.number | th.Tensor
+    values = {key: value for key, value in logger.name_to_value.items() if isinstance(value, kinds)}
+    return [[k, v, logger.name_to_count.get(k, 0), logger.name_to_excluded.get(k, ())] for k, v in values.items()]
 
 
 def random_state(model: OffPolicyAlgorithm) -> dict[str, Any]:
@@ -119,6 +129,10 @@ class Resumption:
         model.action_noise = self._kept["action_noise"]
         if self._continued:
             model._num_timesteps_at_start = self._kept["_num_timesteps_at_start"]
+        logger = model.logger
+        for name, value, count, excluded in self.state["recorded"]:
+            logger.name_to_value[name], logger.name_to_count[name] = value, count
+            logger.name_to_excluded[name] = excluded
         saved = list(self.state["callbacks"])
         for callback in callbacks:
             own = next((each for each in saved if each["class"] == type(callback).__name__), None)

@@ -169,7 +169,7 @@ def test_temperature_given_to_load_applies(
     loaded = CuReSAC.load(tmp_path / "model", env=VectorBox(), **given)
     assert temperature(loaded) == expected
     curious = loaded.policy.curious.log_ent_coef
-    assert curious is not None and float(curious) != 0.0  # as it was learned
+    assert curious is not None and curious.item() != 0.0  # as it was learned
     loaded.learn(5, reset_num_timesteps=False)
     assert (temperature(loaded) == expected) == (not expected[1])
     for curiosity in (0.1, "auto_0.4"):
