@@ -50,7 +50,7 @@ class Background:
         self._image = np.zeros((size, size, 3), dtype=np.uint8)
 
     def begin(self, seed: Seed) -> None:
-        """Draw what an episode is seen before.
+        """Draw what is seen behind an episode.
 
         :param seed: As of ``reset``
         """
@@ -67,7 +67,8 @@ class Background:
             self._image = np.asarray(fitted)
 
     def mask(self, camera: Any) -> np.ndarray:
-        """
+        """Find sky and ground by segmentation.
+
         :param camera: A camera of dm_control
         :return: Where it sees sky or ground, bool [size, size]
         """
@@ -76,7 +77,8 @@ class Background:
         return (kinds == -1) | (kinds == _geom()) & np.isin(numbers, self._ground)
 
     def behind(self, frame: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """
+        """Put this background behind the robot.
+
         :param frame: uint8 [size, size, 3]
         :param mask: Of the same state
         :return: The frame before this background
@@ -85,13 +87,15 @@ class Background:
         return np.where(mask[..., None], image, frame)
 
     def state_dict(self) -> dict[str, Any]:
-        """
+        """Get what the frames to come depend on, for exact resume.
+
         :return: What the frames to come depend on
         """
         return {"rng": self.rng.bit_generator.state, "drawn": self.drawn}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
+        """Restore what the frames to come depend on.
+
         :param state: Result of ``state_dict``
         """
         self.rng.bit_generator.state = state["rng"]

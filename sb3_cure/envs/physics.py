@@ -61,7 +61,8 @@ def _coordinates(env: gym.Env) -> list[tuple[str, str]]:
 
 
 def physics_state_names(env: gym.Env) -> list[str]:
-    """
+    """Name the coordinates of ``physics_state``.
+
     :param env: A dm_control environment, such as ``make_dmc_env`` makes, in any wrappers
     :return: What ``physics_state`` gives: MuJoCo's names of the joints, then the same with ``_velocity``
     :raises ValueError: if the environment is not one of dm_control
@@ -70,7 +71,8 @@ def physics_state_names(env: gym.Env) -> list[str]:
 
 
 def physics_state_units(env: gym.Env) -> list[str]:
-    """
+    """Give the unit of each coordinate of ``physics_state``.
+
     :param env: As of ``physics_state_names``
     :return: Unit of each coordinate: ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"``, or ``""`` for parts of quaternions
     :raises ValueError: if the environment is not one of dm_control
@@ -122,7 +124,8 @@ class Proprioception:
         self.names += [f"{names[joint]}_velocity" for joint in own]
 
     def __call__(self) -> np.ndarray:
-        """
+        """Measure the joints.
+
         :return: Positions, then velocities, float32 [d], in the order of ``names``
         """
         data = self._physics.data
@@ -138,7 +141,8 @@ def _is_own(model: Any, joint: int) -> bool:
 
 
 def telling_coordinates(names: list[str]) -> tuple[str, str]:
-    """
+    """Choose the two coordinates that show best what a task is about, for maps.
+
     :param names: Names of the state's coordinates, as of ``physics_state_names``
     :return: The two of them that show best what the agent does, for maps: of cartpole the pole's angle and its
         velocity, of finger the finger's angle and the body's velocity, of reacher both angles, ...
@@ -150,7 +154,8 @@ def telling_coordinates(names: list[str]) -> tuple[str, str]:
 
 
 def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
-    """
+    """Label the axes of a map.
+
     :param coordinates: Two coordinates of the state, by name
     :return: What to call them on the axes of a map
     """
@@ -158,7 +163,8 @@ def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
 
 
 def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
-    """
+    """Check that a map is of two coordinates of the state.
+
     :param coordinates: Two coordinates of the state, by name
     :param names: Names of all coordinates
     :raises ValueError: if they are not two of these
@@ -170,7 +176,8 @@ def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
 
 
 def is_of_the_suite(control: Any) -> bool:
-    """
+    """Check whether ``integration_state`` knows all that a task may change.
+
     :param control: An environment of dm_control, without Gymnasium
     :return: Whether ``integration_state`` knows all that its task may change
     """
@@ -180,7 +187,8 @@ def is_of_the_suite(control: Any) -> bool:
 
 
 def integration_state(control: Any) -> dict[str, Any]:
-    """
+    """Get all that the future of an environment depends on.
+
     :param control: An environment of the DeepMind Control suite, without Gymnasium
     :return: All that its future depends on: numbers, arrays and dictionaries of these
     """
@@ -201,7 +209,8 @@ def integration_state(control: Any) -> dict[str, Any]:
 
 
 def load_integration_state(control: Any, state: dict[str, Any]) -> None:
-    """
+    """Restore all that the future of an environment depends on.
+
     :param control: An environment of the DeepMind Control suite, without Gymnasium
     :param state: Result of ``integration_state`` for the same task
     """

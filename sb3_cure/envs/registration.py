@@ -29,7 +29,8 @@ ENTRY_POINT = "sb3_cure.envs.dmc:make_dmc_env"
 
 
 def dmc_env_id(domain: str, task: str) -> str:
-    """
+    """Name the Gymnasium id of a task that is seen through pixels.
+
     :param domain: Domain of the DeepMind Control suite, such as ``"cartpole"``
     :param task: Task of that domain, such as ``"swingup"``
     :return: The Gymnasium id of the task seen through pixels

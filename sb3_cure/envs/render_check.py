@@ -34,7 +34,8 @@ TIMEOUT_SECONDS = 180
 
 
 def find_gpus() -> list[str]:
-    """
+    """Find the GPUs of this machine.
+
     :return: Names of the GPUs that torch can use, or else of those that NVIDIA's driver knows, and of AMD's and Intel's
     """
     if th.cuda.is_available():
@@ -47,7 +48,8 @@ def find_gpus() -> list[str]:
 
 
 def is_software_renderer(name: str) -> bool:
-    """
+    """Check whether a renderer computes on the CPU.
+
     :param name: What OpenGL calls its renderer
     :return: Whether it computes on the CPU
     """
@@ -55,7 +57,8 @@ def is_software_renderer(name: str) -> bool:
 
 
 def judge_renderer(name: str, gpus: Sequence[str]) -> str | None:
-    """
+    """Warn of frames that the CPU computes although there is a GPU.
+
     :param name: What OpenGL calls its renderer
     :param gpus: Names of the GPUs of this machine
     :return: A warning if frames are computed by the CPU although there is a GPU, else None

@@ -21,7 +21,8 @@ def _missing(cause: object) -> GLUnavailableError:
 
 
 def is_headless() -> bool:
-    """
+    """Check whether no display is named on which a window could be opened.
+
     :return: Whether no display is named on which a window could be opened
     """
     return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

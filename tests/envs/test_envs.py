@@ -16,11 +16,10 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils import env_checker as gym_checker
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_cure.envs import (
     DMC_TASKS,
-    ActionRepeat,
     NormalizeActions,
     PixelObservation,
     StackFrames,
@@ -33,6 +32,7 @@ from sb3_cure.envs import (
 )
 from sb3_cure.envs.physics import telling_coordinates
 from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 load_gl()  # before any test imports dm_control
 
@@ -146,25 +146,6 @@ def test_one_frame_is_rendered_per_agent_step(make):
         assert render.call_count == 4
 
 
-def test_states_that_nobody_sees_are_not_computed(make, monkeypatch):
-    from dm_control.suite.cartpole import Balance
-
-    env = make()
-    computed = mock.Mock()
-    monkeypatch.setattr(Balance, "get_observation", computed)
-    env.reset()
-    env.step(env.action_space.sample())
-    computed.assert_not_called()
-
-
-def test_lqr_actions_are_clipped_to_the_unit_box(make):
-    env = make("lqr", "lqr_6_2")
-    assert env.action_space == spaces.Box(-1, 1, (2,), np.float32)
-    env.reset()
-    env.step(np.array([0.25, 7.0], np.float32))
-    np.testing.assert_array_equal(env.unwrapped.physics.control(), [0.25, 1.0])
-
-
 # ---------------------------------------------------------------------------------------------------- seeding
 
 
@@ -265,26 +246,6 @@ def test_ids_make_environments_that_step_and_repeat(env_id):
     env.close()
 
 
-def test_gymnasium_make_passes_every_argument_on():
-    kwargs = {
-        "image_size": 40,
-        "frame_stack": 2,
-        "action_repeat": 3,
-        "camera_id": 1,
-        "renderer": "fast",
-        "render_mode": "rgb_array",
-        "seed": 4,
-    }
-    env = gym.make("dmc_pixels/fish-swim-v0", **kwargs)
-    direct = make_dmc_env("fish", "swim", **kwargs)
-    assert env.observation_space.shape == (6, 40, 40)
-    np.testing.assert_array_equal(env.reset()[0], direct.reset()[0])
-    for name in set(kwargs) - {"seed"}:
-        assert env.get_wrapper_attr(name) == direct.get_wrapper_attr(name) == kwargs[name]
-    env.close()
-    direct.close()
-
-
 @pytest.mark.parametrize("through_gymnasium", [False, True])
 def test_environment_checkers_find_nothing(through_gymnasium):
     kwargs = {"image_size": 36, "renderer": "fast", "render_mode": "rgb_array"}
@@ -312,42 +273,6 @@ def test_environment_that_rendered_can_be_copied(make):
         np.testing.assert_array_equal(ours, theirs)
     twin.close()
     assert env.step(action)[0].any()
-
-
-def test_spec_makes_a_copy(make):
-    env = make("ball_in_cup", "catch", seed=2, action_repeat=5)
-    copy = env.spec.make()
-    assert env.spec.id == "dmc_pixels/ball_in_cup-catch-v0"
-    assert copy.get_wrapper_attr("action_repeat") == 5
-    np.testing.assert_array_equal(copy.reset()[0], env.reset()[0])
-    copy.close()
-
-
-def test_vectorised_environments_give_the_same_stream():
-    factories = [
-        partial(make_dmc_env, "point_mass", "easy", image_size=36, renderer="fast", seed=seed) for seed in (1, 2)
-    ]
-    local, remote = DummyVecEnv(factories), SubprocVecEnv(factories)
-    try:
-        first = local.reset()
-        assert (first[0] != first[1]).any()
-        np.testing.assert_array_equal(first, remote.reset())
-        for _ in range(3):
-            actions = np.stack([local.action_space.sample() for _ in factories])
-            (obs, rewards, dones, _), (remote_obs, remote_rewards, remote_dones, _) = (
-                vec_env.step(actions) for vec_env in (local, remote)
-            )
-            np.testing.assert_array_equal(obs, remote_obs)
-            np.testing.assert_array_equal(rewards, remote_rewards.astype(np.float32))  # only DummyVecEnv rounds them
-            np.testing.assert_array_equal(dones, remote_dones)
-        for vec_env in (local, remote):
-            vec_env.seed(9)
-        np.testing.assert_array_equal(local.reset(), remote.reset())
-        names = ("frame_stack", "action_repeat", "renderer", "image_size")
-        assert [remote.get_attr(name) for name in names] == [[3, 3], [4, 4], ["fast", "fast"], [36, 36]]
-    finally:
-        local.close()
-        remote.close()
 
 
 # --------------------------------------------------------------------------------- any Gymnasium environment
@@ -394,26 +319,6 @@ def test_actions_lie_in_the_environments_space(dtype):
         np.testing.assert_allclose(painting.action, np.array(expected), atol=1e-7)
 
 
-def test_frames_that_are_none_are_described():
-    """What came, and what to do about it, which is not what was done already."""
-
-    class Unfinished(Painting):
-        frame = None
-
-        def render(self):
-            return self.frame
-
-    env = make_pixel_env(Unfinished(), image_size=10)
-    for frame, given in (
-        (None, "a NoneType"),
-        (np.zeros((4, 4, 4), np.uint8), r"uint8 of shape \(4, 4, 4\)"),
-        (np.zeros((4, 4, 3)), "float64"),
-    ):
-        Unfinished.frame = frame
-        with pytest.raises(ValueError, match=f"gave {given}.*: let its render\\(\\) return such frames"):
-            env.reset()
-
-
 def test_channels_last_images_are_stacked():
     """As SB3's VecFrameStack does."""
     env = StackFrames(gym.wrappers.AddRenderObservation(Painting()), 3)
@@ -434,14 +339,6 @@ def test_frames_of_another_size_are_area_averaged():
     assert PixelObservation(Painting(), 3).reset()[0][:, 0].tolist() == [[0, 128, 255]] * 3
 
 
-def test_pixel_environment_from_an_id():
-    gym.register("test/Painting-v0", entry_point=Painting)
-    try:
-        assert make_pixel_env("test/Painting-v0", image_size=36).reset()[0].shape == (9, 36, 36)
-    finally:
-        del gym.registry["test/Painting-v0"]
-
-
 def test_gymnasium_is_drawn_fast():
     """The same steps, seen in the same way but for shadows, which lie beside the robot here; few pixels are drawn."""
     frames = {}
@@ -457,106 +354,6 @@ def test_gymnasium_is_drawn_fast():
     assert between.max() < since_the_first.min() / 2
 
 
-# -------------------------------------------------------------------------------------------------- bad input
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "named"),
-    [
-        ({"domain": "cartpol"}, ["'cartpol-swingup'", "cartpole-swingup"]),
-        ({"domain": "walker", "task": "wlak"}, ["'walker-wlak'", "walker-walk"]),
-        ({"image_size": 0}, ["image_size=0", "at least 1", "84"]),
-        ({"image_size": 84.0}, ["image_size=84.0", "integer", "84"]),
-        ({"frame_stack": 0}, ["frame_stack=0", "at least 1", "3"]),
-        ({"frame_stack": True}, ["frame_stack=True", "integer"]),
-        ({"image_size": 8}, ["frame_stack=3 images of shape (3, 8, 8) have 9 channels", "image_size", "fewer frames"]),
-        ({"action_repeat": 0}, ["action_repeat=0", "at least 1", "4"]),
-        ({"action_repeat": 2.5}, ["action_repeat=2.5", "integer"]),
-        ({"renderer": "slow"}, ["renderer='slow'", "'dmc'", "'fast'"]),
-        ({"render_mode": "human"}, ["render_mode='human'", "'rgb_array'"]),
-    ],
-    ids=lambda value: str(value) if isinstance(value, dict) else "",
-)
-def test_bad_input_is_answered_in_one_sentence(kwargs, named):
-    with pytest.raises(ValueError) as error:
-        make_dmc_env(**{"domain": "cartpole", "task": "swingup", **kwargs})
-    message = str(error.value)
-    assert all(part in message for part in named), message
-    assert "\n" not in message and message.endswith(".")
-
-
-@pytest.mark.parametrize(
-    ("build", "match"),
-    [
-        (lambda: make_pixel_env(Painting(render_mode=None)).reset(), "render_mode=None.*make it with 'rgb_array'"),
-        (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "render_mode='ansi'.*make it with 'rgb_array'"),
-        (lambda: make_pixel_env(Painting(), action_repeat=-1), "action_repeat=-1"),
-        (lambda: make_pixel_env(Painting(), renderer="fast"), "Gymnasium's MuJoCo environments.*use 'env'"),
-        (lambda: make_pixel_env(Painting(), renderer="quick"), "'quick'.*'env' or 'fast'"),
-        (lambda: ActionRepeat(Painting(), 0), "action_repeat=0"),
-        (lambda: NormalizeActions(Painting()), "Discrete"),
-        (lambda: StackFrames(gym.wrappers.FlattenObservation(Painting()), 0), "frame_stack=0"),
-    ],
-)
-def test_bad_input_of_the_wrappers(build, match):
-    with pytest.raises(ValueError, match=match):
-        build()
-
-
-# ----------------------------------------------------------------------------------------------------- OpenGL
-
-
-def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")
-    env = {name: value for name, value in os.environ.items() if name not in hidden} | environment
-    env["PYTHONPATH"] = os.pathsep.join(sys.path)
-    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
-
-
-def test_importing_needs_neither_gl_nor_dm_control():
-    result = run_python(
-        "import sys, sb3_cure.envs, gymnasium\n"
-        "assert 'dmc_pixels/cartpole-swingup-v0' in gymnasium.registry\n"
-        "print([name for name in ('dm_control', 'mujoco', 'OpenGL', 'shimmy') if name in sys.modules])"
-    )
-    assert result.stdout.strip() == "[]", result.stderr
-
-
-@pytest.mark.parametrize("missing", ["libEGL", "lib(OpenGL|GL|GLESv2|GLESv1_CM)[.]"])
-def test_missing_gl_is_answered_in_one_sentence(missing):
-    result = run_python(
-        f"""
-import ctypes, re, runpy
-load = ctypes.CDLL.__init__
-
-def refuse(self, name, *args, **kwargs):
-    if name and re.search({missing!r}, str(name)):
-        raise OSError(f"{{name}}: cannot open shared object file: No such file or directory")
-    load(self, name, *args, **kwargs)
-
-ctypes.CDLL.__init__ = refuse
-from sb3_cure.envs import make_dmc_env
-try:
-    make_dmc_env("cartpole", "swingup")
-except Exception as error:
-    print(type(error).__name__, error)
-del __import__("sys").modules["sb3_cure.envs.rendering"]
-runpy.run_module("sb3_cure.envs.rendering", run_name="__main__")
-"""
-    )
-    assert result.returncode == 1
-    for said in (result.stdout, result.stderr):
-        assert "apt-get install libegl1 libopengl0 libgl1-mesa-dri" in said
-        assert said.count("\n") == 1, said
-    assert result.stdout.startswith("GLUnavailableError OpenGL cannot render here (MUJOCO_GL=egl: ")
-
-
-def test_working_gl_names_its_renderer():
-    result = run_python("import runpy; runpy.run_module('sb3_cure.envs.rendering', run_name='__main__')")
-    assert result.returncode == 0 and result.stdout.strip() == check_gl(), result.stderr
-    assert len(check_gl()) > 3
-
-
 @pytest.mark.parametrize(
     ("environment", "chosen"),
     [({}, "egl"), ({"DISPLAY": ":0"}, None), ({"WAYLAND_DISPLAY": "wayland-0"}, None), ({"MUJOCO_GL": "glfw"}, "glfw")],
@@ -569,26 +366,6 @@ def test_egl_is_chosen_only_without_display(environment, chosen):
     ):
         load_gl()
         assert os.environ.get("MUJOCO_GL") == chosen
-
-
-@pytest.mark.parametrize("made", ["make_dmc_env('cartpole', 'swingup')", "make_pixel_env('InvertedPendulum-v5')"])
-def test_display_that_cannot_be_opened_is_none(made):
-    """As that of an ssh connection that has ended: frames are drawn, without a word about displays."""
-    code = f"from sb3_cure.envs import make_dmc_env, make_pixel_env; print({made}.reset()[0].std())"
-    result = run_python(code, DISPLAY=":77")
-    assert result.returncode == 0 and float(result.stdout) > 1, result.stderr
-    assert "isplay" not in result.stderr
-
-
-@pytest.mark.parametrize(("backend", "fix"), [("off", "apt-get install"), (None, "apt-get"), ("glfw", "MUJOCO_GL=egl")])
-def test_backend_that_cannot_render_is_refused(backend, fix):
-    with (
-        mock.patch.dict(os.environ, clear=True),
-        mock.patch.object(sys, "platform", "linux"),
-        mock.patch("dm_control._render.BACKEND", backend),
-        pytest.raises(GLUnavailableError, match=fix),
-    ):
-        load_gl()
 
 
 @pytest.mark.parametrize(
@@ -645,3 +422,144 @@ def test_true_state_of_other_environments_is_refused() -> None:
     for function in (physics_state, physics_state_names, physics_state_units):
         with pytest.raises(ValueError, match=r"Pendulum-v1.* has no physics of dm_control.*make_dmc_env, or give"):
             function(gym.make("Pendulum-v1"))
+
+
+def test_gymnasium_make_passes_every_argument_on():
+    kwargs = dict(image_size=40, frame_stack=2, action_repeat=3, camera_id=1, renderer="fast", render_mode="rgb_array")
+    direct = make_dmc_env("fish", "swim", seed=4, **kwargs)
+    first = direct.reset()[0]
+    assert direct.spec.id == "dmc_pixels/fish-swim-v0" and first.shape == (6, 40, 40)
+    for env in (gym.make("dmc_pixels/fish-swim-v0", seed=4, **kwargs), direct.spec.make()):
+        np.testing.assert_array_equal(env.reset()[0], first)
+        for name in set(kwargs) - {"camera_id"}:
+            assert env.get_wrapper_attr(name) == kwargs[name]
+        env.close()
+
+
+def test_workers_give_the_same_stream():
+    """Started as by default, which is not by fork."""
+    factories = [
+        partial(make_dmc_env, "point_mass", "easy", image_size=36, renderer="fast", seed=seed) for seed in (1, 2)
+    ]
+    local, remote = DummyVecEnv(factories), FaultTolerantSubprocVecEnv(factories)
+    try:
+        first = local.reset()
+        assert (first[0] != first[1]).any()
+        np.testing.assert_array_equal(first, remote.reset())
+        for _ in range(3):
+            actions = np.stack([local.action_space.sample() for _ in factories])
+            (obs, rewards, *_), (remote_obs, remote_rewards, *_) = (each.step(actions) for each in (local, remote))
+            np.testing.assert_array_equal(obs, remote_obs)
+            np.testing.assert_array_equal(rewards, remote_rewards.astype(np.float32))  # only DummyVecEnv rounds them
+    finally:
+        local.close()
+        remote.close()
+
+
+# -------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"domain": "cartpol"}, "'cartpol-swingup' is not .*cartpole-swingup"),
+        ({"image_size": 84.0}, "image_size must be an integer of at least 1, not 84.0"),
+        ({"frame_stack": True}, "frame_stack must be an integer"),
+        ({"action_repeat": 0}, "action_repeat must be an integer"),
+        ({"image_size": 8}, "9 channels in all, .* larger images"),
+        ({"renderer": "slow"}, "renderer must be 'dmc', or 'fast'"),
+        ({"render_mode": "human"}, "render_mode must be 'rgb_array'"),
+    ],
+)
+def test_bad_arguments_of_tasks_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_dmc_env(**{"domain": "cartpole", "task": "swingup", **kwargs})
+
+
+class Unfinished(Painting):
+    def render(self):
+        return np.zeros((4, 4, 3))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: make_pixel_env(Painting(render_mode="ansi")).reset(), "'ansi' rendered a str.*'rgb_array'"),
+        (lambda: make_pixel_env(Unfinished()).reset(), r"rendered float64 \(4, 4, 3\)"),
+        (lambda: make_pixel_env(Painting(), renderer="fast"), "Gymnasium's MuJoCo environments.*use 'env'"),
+        (lambda: make_pixel_env(Painting(), renderer="quick"), "renderer must be 'env' or 'fast'"),
+        (lambda: NormalizeActions(Painting()), "Discrete"),
+    ],
+)
+def test_environments_that_cannot_be_wrapped_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+# ----------------------------------------------------------------------------------------------------- OpenGL
+
+
+def run_python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")
+    env = {name: value for name, value in os.environ.items() if name not in hidden} | environment
+    env["PYTHONPATH"] = os.pathsep.join(sys.path)
+    return subprocess.run([sys.executable, *arguments], env=env, capture_output=True, text=True, timeout=120)
+
+
+def test_importing_needs_neither_gl_nor_dm_control():
+    result = run_python(
+        "-c",
+        "import sys, sb3_cure.envs, gymnasium\n"
+        "assert 'dmc_pixels/cartpole-swingup-v0' in gymnasium.registry\n"
+        "print([name for name in ('dm_control', 'mujoco', 'OpenGL', 'shimmy') if name in sys.modules])",
+    )
+    assert result.stdout.strip() == "[]", result.stderr
+
+
+@pytest.mark.parametrize("missing", ["libEGL", "lib(OpenGL|GL|GLESv2|GLESv1_CM)[.]"])
+def test_missing_gl_is_one_sentence(missing):
+    result = run_python(
+        "-c",
+        f"""
+import ctypes, re, runpy
+load = ctypes.CDLL.__init__
+
+def refuse(self, name, *args, **kwargs):
+    if name and re.search({missing!r}, str(name)):
+        raise OSError(f"{{name}}: cannot open shared object file: No such file or directory")
+    load(self, name, *args, **kwargs)
+
+ctypes.CDLL.__init__ = refuse
+runpy.run_module("sb3_cure.envs", run_name="__main__")
+""",
+    )
+    assert result.returncode == 1 and result.stderr.count("\n") == 1
+    assert "MUJOCO_GL=egl: " in result.stderr and "apt-get install libegl1 libopengl0 libgl1-mesa-dri" in result.stderr
+
+
+def test_working_gl_names_its_renderer_without_a_warning():
+    result = run_python("-m", "sb3_cure.envs")
+    assert result.returncode == 0 and result.stdout.strip() == check_gl() and "Warning" not in result.stderr
+
+
+def test_display_that_cannot_be_opened_is_none():
+    """As that of an ssh connection that has ended: frames are drawn, without a word about displays."""
+    code = (
+        "from sb3_cure.envs import make_dmc_env, make_pixel_env\n"
+        "print(make_pixel_env('InvertedPendulum-v5').reset()[0].std())\n"
+        "print(make_dmc_env('cartpole', 'swingup').reset()[0].std())"
+    )
+    result = run_python("-c", code, DISPLAY=":77")
+    assert result.returncode == 0 and all(float(each) > 1 for each in result.stdout.split()), result.stderr
+    assert "isplay" not in result.stderr
+
+
+@pytest.mark.parametrize(("backend", "fix"), [("off", "apt-get install"), (None, "apt-get"), ("glfw", "MUJOCO_GL=egl")])
+def test_backend_that_cannot_render_is_refused(backend, fix):
+    with (
+        mock.patch.dict(os.environ, clear=True),
+        mock.patch.object(sys, "platform", "linux"),
+        mock.patch("dm_control._render.BACKEND", backend),
+        pytest.raises(GLUnavailableError, match=fix),
+    ):
+        load_gl()

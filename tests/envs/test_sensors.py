@@ -7,13 +7,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.envs import DMC_TASKS, StackFrames, physics_state, physics_state_names
+from sb3_cure.envs import DMC_TASKS, physics_state, physics_state_names
 from sb3_cure.envs.physics import Proprioception
-from sb3_cure.persistence.env_state import load_vec_env_state, restore_error, vec_env_state
+from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 
 SMALL: dict[str, Any] = dict(image_size=24, renderer="fast")
 
@@ -127,45 +126,10 @@ def test_state_is_restored_exactly() -> None:
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 1, 2)).astype(np.float32)
     for action in actions[:4]:
         env.step(action)
-    assert restore_error(env) is None
     load_vec_env_state(other, vec_env_state(env))
     for action in actions[4:]:
         ours, theirs = env.step(action), other.step(action)
         assert all(np.array_equal(ours[0][key], theirs[0][key]) for key in ours[0])
-
-
-class Sensed(gym.Env):
-    """A camera, channels last, beside a number."""
-
-    observation_space = spaces.Dict(
-        image=spaces.Box(0, 255, (6, 7, 3), np.uint8), joint=spaces.Box(-9, 9, (1,), np.float32)
-    )
-    action_space = spaces.Box(-1, 1, (1,), np.float32)
-
-    def reset(self, **kwargs: Any) -> Any:
-        self.n = 0
-        return self.observe(), {}
-
-    def observe(self) -> dict[str, np.ndarray]:
-        return {"image": np.full((6, 7, 3), self.n, np.uint8), "joint": np.array([self.n], np.float32)}
-
-    def step(self, action: Any) -> Any:
-        self.n += 1
-        return self.observe(), 0.0, False, False, {}
-
-
-def test_images_of_a_dictionary_are_stacked() -> None:
-    """The rest stays as it is."""
-    env = StackFrames(Sensed(), 2)
-    assert env.observation_space["image"].shape == (6, 7, 6)
-    assert env.observation_space["joint"] == Sensed.observation_space["joint"]
-    seen, _ = env.reset()
-    for number in range(3):
-        np.testing.assert_array_equal(seen["image"][0, 0], [max(number - 1, 0)] * 3 + [number] * 3)
-        assert seen["joint"] == number and env.observation_space.contains(seen)
-        seen, *_ = env.step(None)
-    with pytest.raises(ValueError, match="cannot be stacked: expected a Box"):
-        StackFrames(gym.wrappers.FilterObservation(Sensed(), ["joint"]), 2)
 
 
 def test_training_from_camera_and_joints() -> None:
