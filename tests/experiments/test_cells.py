@@ -289,7 +289,7 @@ def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest
 def test_damaged_checkpoint_is_put_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """The cell begins anew rather than failing for ever, and says why."""
+    """The cell starts anew instead of failing for ever, and says why."""
     cell = only_cell(tmp_path, budget=120)
     with monkeypatch.context() as full:
         full.setattr(cells, "write_text", lambda path, text: 1 / 0)
@@ -298,7 +298,7 @@ def test_damaged_checkpoint_is_put_aside(
     for path in (tmp_path / cell.folder / "checkpoint").rglob("model.zip"):
         path.write_bytes(path.read_bytes()[:1000])
     folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "begins anew, its checkpoints are kept in unusable-" in capsys.readouterr().out
+    assert "its checkpoints are kept in unusable-" in capsys.readouterr().out
     assert list(folder.glob("unusable-*/**/model.zip"))
     assert steps_of(folder) == [0, 120] and cell.is_done(tmp_path)
 
