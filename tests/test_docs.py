@@ -187,7 +187,7 @@ def test_commands_of_pages_exist() -> None:
     commands = set(re.findall(r"^ *sb3-cure (\w+)", text, re.M))
     assert {"train", "experiment", "report"} <= commands <= COMMANDS.keys()
     modules = set(re.findall(r"python -m ((?:benchmarks|sb3_cure)[\w.]*)", text))
-    assert "sb3_cure.envs.rendering" in modules
+    assert "benchmarks.fuzz" in modules
     for name in modules:
         importlib.import_module(name)
 
@@ -252,5 +252,5 @@ def test_reference_has_what_pages_and_notebooks_import() -> None:
     imports = re.findall(r"^from (sb3_cure[\w.]*) import ([\w, ]+)", "\n".join(code), re.M)
     assert len(imports) > 20
     for module, imported in imports:
-        if module != "sb3_cure.experiments":  # whose modules are imported
+        if module not in ("sb3_cure.experiments", "sb3_cure.evaluation"):  # modules are imported from these
             assert set(imported.replace(" ", "").split(",")) <= names, module

@@ -289,7 +289,7 @@ def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest
 def test_damaged_checkpoint_is_put_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """The cell begins anew rather than failing for ever, and says why."""
+    """The cell starts anew instead of failing for ever, and says why."""
     cell = only_cell(tmp_path, budget=120)
     with monkeypatch.context() as full:
         full.setattr(cells, "write_text", lambda path, text: 1 / 0)
@@ -298,13 +298,13 @@ def test_damaged_checkpoint_is_put_aside(
     for path in (tmp_path / cell.folder / "checkpoint").rglob("model.zip"):
         path.write_bytes(path.read_bytes()[:1000])
     folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "begins anew, its checkpoints are kept in unusable-" in capsys.readouterr().out
+    assert "its checkpoints are kept in unusable-" in capsys.readouterr().out
     assert list(folder.glob("unusable-*/**/model.zip"))
     assert steps_of(folder) == [0, 120] and cell.is_done(tmp_path)
 
 
 def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second one is told so, while the first is at it."""
+    """The second one is refused while the first runs."""
     cell = only_cell(tmp_path, budget=40)
     refusals = []
     learn = CuReSAC.learn
@@ -313,7 +313,7 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
         with pytest.raises(GridError, match="is being run by another process") as refusal:
             run_cell(cell, tmp_path, pictures=False)
         refusals.append(refusal)
-        assert run.read_progress(cell, tmp_path)[0] == "running"
+        assert ": running" in run.status_lines([cell], tmp_path)[0]
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(CuReSAC, "learn", learn_while_another_tries)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from results_for_tests import TASK, curve, write_cell, write_grid, write_two_arms
+from results_for_tests import CURE, TASK, curve, write_cell, write_grid, write_two_arms
 
 from sb3_cure.experiments import statistics
 from sb3_cure.experiments.results import ResultsError, read_results
@@ -71,7 +71,7 @@ def test_missing_curve_of_finished_cell_is_refused(results: Path) -> None:
 
 @pytest.mark.parametrize(
     ("method", "seed", "settings"),
-    [("sac_ae", 1, {"arguments": {"gamma": 0.5}}), ("cure_sac_ae", 0, {"eval_episodes": 3})],
+    [("sac_ae", 1, {"arguments": {"gamma": 0.5}}), ("cure_sac_ae", 0, {"eval_episodes": 3, "arguments": CURE})],
 )
 def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: int, settings: dict) -> None:
     """Seeds of an arm must share all settings, arms of a task their evaluations."""
