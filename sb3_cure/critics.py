@@ -4,6 +4,7 @@ Both act on the latents of the shared encoder. Wherever a value is formed, [B, K
 K = 1 for SAC (the smallest of the twin Q values), the quantiles that are kept for TQC.
 """
 
+from collections.abc import Iterable
 from itertools import chain, pairwise
 from typing import Any
 
@@ -12,7 +13,7 @@ from sb3_contrib.common.utils import quantile_huber_loss
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.layers import EnsembleLinear, run_mlp
+from sb3_cure.layers import EnsembleLinear, EnsembleNorm, ResidualBlock, run_mlp
 
 
 class LatentCritic(nn.Module):
@@ -20,10 +21,13 @@ class LatentCritic(nn.Module):
 
     :param features_dim: Size of the latents
     :param action_dim: Size of the actions
-    :param net_arch: Hidden layers
+    :param net_arch: Hidden layers; of ``"residual"`` the hidden units of each block, the first also their common width
     :param activation_fn: Activation function
     :param n_critics: Number of critics
     :param n_values: Values that each critic returns: 1, or its quantiles
+    :param critic_arch: ``"mlp"``, or ``"residual"``: a linear layer, a block ``x + MLP(LayerNorm(x))`` per entry of
+        ``net_arch``, and a LayerNorm before the output (SimBa, Lee et al. 2024; BRO, Nauman et al. 2024)
+    :raises ValueError: for another ``critic_arch``, or ``"residual"`` without hidden layers
     """
 
     optimizer: th.optim.Optimizer
@@ -36,12 +40,23 @@ class LatentCritic(nn.Module):
         activation_fn: type[nn.Module],
         n_critics: int = 2,
         n_values: int = 1,
+        critic_arch: str = "mlp",
     ):
         super().__init__()
+        if critic_arch not in ("mlp", "residual"):
+            raise ValueError(f"critic_arch is {critic_arch!r}, but it must be 'mlp' or 'residual': choose one.")
+        if critic_arch == "residual" and not net_arch:
+            raise ValueError("critic_arch is 'residual', but net_arch has no layers for the critics: name some.")
         self.n_critics = n_critics
         sizes = [features_dim + action_dim, *net_arch]
-        hidden = [[EnsembleLinear(n_critics, *pair), activation_fn()] for pair in pairwise(sizes)]
-        self.ensemble = nn.Sequential(*chain(*hidden), EnsembleLinear(n_critics, sizes[-1], n_values))
+        hidden: Iterable[nn.Module]
+        if critic_arch == "residual":
+            sizes = sizes[:2]
+            blocks = (ResidualBlock(n_critics, sizes[1], units, activation_fn) for units in net_arch)
+            hidden = (EnsembleLinear(n_critics, *sizes), *blocks, EnsembleNorm(n_critics, sizes[1]))
+        else:
+            hidden = chain(*([EnsembleLinear(n_critics, *pair), activation_fn()] for pair in pairwise(sizes)))
+        self.ensemble = nn.Sequential(*hidden, EnsembleLinear(n_critics, sizes[-1], n_values))
 
     def forward(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -71,7 +86,7 @@ class TwinQ:
         :param action_dim: Size of the actions
         :param net_arch: Hidden layers
         :param activation_fn: Activation function
-        :param kwargs: ``n_critics``
+        :param kwargs: ``n_critics``, ``critic_arch``
         :return: The critics
         """
         return LatentCritic(features_dim, action_dim, net_arch, activation_fn, **kwargs)
@@ -121,7 +136,7 @@ class TruncatedQuantiles(TwinQ):
         :param net_arch: Hidden layers
         :param activation_fn: Activation function
         :param n_quantiles: Quantiles of each critic
-        :param kwargs: ``n_critics``
+        :param kwargs: ``n_critics``, ``critic_arch``
         :return: The critics
         """
         return LatentCritic(features_dim, action_dim, net_arch, activation_fn, n_values=n_quantiles, **kwargs)

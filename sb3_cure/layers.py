@@ -9,6 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_cure.fast_ops import convolve
 
@@ -140,13 +141,59 @@ class EnsembleLinear(nn.Module):
         return th.baddbmm(self.bias, inputs, self.weight)
 
 
+class EnsembleNorm(nn.Module):
+    """LayerNorm of several networks, side by side, each with a scale and a shift of its own.
+
+    :param n: Number of networks
+    :param features: Size of each input
+    """
+
+    def __init__(self, n: int, features: int):
+        super().__init__()
+        self.weight = nn.Parameter(th.ones(n, 1, features))
+        self.bias = nn.Parameter(th.zeros(n, 1, features))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [n, B, features]
+        :return: The same shape
+        """
+        return th.addcmul(self.bias, F.layer_norm(inputs, inputs.shape[-1:]), self.weight)
+
+
+class ResidualBlock(nn.Module):
+    """What SimBa and BRO stack in their critics, of several networks side by side: ``x + MLP(LayerNorm(x))``.
+
+    :param n: Number of networks
+    :param features: Size of each input and output
+    :param hidden: Units of the MLP's hidden layer
+    :param activation_fn: Activation function
+    """
+
+    def __init__(self, n: int, features: int, hidden: int, activation_fn: type[nn.Module]):
+        super().__init__()
+        self.branch = nn.Sequential(
+            EnsembleNorm(n, features),
+            EnsembleLinear(n, features, hidden),
+            activation_fn(),
+            EnsembleLinear(n, hidden, features),
+        )
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: [n, B, features]
+        :return: The same shape
+        """
+        return inputs + self.branch(inputs)
+
+
 def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor) -> th.Tensor:
     """Run an actor or critics: within autocast, too, everything but wide hidden layers in fp32.
 
     The first layer sees latents and actions: of bf16's digits, actions .500 and .501 are one. The last one gives values
     and means, which need more digits, too.
 
-    :param layers: Linear maps and activations
+    :param layers: Linear maps, activations and, in fp32, ``ResidualBlock``
     :param inputs: Latents, with or without actions, [..., B, n]
     :return: Output of the last layer, fp32
     """

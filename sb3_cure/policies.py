@@ -151,7 +151,8 @@ class CuRePolicy(BasePolicy):
     :param encoder_sources: Which losses train the encoder
     :param update: ``"sequential"`` or ``"joint"``, see ``EncoderUpdate``
     :param default_agent: Who acts in ``predict``: ``"task"`` or ``"curious"``
-    :param critic_kwargs: Arguments of the critics: ``n_critics``, and TQC's ``n_quantiles``
+    :param critic_kwargs: Arguments of the critics: ``n_critics``, ``critic_arch`` (see ``LatentCritic``), and TQC's
+        ``n_quantiles``
     """
 
     critics: ClassVar[type[TwinQ]] = TwinQ
