@@ -8,6 +8,7 @@ time of a quiet machine. The warm-up is short and has no burst of updates. Steps
 """
 
 import argparse
+import json
 import os
 import statistics
 import time
@@ -94,7 +95,7 @@ def step_costs(cells: Sequence[Cell], steps: int, rounds: int) -> dict[str, dict
 
 
 def main() -> None:
-    """Measure the arms of a grid, task by task."""
+    """Measure the arms of a grid, task by task; other tasks in the file are kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("grid", help="YAML file, or the name of one of the package's grids")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
@@ -105,13 +106,14 @@ def main() -> None:
     th.set_num_threads(1)
     tune_allocator()
     grid = load_grid(options.grid, tasks=options.task)
-    costs = {}
+    report = json.loads(options.out.read_text()) if options.out.exists() else {"tasks": {}, "conditions": {}}
     for task in dict.fromkeys(cell.task for cell in grid.cells):
         arms = {cell.method: cell for cell in grid.cells if cell.task == task}
-        costs[short_name(task)] = step_costs(list(arms.values()), options.steps, options.rounds)
-        machine = {**describe_machine(), "commit": code_commit(), "load_average": os.getloadavg()}
-        measured = {"steps": options.steps, "rounds": options.rounds}
-        write_json(options.out, {"machine": machine, **measured, "tasks": costs})
+        name, load = short_name(task), os.getloadavg()
+        report["tasks"][name] = step_costs(list(arms.values()), options.steps, options.rounds)
+        measured = {"commit": code_commit(), "steps": options.steps, "rounds": options.rounds, "load_average": load}
+        report["conditions"][name] = {**measured, **describe_machine()}
+        write_json(options.out, report)
 
 
 if __name__ == "__main__":
