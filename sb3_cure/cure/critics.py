@@ -3,6 +3,7 @@
 Wherever a value is formed, [B, K] are K values of each sample: K = 1 for SAC, the quantiles that are kept for TQC.
 """
 
+from collections.abc import Iterable
 from itertools import chain, pairwise
 
 import torch as th
@@ -10,7 +11,7 @@ from sb3_contrib.common.utils import quantile_huber_loss
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_cure.networks.layers import EnsembleLinear, MixedPrecision, run_mlp
+from sb3_cure.networks.layers import EnsembleLinear, EnsembleNorm, MixedPrecision, ResidualBlock, run_mlp
 
 
 class LatentCritic(MixedPrecision):
@@ -18,10 +19,13 @@ class LatentCritic(MixedPrecision):
 
     :param features_dim: Size of the latents
     :param action_dim: Size of the actions
-    :param net_arch: Hidden layers
+    :param net_arch: Hidden layers; of ``"residual"`` the hidden units of each block, the first also their common width
     :param activation_fn: Activation function
     :param n_critics: Number of critics
     :param n_values: Values that each critic returns
+    :param critic_arch: ``"mlp"``, or ``"residual"``: a linear layer, a block ``x + MLP(LayerNorm(x))`` per entry of
+        ``net_arch``, and a LayerNorm before the output (SimBa, Lee et al., 2024; BRO, Nauman et al., 2024)
+    :raises ValueError: for another ``critic_arch``, or ``"residual"`` without hidden layers
     """
 
     optimizer: th.optim.Optimizer
@@ -34,12 +38,23 @@ class LatentCritic(MixedPrecision):
         activation_fn: type[nn.Module],
         n_critics: int = 2,
         n_values: int = 1,
+        critic_arch: str = "mlp",
     ):
         super().__init__()
+        if critic_arch not in ("mlp", "residual"):
+            raise ValueError(f"critic_arch must be 'mlp' or 'residual', but is {critic_arch!r}.")
+        if critic_arch == "residual" and not net_arch:
+            raise ValueError("critic_arch='residual' needs hidden layers, but net_arch has none for the critics.")
         self.n_critics = n_critics
         sizes = [features_dim + action_dim, *net_arch]
-        hidden = [[EnsembleLinear(n_critics, *pair), activation_fn()] for pair in pairwise(sizes)]
-        self.ensemble = nn.Sequential(*chain(*hidden), EnsembleLinear(n_critics, sizes[-1], n_values))
+        hidden: Iterable[nn.Module]
+        if critic_arch == "residual":
+            sizes = sizes[:2]
+            blocks = (ResidualBlock(n_critics, sizes[1], units, activation_fn) for units in net_arch)
+            hidden = (EnsembleLinear(n_critics, *sizes), *blocks, EnsembleNorm(n_critics, sizes[1]))
+        else:
+            hidden = chain(*([EnsembleLinear(n_critics, *pair), activation_fn()] for pair in pairwise(sizes)))
+        self.ensemble = nn.Sequential(*hidden, EnsembleLinear(n_critics, sizes[-1], n_values))
 
     def forward(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """Compute the values of all critics.
@@ -110,8 +125,9 @@ class QuantileCritic(LatentCritic):
         n_critics: int = 2,
         n_quantiles: int = 25,
         top_quantiles_to_drop_per_net: int = 2,
+        critic_arch: str = "mlp",
     ):
-        super().__init__(features_dim, action_dim, net_arch, activation_fn, n_critics, n_values=n_quantiles)
+        super().__init__(features_dim, action_dim, net_arch, activation_fn, n_critics, n_quantiles, critic_arch)
         self.n_kept = (n_quantiles - top_quantiles_to_drop_per_net) * n_critics
 
     def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -48,6 +48,7 @@ class CuRePolicy(BasePolicy):
     :param optimizer_kwargs: Its arguments but for the learning rate
     :param n_critics: Number of critics
     :param n_quantiles: Quantiles of each critic (TQC; 25 by default)
+    :param critic_arch: ``"mlp"`` or ``"residual"``, see ``LatentCritic``
     :param top_quantiles_to_drop_per_net: Quantiles dropped for each critic (TQC), an argument of the algorithm
     :param critic_class: Class of the critics
     :param srl_class: Class of the SRL head, or None
@@ -86,6 +87,7 @@ class CuRePolicy(BasePolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 2,
         n_quantiles: int | None = None,
+        critic_arch: str = "mlp",
         *,
         top_quantiles_to_drop_per_net: int | None = None,
         critic_class: type[LatentCritic] = TwinCritic,
@@ -117,7 +119,7 @@ class CuRePolicy(BasePolicy):
         self.activation_fn = activation_fn
         critic_kwargs = dict(n_quantiles=n_quantiles, top_quantiles_to_drop_per_net=top_quantiles_to_drop_per_net)
         given = {name: value for name, value in critic_kwargs.items() if value is not None}
-        self._make_critic: Any = functools.partial(critic_class, n_critics=n_critics, **given)  # type: ignore[arg-type]
+        self._make_critic: Any = functools.partial(critic_class, n_critics=n_critics, critic_arch=critic_arch, **given)  # type: ignore[arg-type]
         #: Whether encoder and head stay as they are
         self.representation_frozen = False
         #: Who acts in ``predict``: ``"task"`` or ``"curious"``

@@ -144,6 +144,54 @@ class EnsembleLinear(nn.Module):
         return th.baddbmm(self.bias, inputs, self.weight)
 
 
+class EnsembleNorm(nn.Module):
+    """LayerNorm of several networks side by side, each with a scale and a shift of its own.
+
+    :param n: Number of networks
+    :param features: Size of each input
+    """
+
+    def __init__(self, n: int, features: int):
+        super().__init__()
+        self.weight = nn.Parameter(th.ones(n, 1, features))
+        self.bias = nn.Parameter(th.zeros(n, 1, features))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """Normalise each network's input.
+
+        :param inputs: [n, B, features]
+        :return: The same shape
+        """
+        return th.addcmul(self.bias, F.layer_norm(inputs, inputs.shape[-1:]), self.weight)
+
+
+class ResidualBlock(nn.Module):
+    """Residual block of several networks side by side, as in SimBa and BRO: ``x + MLP(LayerNorm(x))``.
+
+    :param n: Number of networks
+    :param features: Size of each input and output
+    :param hidden: Units of the MLP's hidden layer
+    :param activation_fn: Activation function
+    """
+
+    def __init__(self, n: int, features: int, hidden: int, activation_fn: type[nn.Module]):
+        super().__init__()
+        self.branch = nn.Sequential(
+            EnsembleNorm(n, features),
+            EnsembleLinear(n, features, hidden),
+            activation_fn(),
+            EnsembleLinear(n, hidden, features),
+        )
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """Add the branch to its input.
+
+        :param inputs: [n, B, features]
+        :return: The same shape
+        """
+        return inputs + self.branch(inputs)
+
+
 def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:
     """Run an actor or critics, with wide hidden layers in the given number format and the rest in fp32.
 

@@ -1,5 +1,6 @@
 """Twin Q and truncated quantiles: targets, losses and values against loops, and actions in full precision."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -59,6 +60,57 @@ def test_by_default_there_are_two_critics(algorithm: str) -> None:
     kind, n_values = {"sac": (TwinQ, 1), "tqc": (TruncatedQuantiles, 25)}[algorithm]
     for each, features_dim in ((critic, 8), (kind.make(3, 2, [8], nn.ReLU), 3)):
         assert each(th.zeros(6, features_dim), th.zeros(6, 2)).shape == (6, 2, n_values)
+
+
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_residual_critics_one_layer_after_the_other(n_critics: int) -> None:
+    """Linear, x + MLP(LayerNorm(x)) per entry of net_arch, LayerNorm, linear; each network has its own parameters."""
+    critic = LatentCritic(3, 2, [8, 5], nn.ReLU, n_critics, n_values=4, critic_arch="residual")
+    for i, parameter in enumerate(critic.parameters()):  # of the norms, ones and zeros
+        parameter.data += 0.1 * th.randn(parameter.shape, generator=seeded(i))
+    first, *blocks, norm, last = critic.ensemble
+    assert [tuple(block.branch[1].weight.shape) for block in blocks] == [(n_critics, 8, 8), (n_critics, 8, 5)]
+    latents, actions = inputs()
+    values = critic(latents, actions)
+    assert values.shape == (6, n_critics, 4)
+
+    def linear(layer: Any, x: th.Tensor, i: int) -> th.Tensor:
+        return x @ layer.weight[i] + layer.bias[i, 0]
+
+    def normed(layer: Any, x: th.Tensor, i: int) -> th.Tensor:
+        return nn.functional.layer_norm(x, (8,), layer.weight[i, 0], layer.bias[i, 0])
+
+    for i in range(n_critics):
+        x = linear(first, th.cat([latents, actions], dim=1), i)
+        for norm_in, widen, _, narrow in (block.branch for block in blocks):
+            x = x + linear(narrow, linear(widen, normed(norm_in, x, i), i).relu(), i)
+        th.testing.assert_close(values[:, i], linear(last, normed(norm, x, i), i))
+
+
+@BASES
+def test_residual_critics_train_and_load(algorithm: str, tmp_path: Path) -> None:
+    """Every parameter of both agents' critics moves, in bf16, too; a loaded model goes on with the same values."""
+    policy_kwargs = {"net_arch": [16, 16], "critic_arch": "residual"}
+    for precision in ("fp32", "bf16"):
+        arguments: dict[str, Any] = dict(precision=precision, policy_kwargs=policy_kwargs)
+        model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], **arguments)
+        before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+        model.learn(20)
+        critics = [name for name in before if ".critic." in name]
+        assert len(critics) == 2 * (2 + 2 * 6 + 2 + 2)
+        assert not [name for name in critics if th.equal(before[name], model.policy.state_dict()[name])]
+    model.save(tmp_path / "model")
+    loaded = ALGORITHMS[algorithm].load(tmp_path / "model", env=model.env)
+    latents, actions = th.randn(6, loaded.policy.encoder.features_dim), th.rand(6, 2)
+    assert th.equal(loaded.policy.critic(latents, actions), model.policy.critic(latents, actions))
+    assert loaded.learn(20)._n_updates > model._n_updates
+
+
+def test_other_critic_arch_is_refused() -> None:
+    """Also residual critics without a block, whose width nothing tells."""
+    for policy_kwargs in ({"critic_arch": "resnet"}, {"critic_arch": "residual", "net_arch": []}):
+        with pytest.raises(ValueError, match="critic_arch is 'res"):
+            tiny_model("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs)
 
 
 @pytest.mark.parametrize("n_critics", [1, 2, 3])
