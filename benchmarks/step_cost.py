@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from sb3_cure.experiments.files import code_commit, write_json
+from sb3_cure.evaluation.result_files import code_commit, write_json
 from stable_baselines3.common.logger import configure
 
 from benchmarks.harness import describe_machine

@@ -322,7 +322,7 @@ class CuReBase(OffPolicyAlgorithm):
             queue += [*getattr(each, "callbacks", []), *filter(None, [getattr(each, "callback", None)])]
             if isinstance(each, EvalCallback) and share_environment(each.eval_env, self.env):
                 raise ValueError(
-                    "EvalCallback evaluates in the training environment, so that transitions would be stored that never "
+                    "EvalCallback evaluates in the training environment, so that transitions are stored that never "
                     "happened: give it an eval_env of its own."
                 )
         return initialised
