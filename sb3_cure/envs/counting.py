@@ -24,11 +24,7 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gym.Env, widths: Mapping[str, float]) -> None:
         RecordConstructorArgs.__init__(self, widths=dict(widths))
         super().__init__(env)
-        names = physics_state_names(env)
-        if not widths or not set(widths) <= set(names) or min(widths.values()) <= 0:
-            raise ValueError(f"widths must be > 0, for some of {', '.join(names)}, not {dict(widths)!r}.")
-        self._indices = [names.index(name) for name in widths]
-        self._widths = np.array(list(widths.values()), dtype=np.float64)
+        self._indices, self._widths = _grid(env, widths)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -37,11 +33,11 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         :return: What the environment returns, with the cell, a tuple of integers, in the info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        cell = np.floor(physics_state(self.env)[self._indices] / self._widths).astype(int)
-        return observation, reward, terminated, truncated, {**info, "cell": tuple(cell.tolist())}
+        cell = _cell(self.env, self._indices, self._widths)
+        return observation, reward, terminated, truncated, {**info, "cell": cell}
 
 
-class CountReward(CellInfo):
+class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
     """Gives the reward 1 / sqrt(N), N the visits so far of the cell that a step leads to: an oracle of exploration.
 
     Counts of Strehl and Littman (2008), MBIE-EB. They start with the environment and continue over its episodes and
@@ -52,19 +48,21 @@ class CountReward(CellInfo):
     """
 
     def __init__(self, env: gym.Env, widths: Mapping[str, float]) -> None:
-        super().__init__(env, widths)
+        RecordConstructorArgs.__init__(self, widths=dict(widths))
+        super().__init__(env)
+        self._indices, self._widths = _grid(env, widths)
         #: Visits of each cell
         self.visits: dict[tuple[int, ...], int] = {}
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment.
+    def reward(self, reward: Any) -> float:
+        """Count a visit.
 
-        :param action: The action
-        :return: What the environment returns, with the reward of the cell, and the cell in the info
+        :param reward: The task's reward, unused
+        :return: The reward of the cell that the step has led to
         """
-        observation, _, terminated, truncated, info = super().step(action)
-        visits = self.visits[info["cell"]] = self.visits.get(info["cell"], 0) + 1
-        return observation, visits**-0.5, terminated, truncated, info
+        cell = _cell(self.env, self._indices, self._widths)
+        self.visits[cell] = self.visits.get(cell, 0) + 1
+        return self.visits[cell] ** -0.5
 
     def state_dict(self) -> dict[str, Any]:
         """Get the counts, for exact resume.
@@ -79,3 +77,14 @@ class CountReward(CellInfo):
         :param state: Result of ``state_dict``
         """
         self.visits = dict(zip(map(tuple, state["cells"].tolist()), state["visits"], strict=True))
+
+
+def _grid(env: gym.Env, widths: Mapping[str, float]) -> tuple[list[int], np.ndarray]:
+    names = physics_state_names(env)
+    if not widths or not set(widths) <= set(names) or min(widths.values()) <= 0:
+        raise ValueError(f"widths must be > 0, for some of {', '.join(names)}, not {dict(widths)!r}.")
+    return [names.index(name) for name in widths], np.array(list(widths.values()), dtype=np.float64)
+
+
+def _cell(env: gym.Env, indices: list[int], widths: np.ndarray) -> tuple[int, ...]:
+    return tuple(np.floor(physics_state(env)[indices] / widths).astype(int).tolist())

@@ -26,7 +26,7 @@ def actions(n: int) -> np.ndarray:
 
 def test_reward_is_one_by_the_root_of_visits() -> None:
     """Of the state that the step leads to, over episodes; nothing else differs from the environment itself."""
-    env, plain, counts = CountReward(cartpole(), WIDTHS), cartpole(), Counter[tuple[int, ...]]()
+    env, plain, counts = CellInfo(CountReward(cartpole(), WIDTHS), WIDTHS), cartpole(), Counter[tuple[int, ...]]()
     for _ in range(2):
         np.testing.assert_array_equal(env.reset()[0], plain.reset()[0])
         for action in actions(60):
@@ -36,7 +36,7 @@ def test_reward_is_one_by_the_root_of_visits() -> None:
             cell = tuple(int(np.floor(state[name] / width)) for name, width in WIDTHS.items())
             counts[cell] += 1
             assert info["cell"] == cell and reward == pytest.approx(1 / counts[cell] ** 0.5)
-    assert env.visits == counts and max(counts.values()) > 3 and len(counts) > 10
+    assert env.get_wrapper_attr("visits") == counts and max(counts.values()) > 3 and len(counts) > 10
 
 
 def test_counts_are_resumed() -> None:

@@ -104,7 +104,7 @@ def test_coverage_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_unknown_coordinates_are_found_before_anything_runs(tmp_path: Path) -> None:
-    with pytest.raises(GridError, match="give a width > 0 for some of slider, hinge_1"):
+    with pytest.raises(GridError, match="widths must be > 0, for some of slider, hinge_1"):
         check_arms(grid(tmp_path, coverage=dict(widths={"elbow": 1.0}, at=[400])).cells)
     with pytest.raises(GridError, match=r"coverage\.at"):
         grid(tmp_path, coverage=dict(widths=WIDTHS, at=[]))
