@@ -314,12 +314,12 @@ def test_vec_normalize(extras: dict[str, Any], tmp_path: Path) -> None:
     assert (stored >= 0).all() and (stored <= 1).all() and np.abs(buffer.observations[: buffer.pos]).max() <= 1
     np.random.seed(5)
     batch = buffer.sample(8, env)
-    with th.no_grad():  # without a future the rewards are the targets
-        values = model.critic(model.policy.encode(batch.observations), batch.actions).squeeze(2)
-        expected = 0.5 * (values - batch.rewards).square().mean(dim=0).sum()
     np.random.seed(5)
     model.set_logger(configure(None, []))
     model.train(1, 8)
+    with th.no_grad():  # without a future the rewards are the targets
+        values = model.critic(model.policy.encode(batch.observations), batch.actions).squeeze(2)
+        expected = 0.5 * (values - batch.rewards).square().mean(dim=0).sum()
     assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected.item(), rel=1e-4)
     model.save(tmp_path / "model")
     env.save(str(tmp_path / "statistics"))
@@ -398,7 +398,9 @@ def test_dictionaries_with_buffers_of_sb3(extras: dict[str, Any], buffer_class: 
     model = tiny_model("MultiInputPolicy", env, replay_buffer_class=buffer_class, **more, **extras).learn(60)
     assert type(model.replay_buffer) is buffer_class and model._n_updates > 0
     model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
     loaded = CuReSAC.load(tmp_path / "model", env=env)
+    loaded.load_replay_buffer(tmp_path / "buffer", trusted=True)
     assert type(loaded.replay_buffer) is buffer_class
     assert loaded.learn(40, reset_num_timesteps=False).num_timesteps == 100
 
