@@ -19,20 +19,36 @@ import pytest
 import stable_baselines3
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_cure import CuReSAC
 
 
-class SAC(CuReSAC):
-    """CuReSAC without extras and with SAC's defaults."""
+#: SAC's defaults, and no extras
+DEFAULTS: dict[str, Any] = dict(
+    learning_rate=3e-4, buffer_size=1_000_000, learning_starts=100, batch_size=256, tau=0.005, gradient_steps=1,
+    ent_coef="auto", srl=None, curiosity=None, actor_update_interval=1, target_update_interval=1, ent_coef_lr_factor=1,
+)  # fmt: skip
+#: Features extractors of SB3's policies
+EXTRACTORS = {"MlpPolicy": FlattenExtractor, "CnnPolicy": NatureCNN, "MultiInputPolicy": CombinedExtractor}
 
-    def __init__(self, policy: Any, env: Any, learning_rate: Any = 3e-4, buffer_size: int = 1_000_000, **kwargs: Any):
-        defaults = dict(
-            learning_starts=100, batch_size=256, tau=0.005, gradient_steps=1, srl=None, curiosity=None, ent_coef="auto",
-            actor_update_interval=1, target_update_interval=1, ent_coef_lr_factor=1.0,
-        )  # fmt: skip
-        kwargs["policy_kwargs"] = {"net_arch": [256, 256], **(kwargs.get("policy_kwargs") or {})}
-        super().__init__(policy, env, learning_rate, buffer_size, **{**defaults, **kwargs})
+
+class SAC(CuReSAC):
+    """CuReSAC without extras, with SAC's defaults; it trusts the files of its tests."""
+
+    def __init__(self, policy: Any, env: Any, **kwargs: Any):
+        policy_kwargs = {"net_arch": [256, 256], **(kwargs.get("policy_kwargs") or {})}
+        if policy != "MultiInputPolicy" or "features_extractor_kwargs" in policy_kwargs:
+            policy_kwargs.setdefault("features_extractor_class", EXTRACTORS.get(policy))
+        super().__init__(policy, env, **{**DEFAULTS, **kwargs, "policy_kwargs": policy_kwargs})
+
+    def load_replay_buffer(self, *args: Any, **kwargs: Any) -> None:
+        """Load a replay buffer.
+
+        :param args: As of CuReSAC
+        :param kwargs: As of CuReSAC
+        """
+        super().load_replay_buffer(*args, trusted=True, **kwargs)
 
 
 class TestsOfSAC:
