@@ -72,8 +72,9 @@ class CountReward(gym.RewardWrapper, RecordConstructorArgs):
 
 
 class CellInfo(gym.Wrapper, RecordConstructorArgs):
-    """Write the cell of the true state that each step leads to into ``info["cell"]``, where callbacks see it at the ends
-    of episodes, too.
+    """Write the cell of the true state that each step leads to into ``info["cell"]``.
+
+    Callbacks see it there at the ends of episodes, too.
 
     :param env: An environment of dm_control
     :param widths: Width of a cell along each coordinate that is counted, by its name

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure import make_dmc_env
 from sb3_cure.envs import physics_state, physics_state_names, rendering
-from sb3_cure.envs.counting import Cells, CountReward, CellInfo
+from sb3_cure.envs.counting import CellInfo, Cells, CountReward
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 
 WIDTHS = {"slider": 0.05, "hinge_1": 0.3}
