@@ -41,7 +41,8 @@ every_reward = pytest.mark.parametrize("arm", ARMS)
 def inputs_of(model: CuReSAC, batch: Any, latents: th.Tensor, next_latents: th.Tensor) -> RewardInputs:
     """What a reward reads, with given latents."""
     read = {"observations": latents, "next_observations": next_latents}
-    return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, model._look_up, model._encode_centred)  # type: ignore[arg-type]
+    of_model = model._reward_inputs(batch)
+    return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, of_model.look_up, of_model.encode)  # type: ignore[arg-type]
 
 
 def reward_of(model: CuReSAC) -> Any:
@@ -129,9 +130,8 @@ def test_trains_without_a_task_and_in_pretraining(arm: str, pixels: bool) -> Non
     short: dict[str, Any] = dict(episode_length=7)  # so that particles find some of other episodes
     policy, env = ("CnnPolicy", PixelBox(size=24, **short)) if pixels else ("MlpPolicy", VectorBox(**short))
     model = tiny_model(policy, env, task=False, **ARMS[arm]).learn(20)
-    latest = model._metrics.latest
-    assert all(math.isfinite(value) for value in map(float, latest.values()))
-    assert float(latest["train/curious_reward_std"]) > 0
+    logged = train_once(model)
+    assert all(map(math.isfinite, logged.values())) and logged["curious_reward_std"] > 0
     model = tiny_model(policy, env, curiosity=None, **ARMS[arm])
     before, sources = groups(model), set(model.policy.encoder_update.weights)
     model.pretrain(14)

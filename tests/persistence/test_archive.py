@@ -262,7 +262,7 @@ def test_parameters_of_another_model_are_refused() -> None:
     for source in (saved(wide), wide.get_parameters()):
         with pytest.raises(RuntimeError, match="size mismatch"):
             model.set_parameters(source)
-    alone = tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True))
+    alone = tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None)
     with pytest.raises(RuntimeError, match="Missing key"):
         model.set_parameters(saved(alone))
 

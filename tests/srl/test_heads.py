@@ -128,7 +128,7 @@ def cups() -> gym.Env:
 
 
 def model_of_cups(env: gym.Env, srl: str | None, hidden: int = 16, **kwargs: Any) -> CuReSAC:
-    small = dict(net_arch=[hidden], features_extractor_kwargs=dict(n_filters=8), share_encoder=True)
+    small = dict(net_arch=[hidden], features_extractor_kwargs=dict(n_filters=8))
     return tiny_model("CnnPolicy", env, srl=srl, curiosity=None, policy_kwargs=small, buffer_size=1000, **kwargs)
 
 
