@@ -32,11 +32,17 @@ def filled_model(algorithm: str = "sac", pixels: bool = False, **kwargs: Any) ->
 
 
 def sampled(model: CuReSAC) -> Samples:
-    """The batch that ``train_once`` draws, with torch's generator where the update begins."""
+    """The batch that ``train_once`` draws, with torch's generator and the encoder's statistics as in that update.
+
+    :param model: Not trained yet, so that the statistics of its first batch stay as they are when it comes again
+    """
     np.random.seed(1)
     batch = Samples(*model.replay_buffer.sample(BATCH))  # type: ignore[union-attr]
     th.manual_seed(1)
-    return batch._replace(views=model.policy.augmentation(batch.observations))
+    batch = batch._replace(views=model.policy.augmentation(batch.observations))
+    for encoder in (model.policy.encoder, model.policy.encoder_target):
+        encoder.update_statistics(batch.views)
+    return batch
 
 
 def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool = True) -> dict[str, float]:
@@ -48,11 +54,12 @@ def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool =
     :param actors: Whether actors and temperatures follow their critics
     :return: What was logged
     """
-    model._phase = lambda: (srl, rl)  # type: ignore[method-assign]
+    model._phase = lambda: (srl and model.policy.srl is not None, rl)  # type: ignore[method-assign]
     model._n_rl_batches = 0 if actors else 1
     np.random.seed(1)
     th.manual_seed(1)
     model.logger.name_to_value.clear()
+    model.logger.name_to_count.clear()  # of which `record_mean` makes its means
     model.train(1, BATCH)
     return {key.removeprefix("train/"): float(value) for key, value in model.logger.name_to_value.items()}
 

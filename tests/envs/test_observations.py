@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_for_tests import PixelBox, VectorBox
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -136,6 +136,21 @@ def test_images_and_vectors_of_any_shape_pass(part: spaces.Space) -> None:
 def test_policy_for_another_space_is_refused(space: spaces.Space, policy: str | None, advice: str) -> None:
     with pytest.raises(ValueError, match=advice):
         check_observation_space(space, policy)
+
+
+@pytest.mark.parametrize(
+    ("policy", "space", "value", "advice"),
+    [
+        ("MultiInputPolicy", spaces.Dict(front=image(1, 48, 48, 3)), None, "StackFrames"),
+        ("MultiInputPolicy", spaces.Dict(pixels=spaces.Dict(top=image(48, 48, 3))), None, "flatten it"),
+        ("MultiInputPolicy", image(48, 48, 3), None, "use 'CnnPolicy'"),
+        ("CnnPolicy", image(3, 36, 36), np.full((3, 36, 36), -0.5, np.float32), "with numbers such as -0.5"),
+    ],
+)
+def test_model_refuses_what_it_would_see_wrongly(policy: str, space: spaces.Space, value: Any, advice: str) -> None:
+    """Spaces before training, numbers at the first reset."""
+    with pytest.raises(ValueError, match=advice):
+        tiny_model(policy, Returns(space, value)).learn(1)
 
 
 # ------------------------------------------------------------------------------------------------------------- resize

@@ -190,7 +190,7 @@ def test_unusable_augmentations_are_refused() -> None:
     [
         ("rae", "auto", 36, Augmentation),
         ("curl", "auto", 36, RandomShift),
-        ("curl", "auto", 100, RandomCrop),
+        ("curl", "auto", 120, RandomCrop),
         (None, "auto", 36, Augmentation),
         (None, "shift", 36, RandomShift),
         ("rae", "shift", 36, RandomShift),
@@ -204,6 +204,7 @@ def test_auto_is_chosen_by_the_head(srl: str | None, augmentation: str | None, s
     policy = model.policy
     assert type(policy.augmentation) is expected
     assert policy.encoder.view_space == policy.augmentation.view_space
+    assert policy.encoder.view_space.shape[1] == (round(0.84 * size) if expected is RandomCrop else size)
     assert policy.srl is None or policy.srl.augment is policy.augmentation
 
 
