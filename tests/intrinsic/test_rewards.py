@@ -381,8 +381,7 @@ def test_particle_of_a_single_episode_earns_nothing() -> None:
     model = filled_model(srl=None, intrinsic="particle")
     found = captured(model)
     buffer: Any = model.replay_buffer
-    buffer.dones[:] = 0
-    buffer.observations[1:] = buffer.next_observations[:-1]
+    buffer.dones[:] = buffer.starts[1:] = 0
     train_once(model)
     assert not found[0].any()
 
