@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure.envs import CopyObservations, ResizeImages, StackFrames, check_observation_space, make_pixel_env
+from sb3_cure.persistence import ResumableEnv
 
 
 class Returns(gym.Env):
@@ -74,9 +75,10 @@ def test_observations_are_copies_of_the_keys_in_the_space() -> None:
     assert observation.keys() == {"front", "joint"} and observation["front"].all() and observation["joint"].all()
 
 
-def test_attributes_that_are_set_are_the_environments() -> None:
+@pytest.mark.parametrize("wrapper", [CopyObservations, ResumableEnv])
+def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
     """As with SB3's `set_attr`, which sets attributes of the outermost layer."""
-    venv = DummyVecEnv([lambda: CopyObservations(VectorBox())])
+    venv = DummyVecEnv([lambda: wrapper(VectorBox())])
     venv.set_attr("episode_length", 2)
     venv.reset()
     dones = [venv.step(np.zeros((1, 2), np.float32))[2][0] for _ in range(2)]
