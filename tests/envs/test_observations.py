@@ -200,10 +200,11 @@ def test_own_images_are_resized_and_stacked() -> None:
 
 
 def test_images_of_a_dictionary_are_stacked() -> None:
-    """The rest stays as it is."""
+    """The rest stays as it is, as a copy."""
     env = StackFrames(camera_and_joints(), 2)
     (first, _), (second, *_) = env.reset(), env.step(None)
     assert first["front"].shape == (48, 64, 6) and (first["front"] == second["front"]).all()
     assert env.observation_space["joints"] == spaces.Box(-1, 1, (2,)) and first in env.observation_space
+    assert np.array_equal(first["joints"], second["joints"]) and not np.shares_memory(first["joints"], second["joints"])
     with pytest.raises(ValueError, match="cannot be stacked: expected a Box"):
         StackFrames(gym.wrappers.FilterObservation(camera_and_joints(), ["joints"]), 2)

@@ -147,7 +147,9 @@ def r2_of_positions(model: CuReSAC, env: gym.Env, episodes: list[Episode]) -> fl
     return float(np.mean([found[name] for name in ("cup_x", "cup_z", "ball_x", "ball_z")]))
 
 
-@pytest.mark.parametrize("srl", [pytest.param("vae", marks=pytest.mark.long), "spr", "forward", "inverse"])
+@pytest.mark.parametrize(
+    "srl", [*(pytest.param(srl, marks=pytest.mark.long) for srl in ("vae", "spr")), "forward", "inverse"]
+)
 def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[Episode]]) -> None:
     """The positions of cup and ball, from images, by a linear map: far better than those of the untrained encoder.
 
