@@ -1,4 +1,4 @@
-"""How the curious agent values ends of episodes, falling errors and next observations."""
+"""How the curious agent values ends of episodes."""
 
 import os
 from typing import Any
@@ -8,7 +8,6 @@ import pytest
 import torch as th
 from agents_for_tests import q_values
 from envs_for_tests import Cliff, VectorBox, tiny_model
-from updates_for_tests import train_once
 
 from sb3_cure import CuReSAC
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -20,16 +19,6 @@ class ResetsAreNovel(SRLHead):
     def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
         position, reset, _ = batch.observations.unbind(dim=1)
         return SRLOutput(0 * latents.square().mean(), reset + 0.05 * (position + 2))
-
-
-class FallingError(SRLHead):
-    """No parameters; the error depends on the place and falls by 1 % with every batch."""
-
-    n_batches = 0
-
-    def loss(self, batch: Any, latents: th.Tensor) -> SRLOutput:
-        self.n_batches += 1
-        return SRLOutput(0 * latents.square().mean(), 0.99**self.n_batches * (2 + batch.observations[:, 0]))
 
 
 def curious_on_the_cliff(curiosity_gamma: float, ent_coef: float, updates: int, **kwargs: Any) -> CuReSAC:
@@ -62,7 +51,7 @@ def deaths(model: CuReSAC) -> float:
 @pytest.mark.parametrize("arguments, dies", [({}, False), ({"curiosity_episodic": True}, True)])
 def test_dying_is_not_preferred_by_default(arguments: dict[str, Any], dies: bool) -> None:
     """Nearly all rewards are below the mean: ending them pays if the return ends with the episode, and only then."""
-    share = deaths(curious_on_the_cliff(0.9, 0.02, 1000, learning_rate=3e-3, **arguments))
+    share = deaths(curious_on_the_cliff(0.9, 0.02, 500, learning_rate=3e-3, **arguments))
     assert share > 0.5 if dies else share < 0.2
 
 
@@ -70,9 +59,9 @@ def test_curious_values_of_terminal_states_stay_bounded() -> None:
     """No sample starts from them, so that no update corrects what is bootstrapped from: over 20 000 updates they stay
     beside the values of the states that are learned, far from the limit of 500 that rewards of 5 would allow.
 
-    By default a fifth of the updates, with targets that follow five times as fast: as many horizons of the return.
+    By default a tenth of the updates, with targets that follow ten times as fast: as many horizons of the return.
     """
-    speed = 1 if os.environ.get("SB3_CURE_TEST_ALL") else 5
+    speed = 1 if os.environ.get("SB3_CURE_TEST_ALL") else 10
     model = curious_on_the_cliff(0.99, 0.02, 0, learning_rate=3e-3, batch_size=16, tau=0.02 * speed)
     ended = model.replay_buffer.dones[:1000, 0] == 1
     ends = th.as_tensor(model.replay_buffer.next_observations[:1000, 0][ended])
@@ -85,14 +74,6 @@ def test_curious_values_of_terminal_states_stay_bounded() -> None:
             at_starts = q_values(model, "curious", model.policy.encode(starts), actions)
         assert float(at_starts.abs().max()) < 60
         assert float(at_starts.min()) - 5 < float(at_ends.min()) <= float(at_ends.max()) < float(at_starts.max()) + 5
-
-
-def test_curious_reward_stays_centred_while_errors_fall() -> None:
-    """A running mean would lag behind the error, and nearly all rewards would turn negative without a reason."""
-    model = tiny_model("MlpPolicy", VectorBox(), srl=FallingError, learning_starts=200).learn(200)
-    model.train(600, batch_size=16)
-    means = [train_once(model)["curious_reward_mean"] for _ in range(5)]
-    assert np.abs(means).max() < 0.05
 
 
 def test_transition_model_must_say_what_it_is() -> None:
