@@ -150,7 +150,7 @@ class PixelBox(VectorBox):
 
 
 def tiny_model(policy: str, env: Any, algorithm: type[CuReSAC] = CuReSAC, **kwargs: Any) -> CuReSAC:
-    """The smallest model that trains, on one thread and in fp32: 10 random agent steps, then an update per step.
+    """Make the smallest model that trains: on one thread, in fp32, 10 random agent steps, then an update per step.
 
     Networks are tiny unless ``policy_kwargs`` says otherwise.
     """

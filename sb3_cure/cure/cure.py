@@ -165,7 +165,7 @@ class CuRe(CuReBase):
             return learns_srl, False
         if not self._alternates:
             return learns_srl, True
-        srl_phase = self._n_updates // self.srl_period % 2 == 0
+        srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy
         return learns_srl and srl_phase, not srl_phase
 
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
