@@ -1,6 +1,6 @@
 """CuRe: curiosity-driven representations for an off-policy actor-critic (Algorithm 1 of the paper).
 
-Reads beside SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
+Compare with SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
 each update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says
 how several losses step the encoder that they share.
 """
@@ -94,14 +94,14 @@ class CuRe(CuReBase):
         :param env: Environments
         :return: What was collected
         """
-        goes_on = False
+        continues = False
         try:
             rollout = super().collect_rollouts(self._overlapped or env, *args, **kwargs)
-            goes_on = rollout.continue_training
+            continues = rollout.continue_training
         finally:
-            if not goes_on:  # the environments have made a step that is not stored: another `learn` begins with a reset
+            if not continues:  # a step was made and not stored: another `learn` begins with a reset
                 self._last_obs = None
-        if goes_on and not self._warmed_up and self.num_timesteps > self.learning_starts:
+        if continues and not self._warmed_up and self.num_timesteps > self.learning_starts:
             self._warm_up()
         return rollout
 
@@ -185,7 +185,7 @@ class CuRe(CuReBase):
         judges_head = reward is not None and reward.needs_srl
         if policy.srl is not None and (learns_srl or judges_head):
             srl_loss, inputs.srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
-        # A reward made of the head's error is that of the head before its step.
+        # A reward computed from the head's error uses the error before the head's step.
         curious_rewards = self._curious_rewards(inputs, metrics) if judges_head else None
         if learns_srl:
             self._update_srl(srl_loss)
@@ -198,7 +198,7 @@ class CuRe(CuReBase):
         return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
 
     def _srl_loss(self, srl: SRLHead, batch: Samples, learns: bool, metrics: Metrics) -> tuple[th.Tensor, th.Tensor]:
-        """Loss of the head, and the error of each sample that an intrinsic reward may be made of, [B]."""
+        """Loss of the head, and the error of each sample, which intrinsic rewards may use, [B]."""
         source = "srl" if learns else "measured"
         names = ["observations", "next_observations"] if srl.needs_next_latents else ["observations"]
         latents = [self.policy.encoder_update.latents(source, name) for name in names]
@@ -263,8 +263,8 @@ class CuRe(CuReBase):
             self._update_actor_critic("task", batch, rewards, discounts, view, metrics)
         if self._has_curious_agent:
             assert curious_rewards is not None
-            goes_on = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            discounts = goes_on * self.curiosity_gamma
+            continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
+            discounts = continues * self.curiosity_gamma
             self._update_actor_critic("curious", batch, curious_rewards, discounts, "next_observations", metrics)
 
     def _update_actor_critic(
@@ -281,7 +281,7 @@ class CuRe(CuReBase):
         :param name: ``"task"`` or ``"curious"``
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
-        :param discounts: Discount factor where the return goes on, else 0, [B, 1]
+        :param discounts: Discount factor where the return continues, else 0, [B, 1]
         :param bootstrap_view: Name of the views that the return bootstraps from
         :param metrics: Takes what is logged
         """
