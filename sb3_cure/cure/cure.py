@@ -255,17 +255,23 @@ class CuRe(CuReBase):
 
     def _update_agents(self, batch: Samples, curious_rewards: th.Tensor | None, metrics: Metrics) -> None:
         """UpdateTaskAC and UpdateCuriousAC, each with its rewards and discounts."""
+        one_step = "next_observations"
+        several = one_step if batch.n_step is None else "n_step"
+        views = {several} if not self._has_curious_agent else {several, one_step} if self.task else {one_step}
+        with th.no_grad():
+            encoder_target, inputs = self.policy.encoder_target, self.policy.encoder_update.views
+            next_latents = {view: encoder_target(inputs[view]) for view in views}
         if self.task:
-            n_step, view = (batch, "next_observations") if batch.n_step is None else (batch.n_step, "n_step")
+            n_step = batch.n_step or batch
             bonus = curious_rewards if self.curiosity == "bonus" else None
             rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
             discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
-            self._update_actor_critic("task", batch, rewards, discounts, view, metrics)
+            self._update_actor_critic("task", batch, rewards, discounts, several, next_latents[several], metrics)
         if self._has_curious_agent:
             assert curious_rewards is not None
             continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            discounts = continues * self.curiosity_gamma
-            self._update_actor_critic("curious", batch, curious_rewards, discounts, "next_observations", metrics)
+            discounts, latents = continues * self.curiosity_gamma, next_latents[one_step]
+            self._update_actor_critic("curious", batch, curious_rewards, discounts, one_step, latents, metrics)
 
     def _update_actor_critic(
         self,
@@ -273,7 +279,8 @@ class CuRe(CuReBase):
         batch: Samples,
         rewards: th.Tensor,
         discounts: th.Tensor,
-        bootstrap_view: str,
+        next_view: str,
+        next_latents: th.Tensor,
         metrics: Metrics,
     ) -> None:
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
@@ -282,13 +289,13 @@ class CuRe(CuReBase):
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return continues, else 0, [B, 1]
-        :param bootstrap_view: Name of the views that the return bootstraps from
+        :param next_view: Name of the views that the return bootstraps from
+        :param next_latents: Latents of these by the target encoder, [B, features_dim]
         :param metrics: Takes what is logged
         """
         agent, encoder, prefix = self.policy.agents[name], self.policy.encoder_update, PREFIXES[name]
         with th.no_grad():
-            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.features(bootstrap_view))
-            next_latents = self.policy.encoder_target(encoder.views[bootstrap_view]).float()
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.features(next_view))
             next_values = agent.critic_target.target_values(next_latents, next_actions)
             target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
         critic_loss = agent.critic.loss(encoder.latents(name), batch.actions, target)
