@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
-from grids_for_tests import DMC_TASK, TASK, TINY, method, steps_of, write_grid
+from grids_for_tests import DMC_TASK, TASK, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
