@@ -88,7 +88,7 @@ class ModelArchive:
     def read(self, part: str) -> dict[str, Any]:
         """Read states.
 
-        :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"traits"``
+        :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"architecture"``
         :return: States by name
         """
         with refusing(self.name):
@@ -126,7 +126,7 @@ def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor
 
     :param path: Model's file
     :return: The tensors of its policy by name; the logarithm of its curious agent's temperature, if it learns that; and
-        the ``traits`` of its policy
+        the ``architecture`` of its policy
     :raises ArchiveError: if it is damaged or pickled
     """
     with reading(path, "zip") as (file, name):
@@ -134,7 +134,7 @@ def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor
     if archive.is_pickled:
         raise ArchiveError(f"{name} was pickled by SB3's save: load it with trusted=True, and save it again.")
     temperature = archive.read("variables").get("policy.curious.log_ent_coef")
-    return archive.read("parameters")["policy"], temperature, archive.read("traits")
+    return archive.read("parameters")["policy"], temperature, archive.read("architecture")
 
 
 class SavesModels(OffPolicyAlgorithm):
@@ -180,7 +180,7 @@ class SavesModels(OffPolicyAlgorithm):
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
             "variables": {name: recursive_getattr(self, name) for name in variables},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
-            "traits": getattr(self.policy, "traits", {}),  # of SB3's own policies: none
+            "architecture": getattr(self.policy, "architecture", {}),  # of SB3's own policies: none
         }
         data = {"format": VERSION, "settings": settings}
         data |= {name: encode(part, name, tensors) for name, part in content.items()}
