@@ -185,7 +185,7 @@ class CuRe(CuReBase):
         judges_head = reward is not None and reward.needs_srl
         if policy.srl is not None and (learns_srl or judges_head):
             srl_loss, inputs.srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
-        # A reward computed from the head's error uses the error before the head's step.
+        # A reward made of the head's error is that of the head before its step.
         curious_rewards = self._curious_rewards(inputs, metrics) if judges_head else None
         if learns_srl:
             self._update_srl(srl_loss)
@@ -198,7 +198,7 @@ class CuRe(CuReBase):
         return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
 
     def _srl_loss(self, srl: SRLHead, batch: Samples, learns: bool, metrics: Metrics) -> tuple[th.Tensor, th.Tensor]:
-        """Loss of the head, and the error of each sample, which intrinsic rewards may use, [B]."""
+        """Loss of the head, and the error of each sample that an intrinsic reward may be made of, [B]."""
         source = "srl" if learns else "measured"
         names = ["observations", "next_observations"] if srl.needs_next_latents else ["observations"]
         latents = [self.policy.encoder_update.latents(source, name) for name in names]
