@@ -1,7 +1,7 @@
 """Models as a ``.zip`` of JSON and safetensors, which can be loaded from strangers.
 
 ``data`` is the JSON of the settings, in which the tensors of ``tensors.safetensors`` are named. What is no data (a
-function, a user's class) is there as a placeholder that tells what it was, and ``load`` asks for it.
+function, a user's class) is there as a placeholder that names it, and ``load`` needs it in ``custom_objects``.
 """
 
 import json
@@ -46,7 +46,7 @@ _TEMPERATURES = {
 
 
 class Stateful(Protocol):
-    """A part of a model with a state beside tensors and settings."""
+    """A part of a model with a state besides tensors and settings."""
 
     def state_dict(self) -> dict[str, Any]:
         """Get the state.
@@ -141,7 +141,7 @@ class SavesModels(OffPolicyAlgorithm):
     """Mixin for an algorithm of SB3: ``save``, ``load`` and ``set_parameters`` without pickle."""
 
     def _stateful_parts(self) -> dict[str, Stateful]:
-        """Objects with a state beside tensors and settings, such as a generator, by name: saved and resumed."""
+        """Objects with a state besides tensors and settings, such as a generator, by name: saved and resumed."""
         parts: dict[str, Stateful] = getattr(super(), "_stateful_parts", dict)()
         return parts
 
@@ -206,7 +206,7 @@ class SavesModels(OffPolicyAlgorithm):
     ) -> Self:
         """Load a model, also one from a stranger.
 
-        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still ask for
+        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still need
         more memory than there is.) A temperature that is given replaces the saved one, whether fixed or learned.
 
         :param path: Path with or without its suffix ``.zip``, or a binary file
