@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from sb3_cure.evaluation.result_files import code_commit, write_json
 from stable_baselines3.common.logger import configure
 
 from benchmarks.harness import describe_machine
 from sb3_cure.allocator import tune_allocator
+from sb3_cure.evaluation.result_files import code_commit, write_json
 from sb3_cure.experiments.grid import Cell, load_grid, short_name
 
 #: Agent steps without updates, then steps with updates that do not count

@@ -1,6 +1,6 @@
 """CuRe: curiosity-driven representations for an off-policy actor-critic (Algorithm 1 of the paper).
 
-Reads beside SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
+Compare with SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
 each update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says
 how several losses step the encoder that they share.
 """
@@ -94,14 +94,14 @@ class CuRe(CuReBase):
         :param env: Environments
         :return: What was collected
         """
-        goes_on = False
+        continues = False
         try:
             rollout = super().collect_rollouts(self._overlapped or env, *args, **kwargs)
-            goes_on = rollout.continue_training
+            continues = rollout.continue_training
         finally:
-            if not goes_on:  # the environments have made a step that is not stored: another `learn` begins with a reset
+            if not continues:  # a step was made and not stored: another `learn` begins with a reset
                 self._last_obs = None
-        if goes_on and not self._warmed_up and self.num_timesteps > self.learning_starts:
+        if continues and not self._warmed_up and self.num_timesteps > self.learning_starts:
             self._warm_up()
         return rollout
 
@@ -184,9 +184,11 @@ class CuRe(CuReBase):
         reward = policy.intrinsic if learns_rl else None
         judges_head = reward is not None and reward.needs_srl
         if policy.srl is not None and (learns_srl or judges_head):
-            srl_loss, inputs.srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
-        # A reward made of the head's error is that of the head before its step.
-        curious_rewards = self._curious_rewards(inputs, metrics) if judges_head else None
+            srl_loss, srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
+        curious_rewards = None
+        if judges_head:  # the reward is of the head before its step
+            inputs.srl_error = self._judged_error(policy.srl, batch, srl_error)
+            curious_rewards = self._curious_rewards(inputs, metrics)
         if learns_srl:
             self._update_srl(srl_loss)
         if reward is not None and not judges_head:
@@ -198,7 +200,7 @@ class CuRe(CuReBase):
         return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
 
     def _srl_loss(self, srl: SRLHead, batch: Samples, learns: bool, metrics: Metrics) -> tuple[th.Tensor, th.Tensor]:
-        """Loss of the head, and the error of each sample that an intrinsic reward may be made of, [B]."""
+        """Loss of the head, and the error of each sample, [B]."""
         source = "srl" if learns else "measured"
         names = ["observations", "next_observations"] if srl.needs_next_latents else ["observations"]
         latents = [self.policy.encoder_update.latents(source, name) for name in names]
@@ -211,17 +213,17 @@ class CuRe(CuReBase):
             )
         variance = latents[0].detach().var(dim=0, correction=0).mean()
         metrics |= {"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance}
-        of_transitions = srl.needs_next_latents or srl.models_transitions
-        if self.curiosity_target == "next_observation" and not of_transitions and self.policy.intrinsic is not None:
-            error = self._next_srl_error(srl, batch)
         return loss.float(), error.float()
 
     @th.no_grad()
-    def _next_srl_error(self, srl: SRLHead, batch: Samples) -> th.Tensor:
+    def _judged_error(self, srl: Any, batch: Samples, error: th.Tensor) -> th.Tensor:
+        """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
+        if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
+            return error
         views = self.policy.augmentation(batch.next_observations)
         latents = self.policy.encoder(views)
         # With nothing else, so that no head takes (s', a, s') for a transition.
-        return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error  # type: ignore[arg-type]
+        return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error.float()  # type: ignore[arg-type]
 
     def _update_srl(self, loss: th.Tensor) -> None:
         """UpdateSRL: train the head and, through the latents, the encoder."""
@@ -255,17 +257,23 @@ class CuRe(CuReBase):
 
     def _update_agents(self, batch: Samples, curious_rewards: th.Tensor | None, metrics: Metrics) -> None:
         """UpdateTaskAC and UpdateCuriousAC, each with its rewards and discounts."""
+        one_step = "next_observations"
+        several = one_step if batch.n_step is None else "n_step"
+        views = {several} if not self._has_curious_agent else {several, one_step} if self.task else {one_step}
+        with th.no_grad():
+            encoder_target, inputs = self.policy.encoder_target, self.policy.encoder_update.views
+            next_latents = {view: encoder_target(inputs[view]) for view in views}
         if self.task:
-            n_step, view = (batch, "next_observations") if batch.n_step is None else (batch.n_step, "n_step")
+            n_step = batch.n_step or batch
             bonus = curious_rewards if self.curiosity == "bonus" else None
             rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
             discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
-            self._update_actor_critic("task", batch, rewards, discounts, view, metrics)
+            self._update_actor_critic("task", batch, rewards, discounts, several, next_latents[several], metrics)
         if self._has_curious_agent:
             assert curious_rewards is not None
-            goes_on = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            discounts = goes_on * self.curiosity_gamma
-            self._update_actor_critic("curious", batch, curious_rewards, discounts, "next_observations", metrics)
+            continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
+            discounts, latents = continues * self.curiosity_gamma, next_latents[one_step]
+            self._update_actor_critic("curious", batch, curious_rewards, discounts, one_step, latents, metrics)
 
     def _update_actor_critic(
         self,
@@ -273,7 +281,8 @@ class CuRe(CuReBase):
         batch: Samples,
         rewards: th.Tensor,
         discounts: th.Tensor,
-        bootstrap_view: str,
+        next_view: str,
+        next_latents: th.Tensor,
         metrics: Metrics,
     ) -> None:
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
@@ -281,14 +290,14 @@ class CuRe(CuReBase):
         :param name: ``"task"`` or ``"curious"``
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
-        :param discounts: Discount factor where the return goes on, else 0, [B, 1]
-        :param bootstrap_view: Name of the views that the return bootstraps from
+        :param discounts: Discount factor where the return continues, else 0, [B, 1]
+        :param next_view: Name of the views that the return bootstraps from
+        :param next_latents: Latents of these by the target encoder, [B, features_dim]
         :param metrics: Takes what is logged
         """
         agent, encoder, prefix = self.policy.agents[name], self.policy.encoder_update, PREFIXES[name]
         with th.no_grad():
-            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.features(bootstrap_view))
-            next_latents = self.policy.encoder_target(encoder.views[bootstrap_view]).float()
+            next_actions, next_log_prob = agent.actor.action_log_prob(encoder.features(next_view))
             next_values = agent.critic_target.target_values(next_latents, next_actions)
             target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
         critic_loss = agent.critic.loss(encoder.latents(name), batch.actions, target)

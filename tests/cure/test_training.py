@@ -402,10 +402,14 @@ def test_pretraining(curiosity: str | None, collector: str) -> None:
 
 
 def test_training_after_pretraining_begins_as_without() -> None:
-    """With the same environments and random actions; two calls of ``pretrain`` do not collect the same steps."""
+    """With the same environments and random numbers; two calls of ``pretrain`` do not collect the same steps."""
     collected: list[np.ndarray] = []
+    states: list[th.Tensor] = []
 
     class Keep(BaseCallback):
+        def _on_training_start(self) -> None:
+            states.append(th.get_rng_state())
+
         def _on_step(self) -> bool:
             return True
 
@@ -419,7 +423,7 @@ def test_training_after_pretraining_begins_as_without() -> None:
             model.pretrain(30, "random", callback=Keep())
         model.learn(30, callback=Keep())
     first, second, pretrained, vanilla = collected
-    assert (first != second).any()
+    assert (first != second).any() and th.equal(*states[2:])
     np.testing.assert_array_equal(pretrained, vanilla)
 
 
