@@ -3,8 +3,9 @@
 python -m benchmarks.sb3_tests path/to/stable-baselines3 --out results/robustness (a checkout of about the installed
 version; a quarter of an hour)
 
-Tests of what CuReSAC refuses by design fail: gSDE, ``share_features_extractor``, SB3's policy classes, its n-step
-buffer. The installed SB3 is tested, and of the checkout only the folder ``tests`` is read.
+Tests of what CuReSAC does otherwise by design fail: gSDE, ``share_features_extractor``, SB3's n-step buffer, images
+standardised by ``VecNormalize``; and those that read SB3's policy classes, whose actors and critics have encoders of
+their own. The installed SB3 is tested, and of the checkout only the folder ``tests`` is read.
 """
 
 import argparse
@@ -22,23 +23,23 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 
 from sb3_cure import CuReSAC
+from sb3_cure.data.observations import image_spaces
 
 #: SAC's defaults, and no extras
 DEFAULTS: dict[str, Any] = dict(
     learning_rate=3e-4, buffer_size=1_000_000, learning_starts=100, batch_size=256, tau=0.005, gradient_steps=1,
     ent_coef="auto", srl=None, curiosity=None, actor_update_interval=1, target_update_interval=1, ent_coef_lr_factor=1,
 )  # fmt: skip
-#: Features extractors of SB3's policies
-EXTRACTORS = {"MlpPolicy": FlattenExtractor, "CnnPolicy": NatureCNN, "MultiInputPolicy": CombinedExtractor}
 
 
 class SAC(CuReSAC):
     """CuReSAC without extras, with SAC's defaults; it trusts the files of its tests."""
 
     def __init__(self, policy: Any, env: Any, **kwargs: Any):
-        policy_kwargs = {"net_arch": [256, 256], **(kwargs.get("policy_kwargs") or {})}
-        if policy != "MultiInputPolicy" or "features_extractor_kwargs" in policy_kwargs:
-            policy_kwargs.setdefault("features_extractor_class", EXTRACTORS.get(policy))
+        has_images = policy == "MultiInputPolicy" and env is not None and bool(image_spaces(env.observation_space))
+        extractor = NatureCNN if policy == "CnnPolicy" else CombinedExtractor if has_images else FlattenExtractor
+        defaults = {"net_arch": [256, 256], "features_extractor_class": extractor}
+        policy_kwargs = defaults | (kwargs.get("policy_kwargs") or {})
         super().__init__(policy, env, **{**DEFAULTS, **kwargs, "policy_kwargs": policy_kwargs})
 
     def load_replay_buffer(self, *args: Any, **kwargs: Any) -> None:

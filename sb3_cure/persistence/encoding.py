@@ -122,6 +122,8 @@ NAMED: dict[str, Any] = {
         encoders.VectorEncoder,
         encoders.DictEncoder,
         torch_layers.FlattenExtractor,
+        torch_layers.NatureCNN,
+        torch_layers.CombinedExtractor,
         *SRL_HEADS.values(),
         *INTRINSIC_REWARDS.values(),
         *_of_module(activation, th.nn.Module),

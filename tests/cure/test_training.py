@@ -485,12 +485,14 @@ def test_sac_alone_trains_the_shared_encoder(update: str) -> None:
 
 
 @pytest.mark.parametrize("srl", ["rae", "curl"])
-def test_nature_cnn_is_shared_and_trained_by_all(srl: str) -> None:
+def test_nature_cnn_is_shared_and_trained_by_all(srl: str, tmp_path: Path) -> None:
     policy_kwargs = dict(features_extractor_class=NatureCNN, features_extractor_kwargs=dict(features_dim=8))
     model = tiny_model("CnnPolicy", PixelBox(), srl=srl, policy_kwargs=policy_kwargs)
     names = moved(model, lambda: model.learn(14))
     assert names >= {"encoder", "encoder_target", "srl", *TASK, *CURIOUS}
-    assert model.policy.encode(th.zeros(3, 6, 36, 36, dtype=th.uint8)).shape == (3, 8)
+    model.save(tmp_path / "model")
+    loaded = CuReSAC.load(tmp_path / "model")
+    assert loaded.policy.encode(th.zeros(3, 6, 36, 36, dtype=th.uint8)).shape == (3, 8)
 
 
 @both_updates
