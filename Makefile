@@ -77,9 +77,9 @@ test: gl  ## run the tests in two processes (options for pytest: make test PYTES
 test-all: export SB3_CURE_TEST_ALL := 1
 test-all: test  ## the same, with all combinations of algorithms, heads, rewards and sensors, and with long tests
 
-# What runs with the lowest versions of setup.cfg's ranges and without the extras: bit parity with SB3, SB3's habits,
-# the replay buffer, CuRe's own arguments, and the pixels of dm_control.
-SMOKE := tests/cure/test_sb3_parity.py tests/cure/test_compatibility.py tests/data/test_buffers.py \
+# What runs with the lowest versions of setup.cfg's ranges and without the extras: parity with SB3, SB3's habits, the
+# replay buffer, CuRe's own arguments, and the pixels of dm_control.
+SMOKE := tests/cure/test_update_equals_sb3.py tests/cure/test_compatibility.py tests/data/test_buffers.py \
 	tests/cure/test_arguments.py tests/envs/test_envs.py::test_frames_and_rewards_are_those_of_dm_control
 
 .venv-oldest/.installed: .venv/.installed setup.cfg constraints-oldest.txt

@@ -16,8 +16,9 @@ def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
     :return: By head: milliseconds of an update, and how many more these are than without a head
     """
     small = SETTINGS[0]
-    common: dict[str, Any] = dict(env_kwargs=small.env_kwargs, warmup_updates=0, curiosity=None)
-    common["policy_kwargs"] = {**small.policy_kwargs, "share_encoder": True}
+    common: dict[str, Any] = dict(
+        env_kwargs=small.env_kwargs, policy_kwargs=small.policy_kwargs, warmup_updates=0, curiosity=None
+    )
     arms: dict[str, dict[str, Any]] = {PLAIN: {}, "no head, shift": dict(augmentation="shift")}
     arms |= {head: dict(srl=head) for head in SRL_HEADS}
     models = {name: make_model(**common, **{"srl": None, **arm}) for name, arm in arms.items()}

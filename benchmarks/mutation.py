@@ -41,13 +41,13 @@ ROOT = Path(__file__).resolve().parent.parent
 GROUPS = {
     "cure/cure.py": """cure/test_gradients.py cure/test_actor_critic.py cure/test_temperatures.py test_polyak_rates.py
         cure/test_warmup_burst.py cure/test_curiosity_target.py cure/test_alternating.py
-        persistence/test_resume_and_more.py cure/test_training.py
+        persistence/test_resume.py cure/test_training.py
         srl/test_contract.py::test_error_is_one_number_per_sample_detached
-        cure/test_sb3_parity.py::test_updates_of_tqc_equal_sb3_contrib
+        cure/test_update_equals_sb3.py
         -k 'not (one_update_per or vectors or can_be_changed or frame_stack or bar or csv or board)'""",
     "cure/critics.py": "cure/test_critics.py cure/test_gradients.py cure/test_actor_critic.py",
     "cure/encoder_update.py": "cure/test_encoder_update.py cure/test_encoder_shares.py cure/test_gradients.py",
-    "cure/mixers.py": """cure/test_mixers.py persistence/test_resume_and_more.py
+    "cure/mixers.py": """cure/test_mixers.py persistence/test_resume.py
         cure/test_training.py::test_schedules_begin_where_the_call_begins""",
     "cure/pretraining.py": "cure -k pretrain",
     "srl/*.py": "srl cure/test_dictionaries.py",

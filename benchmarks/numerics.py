@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 from benchmarks.harness import make_model
 
-COLUMNS = {"train/q_value": "mean Q", "train/srl_loss": "SRL loss"}
+COLUMNS = {"train/q_target": "mean Q", "train/srl_loss": "SRL loss"}
 #: Small, so that there is time for many seeds: how far runs part says more than one run of the paper's size
 BATCH_SIZE = 16
 ENV = dict(image_size=36, grayscale=True)

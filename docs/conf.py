@@ -70,7 +70,7 @@ def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
 
 def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Asterisks in shapes, as in [B, *shape], are no emphasis."""
-    lines[:] = [re.sub(r"(\[(?:\w+, )*)\*(?=\w)", r"\1\\*", line) for line in lines]
+    lines[:] = [re.sub(r"(\[(?:[\w.]+, )*)\*(?=\w)", r"\1\\*", line) for line in lines]
 
 
 def mark_tables(app: Sphinx, doctree: nodes.document) -> None:

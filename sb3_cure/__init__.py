@@ -3,7 +3,7 @@
 from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 from sb3_cure.envs import make_dmc_env, make_pixel_env, register_dmc_envs
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.4.0.dev0"
 
 register_dmc_envs()
 

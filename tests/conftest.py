@@ -2,7 +2,7 @@
 
 import os
 
-# Without a display MuJoCo needs to be told to render off-screen, before it is imported.
+# Without a display MuJoCo needs a backend that renders off-screen, before it is imported.
 os.environ.setdefault("MUJOCO_GL", "egl")
 # For the processes that tests start; see below.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -19,14 +19,13 @@ multiprocessing.get_context("forkserver").set_forkserver_preload(["sb3_cure", "s
 th.set_num_threads(1)
 
 
-#: Tests that take longest, by the beginnings of their names. They are begun first: of two processes neither is to be
+#: Tests that take longest, by the beginnings of their names. They start first: of two processes neither is
 #: left alone with one of them at the end.
 LONGEST = (
-    "tests/test_learning.py",
-    "tests/test_determinism.py",
-    "tests/test_curious_returns.py",
-    "tests/test_diagnostics.py::test_real_pixels",
-    "tests/test_sb3_parity.py::test_500_updates",
+    "tests/cure/test_learning.py",
+    "tests/cure/test_determinism.py",
+    "tests/cure/test_curious_returns.py",
+    "tests/evaluation/test_diagnostics.py::test_real_pixels",
     "tests/experiments/test_run.py::test_killed",
     "tests/experiments/test_cells.py::test_pictures_show_every_policy",
     "tests/test_notebooks.py",

@@ -11,7 +11,6 @@ from envs_for_tests import PixelBox
 from stable_baselines3 import SAC
 
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
 
 PAGE = (Path(__file__).parents[1] / "docs" / "coming_from.md").read_text(encoding="utf-8")
@@ -34,13 +33,13 @@ def test_each_project_has_its_lines() -> None:
 
 
 def test_sb3s_lines_have_sb3s_defaults() -> None:
-    """Whatever differs from them is written there, but for the buffer, whose batches are SB3's bit for bit."""
+    """Whatever differs from them is written there; our own rates are SB3's single one."""
     names: dict[str, Any] = {"env": None, "CuReSAC": lambda policy, env, **given: given}
     exec(SNIPPETS["Stable-Baselines3"].replace("from sb3_cure import", "# "), names)
     ours = {name: each.default for name, each in inspect.signature(CuReSAC.__init__).parameters.items()}
     theirs = {name: each.default for name, each in inspect.signature(SAC.__init__).parameters.items()}
     given = {**ours, **names["model"]}
-    assert given.pop("replay_buffer_class") is FrameStackReplayBuffer and given.pop("replay_buffer_kwargs")
+    assert given["encoder_tau"] == given["tau"] and given["ent_coef_lr_factor"] == given["actor_update_interval"] == 1
     for name, default in theirs.items():
         assert given.get(name, default) == default, name
 

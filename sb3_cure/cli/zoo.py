@@ -271,7 +271,7 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
     for name in OWN:
         parser.add_argument(f"--{name}", metavar="MODULE.CLASS", help="Class of your own, which no saved model holds")
     parser.add_argument(
-        "--trusted", action="store_true", help="Also import, call and unpickle what the run's folder asks for"
+        "--trusted", action="store_true", help="Also import, call and unpickle what the run's folder names"
     )
     return parser
 

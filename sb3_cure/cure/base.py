@@ -35,7 +35,7 @@ class CuReBase(OffPolicyAlgorithm):
     Defaults are the paper's table of hyperparameters. Timesteps are *agent* steps, as everywhere in SB3: environment
     steps divided by the action repeat.
 
-    With ``srl=None, curiosity=None`` it is the base class whose encoder is shared and trained by the critics alone.
+    With ``srl=None, curiosity=None`` it is the base class with one encoder, shared and trained by the critics alone.
 
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for dictionaries of
         both, or a subclass of ``CuRePolicy``
@@ -67,13 +67,13 @@ class CuReBase(OffPolicyAlgorithm):
     :param curiosity_beta: beta, factor of the intrinsic reward
     :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"``
     :param curiosity_ent_coef: Temperature of the curious agent, as ``ent_coef``; None: like ``ent_coef``
-    :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it goes on: a
+    :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it does not: a
         reward of mean zero would otherwise make dying attractive wherever the error is low
     :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
-    :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head asks for
+    :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
     :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000), or 0
         where there is no warm-up. In each of them actors, temperatures and targets are updated, as in SAC-AE's code
@@ -383,7 +383,7 @@ class CuReBase(OffPolicyAlgorithm):
         return max(self._current_progress_remaining, 0.0)
 
     def dump_logs(self) -> None:
-        """Write the logs: SB3's, environment steps beside agent steps, and how often the curious actor acted."""
+        """Write the logs: SB3's, environment steps next to agent steps, and how often the curious actor acted."""
         self.logger.record("time/environment_steps", self.num_timesteps * self._action_repeat)
         for name, value in self._mixer.pop_metrics().items():
             self.logger.record(name, value)

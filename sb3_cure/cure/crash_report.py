@@ -88,7 +88,7 @@ class FiniteGuard:
 
 @contextlib.contextmanager
 def crash_report(model: OffPolicyAlgorithm, batch: Any) -> Iterator[None]:
-    """Write the batch of a ``NonFiniteError`` beside the logs, or among temporary files, and name the folder in it.
+    """Write the batch of a ``NonFiniteError`` next to the logs, or among temporary files, and name the folder in it.
 
     :param model: The model
     :param batch: Samples that it learns from within this context

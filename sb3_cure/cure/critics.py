@@ -67,7 +67,7 @@ class LatentCritic(MixedPrecision):
         return run_mlp(self.ensemble, inputs, self.compute_dtype).transpose(0, 1)
 
     def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Compute the values to bootstrap from, without the entropy; asked of target critics.
+        """Compute the values to bootstrap from, without the entropy; for target critics.
 
         :param latents: Latents of the next observations, [B, features_dim]
         :param actions: Next actions, [B, action_dim]

@@ -1,6 +1,6 @@
 """CuRe: curiosity-driven representations for an off-policy actor-critic (Algorithm 1 of the paper).
 
-Reads beside SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
+Compare with SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
 each update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says
 how several losses step the encoder that they share.
 """
@@ -94,14 +94,14 @@ class CuRe(CuReBase):
         :param env: Environments
         :return: What was collected
         """
-        goes_on = False
+        continues = False
         try:
             rollout = super().collect_rollouts(self._overlapped or env, *args, **kwargs)
-            goes_on = rollout.continue_training
+            continues = rollout.continue_training
         finally:
-            if not goes_on:  # the environments have made a step that is not stored: another `learn` begins with a reset
+            if not continues:  # a step was made and not stored: another `learn` begins with a reset
                 self._last_obs = None
-        if goes_on and not self._warmed_up and self.num_timesteps > self.learning_starts:
+        if continues and not self._warmed_up and self.num_timesteps > self.learning_starts:
             self._warm_up()
         return rollout
 
@@ -165,7 +165,7 @@ class CuRe(CuReBase):
             return learns_srl, False
         if not self._alternates:
             return learns_srl, True
-        srl_phase = self._n_updates // self.srl_period % 2 == 0
+        srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy
         return learns_srl and srl_phase, not srl_phase
 
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
@@ -271,8 +271,8 @@ class CuRe(CuReBase):
             self._update_actor_critic("task", batch, rewards, discounts, several, next_latents[several], metrics)
         if self._has_curious_agent:
             assert curious_rewards is not None
-            goes_on = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            discounts, latents = goes_on * self.curiosity_gamma, next_latents[one_step]
+            continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
+            discounts, latents = continues * self.curiosity_gamma, next_latents[one_step]
             self._update_actor_critic("curious", batch, curious_rewards, discounts, one_step, latents, metrics)
 
     def _update_actor_critic(
@@ -290,7 +290,7 @@ class CuRe(CuReBase):
         :param name: ``"task"`` or ``"curious"``
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
-        :param discounts: Discount factor where the return goes on, else 0, [B, 1]
+        :param discounts: Discount factor where the return continues, else 0, [B, 1]
         :param next_view: Name of the views that the return bootstraps from
         :param next_latents: Latents of these by the target encoder, [B, features_dim]
         :param metrics: Takes what is logged

@@ -1,5 +1,8 @@
-"""Train the representation before the task: while collecting without task reward (paper, "Effect of Pretraining"), from
-episodes on disk, or by transfer from a model of another task (the paper's outlook)."""
+"""Train the representation before the task.
+
+While collecting without task reward (paper, "Effect of Pretraining"), from episodes on disk, or by transfer from a
+model of another task (the paper's outlook).
+"""
 
 import functools
 from collections.abc import Iterable
@@ -50,7 +53,7 @@ class Pretraining(CuRe):
     def load_transitions(self, source: str | Path | Iterable[Any]) -> int:
         """Fill the replay buffer from episodes on disk, see ``sb3_cure.datasets``.
 
-        ``learn`` then begins with them beside what it collects; ``learning_starts=0`` leaves its random warm-up out.
+        ``learn`` then begins with them and adds what it collects; ``learning_starts=0`` leaves its random warm-up out.
 
         :param source: A folder of ``.npz`` files, one such file, or episodes with their attributes, such as
             ``minari.load_dataset(...)``
@@ -159,7 +162,7 @@ class Pretraining(CuRe):
         :param callback: SB3 callback(s)
         :param log_interval: Episodes between two dumps of the logger
         :param tb_log_name: Name of the run in TensorBoard
-        :param reset_num_timesteps: False: go on with the pretraining in which a loaded checkpoint was taken
+        :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was taken
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         :raises ValueError: if there is no SRL head, or no such collector

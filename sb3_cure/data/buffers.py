@@ -42,7 +42,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
     :param optimize_memory_usage: Ignored: frames are kept once in any case
     :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
         as an infinite horizon task
-    :param frame_stack: Frames per observation, which channels cannot tell: by key (1 for other images), or one number
+    :param frame_stack: Frames per observation, which channels do not show: by key (1 for other images), or one number
         for all (in dictionaries 1 where it does not divide the channels)
     :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
         a million transitions of 84x84 take 22 GB. The last directory of the path is created if it is missing. The
@@ -152,7 +152,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         row: dict[str, Any] = {"actions": np.asarray(action).reshape(self.n_envs, self.action_dim)}
         row |= {"rewards": reward, "dones": done}
         if self.handle_timeout_termination:
-            row["timeouts"] = [info.get("TimeLimit.truncated", False) for info in infos]
+            row["timeouts"] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(self.n_envs)
         counts = {}
         for key, ring in self.rings.items():
             tails = self.rows[f"slots/{key}"][before, :, 1] if self._n_valid else None

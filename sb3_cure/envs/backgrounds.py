@@ -1,8 +1,8 @@
-"""What is seen behind a robot in place of sky and floor: distractors, which tell nothing of the task.
+"""What is seen behind a robot in place of sky and floor: distractors, which say nothing about the task.
 
 As in the benchmarks of Zhang et al. (2018), "Natural Environment Benchmarks for Reinforcement Learning", and Stone et
 al. (2021), "The Distracting Control Suite". Where the robot is MuJoCo's own segmentation says, so that all tasks and
-cameras are alike; it is rendered beside each frame.
+cameras are alike; it is rendered along with each frame.
 """
 
 from collections.abc import Sequence

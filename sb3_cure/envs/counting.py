@@ -1,4 +1,4 @@
-"""How often cells of the true state were visited: a reward that sees them, and what callbacks count by."""
+"""Visits of cells of the true state: in the info, for callbacks, and as a reward."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,97 +10,81 @@ from gymnasium.utils import RecordConstructorArgs
 from sb3_cure.envs.physics import physics_state, physics_state_names
 
 
-class Cells:
-    """The joint grid over some coordinates of the true state; it has no end on any side.
+class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Puts the cell of the true state that each step leads to into ``info["cell"]``.
 
-    :param widths: Width of a cell along each coordinate, in its unit
-    :param names: Names of all coordinates, see ``physics_state_names``
-    :raises ValueError: if there are no such coordinates
+    Cells are those of a joint grid over some coordinates, which is unbounded. Callbacks see the cell of the last step
+    of an episode, too.
+
+    :param env: A dm_control environment, such as ``make_dmc_env`` makes
+    :param widths: Width of a cell along each coordinate of the grid, by name (see ``physics_state_names``), in its unit
+    :raises ValueError: If there are no such coordinates
     """
 
-    def __init__(self, widths: Mapping[str, float], names: list[str]):
-        if not widths or not set(widths) <= set(names) or min(widths.values()) <= 0:
-            raise ValueError(f"widths are {dict(widths)!r}: give a width > 0 for some of {', '.join(names)}.")
-        self._indices = [names.index(name) for name in widths]
-        self._widths = np.array(list(widths.values()), dtype=np.float64)
-
-    def of(self, state: np.ndarray) -> tuple[int, ...]:
-        """
-        :param state: The true state, [d]
-        :return: The cell that it lies in
-        """
-        return tuple(np.floor(state[self._indices] / self._widths).astype(int).tolist())
-
-
-class CountReward(gym.RewardWrapper, RecordConstructorArgs):
-    """An oracle of exploration: the reward is 1 / sqrt(N), N the visits so far of the cell that a step leads to.
-
-    Counts of Strehl and Littman (2008), MBIE-EB. They start with the environment, go on over its episodes and through
-    exact resume; environments side by side count each for itself.
-
-    :param env: An environment of dm_control, such as ``make_dmc_env`` makes
-    :param widths: Width of a cell along each coordinate that is counted, by its name
-    """
-
-    def __init__(self, env: gym.Env, widths: Mapping[str, float]):
+    def __init__(self, env: gym.Env, widths: Mapping[str, float]) -> None:
         RecordConstructorArgs.__init__(self, widths=dict(widths))
         super().__init__(env)
-        self._cells = Cells(widths, physics_state_names(env))
+        self._indices, self._widths = _grid(env, widths)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment.
+
+        :param action: The action
+        :return: What the environment returns, with the cell, a tuple of integers, in the info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        cell = _cell(self.env, self._indices, self._widths)
+        return observation, reward, terminated, truncated, {**info, "cell": cell}
+
+
+class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
+    """Gives the reward 1 / sqrt(N), N the visits so far of the cell that a step leads to: an oracle of exploration.
+
+    Counts of Strehl and Littman (2008), MBIE-EB. They start with the environment and continue over its episodes and
+    through exact resume. Each environment counts for itself.
+
+    :param env: As of ``CellInfo``
+    :param widths: As of ``CellInfo``
+    """
+
+    def __init__(self, env: gym.Env, widths: Mapping[str, float]) -> None:
+        RecordConstructorArgs.__init__(self, widths=dict(widths))
+        super().__init__(env)
+        self._indices, self._widths = _grid(env, widths)
         #: Visits of each cell
         self.visits: dict[tuple[int, ...], int] = {}
 
     def reward(self, reward: Any) -> float:
+        """Count a visit.
+
+        :param reward: The task's reward, unused
+        :return: The reward of the cell that the step has led to
         """
-        :param reward: The task's reward of a step, unused
-        :return: That of the cell to which it has led
-        """
-        cell = self._cells.of(physics_state(self.env))
+        cell = _cell(self.env, self._indices, self._widths)
         self.visits[cell] = self.visits.get(cell, 0) + 1
         return self.visits[cell] ** -0.5
 
     def state_dict(self) -> dict[str, Any]:
-        """
-        :return: The counts
+        """Get the counts, for exact resume.
+
+        :return: Plain data
         """
         return {"cells": np.array(list(self.visits), dtype=np.int64), "visits": list(self.visits.values())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
+        """Restore the counts.
+
         :param state: Result of ``state_dict``
         """
         self.visits = dict(zip(map(tuple, state["cells"].tolist()), state["visits"], strict=True))
 
 
-class CellInfo(gym.Wrapper, RecordConstructorArgs):
-    """Write the cell of the true state that each step leads to into ``info["cell"]``.
+def _grid(env: gym.Env, widths: Mapping[str, float]) -> tuple[list[int], np.ndarray]:
+    names = physics_state_names(env)
+    if not widths or not set(widths) <= set(names) or min(widths.values()) <= 0:
+        raise ValueError(f"widths must be > 0, for some of {', '.join(names)}, not {dict(widths)!r}.")
+    return [names.index(name) for name in widths], np.array(list(widths.values()), dtype=np.float64)
 
-    Callbacks see it there at the ends of episodes, too.
 
-    :param env: An environment of dm_control
-    :param widths: Width of a cell along each coordinate that is counted, by its name
-    """
-
-    def __init__(self, env: gym.Env, widths: Mapping[str, float]):
-        RecordConstructorArgs.__init__(self, widths=dict(widths))
-        super().__init__(env)
-        self._cells = Cells(widths, physics_state_names(env))
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """
-        :param action: The action
-        :return: What the environment returns
-        """
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        cell = self._cells.of(physics_state(self.env))
-        return observation, reward, terminated, truncated, {**info, "cell": cell}
-
-    def state_dict(self) -> dict[str, Any]:
-        """
-        :return: Nothing: it keeps nothing
-        """
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        :param state: Result of ``state_dict``
-        """
+def _cell(env: gym.Env, indices: list[int], widths: np.ndarray) -> tuple[int, ...]:
+    return tuple(np.floor(physics_state(env)[indices] / widths).astype(int).tolist())

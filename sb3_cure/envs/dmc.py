@@ -231,7 +231,7 @@ def make_dmc_env(
     return StackFrames(env, frame_stack)
 
 
-# With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) when it is asked for "human".
+# With this gymnasium.make shows the frames of "rgb_array" in a window (needs pygame) for render_mode="human".
 make_dmc_env.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]
 
 

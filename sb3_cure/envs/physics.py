@@ -1,6 +1,6 @@
 """The true state of a DeepMind Control environment, which agents that see pixels never get.
 
-``physics_state`` is for maps and statistics; ``integration_state`` is all that the simulation goes on from.
+``physics_state`` is for maps and statistics; ``integration_state`` is all that the simulation continues from.
 """
 
 import copy
@@ -98,9 +98,9 @@ def physics_state(env: gym.Env) -> np.ndarray:
 
 
 class Proprioception:
-    """What a robot of the DeepMind Control suite can tell of itself: positions and velocities of its own joints.
+    """What a robot of the DeepMind Control suite can sense of itself: positions and velocities of its own joints.
 
-    Neither of objects and targets nor of where in the world the robot is, which no encoder in a joint tells: left out
+    Neither of objects and targets nor of the robot's place in the world, which no encoder in a joint measures: left out
     are the joints of other bodies (balls, pegs, boxes, the spinner of finger) and those with which a robot floats
     (free joints, ``rootx``, ``rooty``, ``rootz``). Slides are in metres, hinges in radians, or as cosine and sine where
     they turn all around; velocities are in metres or radians per second.

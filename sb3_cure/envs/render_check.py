@@ -1,4 +1,4 @@
-"""Which OpenGL renders here, how quickly, and whether a GPU beside it lies idle."""
+"""Which OpenGL renders here, how quickly, and whether a GPU lies idle."""
 
 import contextlib
 import json

@@ -42,9 +42,9 @@ def _glfw_has_a_display() -> bool:
 
 
 def choose_backend() -> None:
-    """Let MuJoCo, which asks when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
+    """Let MuJoCo, which reads it when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
-    Mesa's software renderer is told to use no extra threads, unless ``LP_NUM_THREADS`` is set.
+    Mesa's software renderer gets no extra threads, unless ``LP_NUM_THREADS`` is set.
     """
     # It starts a thread per core for each environment, which small images only slow down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -56,7 +56,7 @@ def load_gl() -> None:
     """
     Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
-    Mesa's software renderer is told to use no extra threads, as by ``choose_backend``, and SDL's windows to do without
+    Mesa's software renderer gets no extra threads, as by ``choose_backend``, and SDL's windows to do without
     OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is set. No rendering context is made, so a process that has only
     called this can still be forked.
 

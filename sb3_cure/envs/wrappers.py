@@ -124,7 +124,7 @@ class ActionRepeat(RepeatAction):
     """
     Repeats each action, sums the rewards, and stops early where the episode ends.
 
-    Unlike the wrapper it is made from, it tells its ``action_repeat`` and that videos have fewer frames per second.
+    Unlike Gymnasium's wrapper, it has an attribute ``action_repeat``, and videos have fewer frames per second.
 
     :param env: The environment
     :param num_repeats: Environment steps per agent step

@@ -148,7 +148,7 @@ class _CellRun:
         write_text(self.folder / DONE, "")
 
     def _make_env(self) -> Any:
-        # By a function: of an id SB3 asks for render_mode="rgb_array", which not every environment knows.
+        # By a function: SB3 passes render_mode="rgb_array" to an id, which not every environment accepts.
         return make_vec_env(self.cell.make_env, n_envs=self.cell.n_envs)
 
     def _resume(self) -> CuReSAC | None:

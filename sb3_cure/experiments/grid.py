@@ -385,7 +385,7 @@ def load_grid(
         _scale(file, budget, path)
     if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
         if seeds > len(file.seeds):
-            raise GridError(f"--seeds asks for {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
+            raise GridError(f"--seeds is {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
     file.seeds = sorted({*file.seeds, *chosen})

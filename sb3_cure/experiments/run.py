@@ -50,7 +50,7 @@ def run_grid(
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
         only where no machine has a GPU: Ray would start a cell per core, all on the first card
-    :param retries: Ray: how often a cell whose worker died is started again, from its checkpoint
+    :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, if the grid cannot be run
     """
@@ -135,7 +135,7 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
 
 
 def _run_on_worker(unit: Unit, settings: Settings, has_gpu: bool) -> bool:
-    """Run a unit in a process of Ray, which does not hide the GPUs from a task that asks for none."""
+    """Run a unit in a process of Ray, which does not hide the GPUs from a task that needs none."""
     if not has_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     return _run_unit(unit, *settings)
@@ -265,7 +265,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
     add("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
     add("--gpus-per-cell", type=float, help="Ray: share of a GPU per cell, such as 0.25; 0: compute on the CPU")
-    add("--retries", type=int, default=3, help="Ray: new starts of a cell whose worker died")
+    add("--retries", type=int, default=3, help="Ray: new starts of a cell after its worker died")
     add("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     add("--no-pictures", dest="pictures", action="store_false", help="neither draw nor film")
     add("--dry-run", action="store_true", help="list the cells and their states, run nothing")

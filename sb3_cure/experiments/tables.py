@@ -416,7 +416,7 @@ def pretraining_table(experiment: Experiment) -> Table:
         ours = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
         rows.append([task, method, str(len(finals)), ours, _published(theirs), difference])
     note = render_text("pretraining", published.PAPER, experiment.budget, compares)
-    title = "Final return after pretraining, beside the paper's"
+    title = "Final return after pretraining, and the paper's"
     return _table(title, "task; arm; >seeds; >ours; >paper; >difference", rows, note)
 
 

@@ -1,4 +1,4 @@
-"""Number formats of the networks: which one to use, and how to ask for it."""
+"""Number formats of the networks: which one to use, and how to switch to it."""
 
 import contextlib
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
 """Models as a ``.zip`` of JSON and safetensors, which can be loaded from strangers.
 
 ``data`` is the JSON of the settings, in which the tensors of ``tensors.safetensors`` are named. What is no data (a
-function, a user's class) is there as a placeholder that tells what it was, and ``load`` asks for it.
+function, a user's class) is there as a placeholder that names it, and ``load`` needs it in ``custom_objects``.
 """
 
 import json
@@ -46,7 +46,7 @@ _TEMPERATURES = {
 
 
 class Stateful(Protocol):
-    """A part of a model with a state beside tensors and settings."""
+    """A part of a model with a state besides tensors and settings."""
 
     def state_dict(self) -> dict[str, Any]:
         """Get the state.
@@ -88,7 +88,7 @@ class ModelArchive:
     def read(self, part: str) -> dict[str, Any]:
         """Read states.
 
-        :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"traits"``
+        :param part: ``"parameters"``, ``"variables"``, ``"parts"`` or ``"architecture"``
         :return: States by name
         """
         with refusing(self.name):
@@ -126,7 +126,7 @@ def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor
 
     :param path: Model's file
     :return: The tensors of its policy by name; the logarithm of its curious agent's temperature, if it learns that; and
-        the ``traits`` of its policy
+        the ``architecture`` of its policy
     :raises ArchiveError: if it is damaged or pickled
     """
     with reading(path, "zip") as (file, name):
@@ -134,14 +134,14 @@ def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor
     if archive.is_pickled:
         raise ArchiveError(f"{name} was pickled by SB3's save: load it with trusted=True, and save it again.")
     temperature = archive.read("variables").get("policy.curious.log_ent_coef")
-    return archive.read("parameters")["policy"], temperature, archive.read("traits")
+    return archive.read("parameters")["policy"], temperature, archive.read("architecture")
 
 
 class SavesModels(OffPolicyAlgorithm):
     """Mixin for an algorithm of SB3: ``save``, ``load`` and ``set_parameters`` without pickle."""
 
     def _stateful_parts(self) -> dict[str, Stateful]:
-        """Objects with a state beside tensors and settings, such as a generator, by name: saved and resumed."""
+        """Objects with a state besides tensors and settings, such as a generator, by name: saved and resumed."""
         parts: dict[str, Stateful] = getattr(super(), "_stateful_parts", dict)()
         return parts
 
@@ -180,7 +180,7 @@ class SavesModels(OffPolicyAlgorithm):
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
             "variables": {name: recursive_getattr(self, name) for name in variables},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
-            "traits": getattr(self.policy, "traits", {}),  # of SB3's own policies: none
+            "architecture": getattr(self.policy, "architecture", {}),  # of SB3's own policies: none
         }
         data = {"format": VERSION, "settings": settings}
         data |= {name: encode(part, name, tensors) for name, part in content.items()}
@@ -206,7 +206,7 @@ class SavesModels(OffPolicyAlgorithm):
     ) -> Self:
         """Load a model, also one from a stranger.
 
-        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still ask for
+        No code that an archive holds is run, and nothing that it names is imported. (Its settings may still need
         more memory than there is.) A temperature that is given replaces the saved one, whether fixed or learned.
 
         :param path: Path with or without its suffix ``.zip``, or a binary file

@@ -44,7 +44,7 @@ def callback_state(callback: BaseCallback) -> dict[str, Any]:
     contents = {name: _content(value) for name, value in attributes.items()}
     changed = [name for name, content in contents.items() if content is not None and content != initial.get(name)]
     state["changed"] = {name: attributes[name] for name in changed}
-    if not type(callback).__module__.startswith("stable_baselines3."):  # whose progress bars and the like are no state
+    if not type(callback).__module__.startswith("stable_baselines3."):  # progress bars and the like are no state
         state["missing"] = [f"{state['class']}.{name}" for name, content in contents.items() if content is None]
         try:
             check_sharing(state["changed"].values(), state["class"])

@@ -1,6 +1,6 @@
 """Values as JSON, with the arrays and tensors in them set apart, and files of both without pickle.
 
-JSON stands for itself; whatever it cannot express is an object whose only key begins with ``!`` and tells the type.
+JSON stands for itself; what it cannot express is an object with one key, which begins with ``!`` and names the type.
 Reading runs no code of a file and imports nothing that it names: tensors are read by safetensors, objects are those of
 ``_KINDS``, classes those of ``NAMED`` and the policies that a model registers.
 """
@@ -224,7 +224,7 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
 
 
 def _revived(kind: type, attributes: dict[str, Any]) -> Any:
-    """Make an object of a class whose state is its attributes."""
+    """Make an object of a class that keeps its state in attributes."""
     value: Any = object.__new__(kind)
     vars(value).update(attributes)
     return value

@@ -34,7 +34,7 @@ _STATE = ("attributes", "seed", "options", "restarts", "faults_in_a_row", "last_
 class EnvFaultError(RuntimeError):
     """An environment failed. The worker's own traceback, if there is one, is a note."""
 
-    #: Whether another worker may go on in its place
+    #: Whether another worker may take its place
     restartable = True
 
 
@@ -209,12 +209,12 @@ class _Worker:
 
         :param what: What happened to it, the end of a sentence that begins with "Environment 0"
         :param details: The worker's traceback, or ""
-        :param restartable: Whether another worker may go on
+        :param restartable: Whether another worker may take its place
         :return: Error to raise
         """
         command = self._request[0]
         hint = " (scripts that start workers need `if __name__ == '__main__':`)" if command == "get_spaces" else ""
-        fault = EnvFaultError(f"Environment {self.index} {what}, when asked for {command}{hint}.")
+        fault = EnvFaultError(f"Environment {self.index} {what} in {command}{hint}.")
         fault.restartable = restartable
         if details:
             fault.add_note(f"Traceback of the worker:\n{details}")
@@ -274,7 +274,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
 
     ``CuReSAC`` stores nothing of such a step. SB3's own off-policy algorithms store one transition that stands still.
     Frozen frames always raise, since transitions before the error are wrong, too; and so does a worker that is lost
-    between two steps, when an attribute or a method is asked for.
+    between two steps, when an attribute or a method is read.
 
     :param env_fns: Functions that make the environments
     :param timeout: Seconds that a step, or any other answer, may take

@@ -26,9 +26,9 @@ def updates(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> int:
 @pytest.mark.parametrize("method", METHODS)
 def test_each_fast_file_trains(method: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """With its own networks; the log shows the burst and the updates after it."""
-    small = ["learning_starts:100", "warmup_updates:20", "batch_size:16"]
-    arguments = ["--conf-file", f"fast/{method}", "-n", "300", "-f", str(tmp_path), "-params", *small]
-    assert updates(arguments, capfd) == 20 + 149  # up to the last step of two episodes of 125
+    small = ["learning_starts:110", "warmup_updates:5", "batch_size:8"]
+    arguments = ["--conf-file", f"fast/{method}", "-n", "130", "-f", str(tmp_path), "-params", *small]
+    assert updates(arguments, capfd) == 5 + 14  # up to the end of the episode of 125
 
 
 @pytest.mark.parametrize(("algo", "method"), [*(("cure_sac", method) for method in METHODS), ("cure_tqc", "cure_curl")])

@@ -1,4 +1,4 @@
-"""Visits of the true state's cells: a reward that sees them, kept by exact resume."""
+"""Visits of the true state's cells: in the info, and as a reward that exact resume keeps."""
 
 from collections import Counter
 from typing import Any
@@ -9,19 +9,11 @@ from envs_for_tests import PixelBox
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure import make_dmc_env
-from sb3_cure.envs import physics_state, physics_state_names, rendering
-from sb3_cure.envs.counting import CellInfo, Cells, CountReward
+from sb3_cure.envs import physics_state, physics_state_names
+from sb3_cure.envs.counting import CellInfo, CountReward
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
 
 WIDTHS = {"slider": 0.05, "hinge_1": 0.3}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _gl() -> None:
-    try:
-        rendering.load_gl()
-    except rendering.GLUnavailableError as error:
-        pytest.skip(str(error))
 
 
 def cartpole() -> Any:
@@ -34,17 +26,17 @@ def actions(n: int) -> np.ndarray:
 
 def test_reward_is_one_by_the_root_of_visits() -> None:
     """Of the state that the step leads to, over episodes; nothing else differs from the environment itself."""
-    env, plain, counts = CountReward(cartpole(), WIDTHS), cartpole(), Counter[tuple[int, ...]]()
+    env, plain, counts = CellInfo(CountReward(cartpole(), WIDTHS), WIDTHS), cartpole(), Counter[tuple[int, ...]]()
     for _ in range(2):
         np.testing.assert_array_equal(env.reset()[0], plain.reset()[0])
         for action in actions(60):
-            obs, reward, *_ = env.step(action)
+            obs, reward, *_, info = env.step(action)
             np.testing.assert_array_equal(obs, plain.step(action)[0])
             state = dict(zip(physics_state_names(plain), physics_state(plain), strict=True))
             cell = tuple(int(np.floor(state[name] / width)) for name, width in WIDTHS.items())
             counts[cell] += 1
-            assert reward == pytest.approx(1 / counts[cell] ** 0.5)
-    assert env.visits == counts and max(counts.values()) > 3 and len(counts) > 10
+            assert info["cell"] == cell and reward == pytest.approx(1 / counts[cell] ** 0.5)
+    assert env.get_wrapper_attr("visits") == counts and max(counts.values()) > 3 and len(counts) > 10
 
 
 def test_counts_are_resumed() -> None:
@@ -52,9 +44,7 @@ def test_counts_are_resumed() -> None:
     first.reset()
     for action in actions(30):
         first.step(action[None])
-    state = vec_env_state(first)
-    assert state is not None
-    load_vec_env_state(second, state)
+    load_vec_env_state(second, vec_env_state(first))
     for action in actions(20):
         one, other = first.step(action[None]), second.step(action[None])
         assert one[1] == other[1] and one[3][0]["cell"] == other[3][0]["cell"]
@@ -63,10 +53,7 @@ def test_counts_are_resumed() -> None:
 
 @pytest.mark.parametrize("widths", [{}, {"elbow": 1.0}, {"slider": 0.0}])
 def test_grids_that_cannot_be_are_refused(widths: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="give a width > 0 for some of slider"):
-        Cells(widths, ["slider", "hinge_1"])
-
-
-def test_true_state_is_needed() -> None:
+    with pytest.raises(ValueError, match="widths must be > 0, for some of slider"):
+        CellInfo(cartpole(), widths)
     with pytest.raises(ValueError, match="has no physics of dm_control"):
         CountReward(PixelBox(), WIDTHS)

@@ -70,12 +70,12 @@ def test_only_acting_networks_are_exported() -> None:
 
 
 def test_actions_follow_further_training() -> None:
-    """Actions are still those of ``predict``, though training leaves the networks in another mode."""
+    """Actions are still those of ``predict``, also of networks in training mode."""
     model = tiny_model("CnnPolicy", PixelBox())
     model.policy.encoder.trunk.append(th.nn.Dropout())
     module = DeterministicActor(model)
     model.learn(14)
-    assert model.policy.training
+    model.policy.set_training_mode(True)
     batch = th.as_tensor(model.observation_space.sample()[None])
     exported = th.export.export(module, (batch,)).module()
     for follow in (module, exported):

@@ -81,8 +81,7 @@ def watch(model: BaseAlgorithm, steps: int, **arguments: Any) -> tuple[list[str]
 # ------------------------------------------------------------------ runs that are well
 
 
-@pytest.mark.parametrize("curiosity", ["separate", "bonus"])
-@pytest.mark.parametrize("srl", ["rae", "curl"])
+@pytest.mark.parametrize(("srl", "curiosity"), [("rae", "bonus"), ("curl", "separate")])
 def test_good_runs_give_no_warning(srl: str, curiosity: str) -> None:
     """All checks look, none of them warns; they look only after ``min_updates``."""
     warned, logged = watch(tiny_model("CnnPolicy", PixelBox(), srl=srl, curiosity=curiosity), 200)

@@ -156,7 +156,7 @@ def train_on_breaking_dmc() -> dict[str, Any]:
 def test_training_on_real_pixels_survives_faults(fresh: ProcessPoolExecutor) -> None:
     result = fresh.submit(train_on_breaking_dmc).result()
     for kind, sentence in zip(RESTARTED, result["sentences"], strict=True):
-        assert re.match(rf"Environment 0 .*{SAID[kind]}.*, when asked for step\.$", sentence), sentence
+        assert re.match(rf"Environment 0 .*{SAID[kind]}.* in step\.$", sentence), sentence
     assert result["restarts"] == [4, 0] and result["steps"] == 80
     assert result["stored"] == 40 - 4, "a step with a fault is stored for no environment"
     for first in result["first"]:  # of an episode: the stack repeats its first frame
