@@ -26,14 +26,16 @@ class ActorCriticForTests:
 
     @th.no_grad()
     def set_temperature(self, temperature: float) -> None:
-        """
+        """Set the learned temperature.
+
         :param temperature: New value of the learned temperature
         """
         self.log_ent_coef.fill_(float(np.log(temperature)))
 
 
 def actor_critic(model: CuReSAC, name: str) -> ActorCriticForTests:
-    """
+    """Get one of the two agents.
+
     :param model: A model
     :param name: ``"task"`` or ``"curious"``
     :return: That agent
@@ -43,18 +45,19 @@ def actor_critic(model: CuReSAC, name: str) -> ActorCriticForTests:
 
 
 def q_values(model: CuReSAC, name: str, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """
+    """Compute what each of an agent's critics says.
+
     :param model: A model
     :param name: ``"task"`` or ``"curious"``
     :param latents: Latents of the shared encoder, [B, features_dim]
     :param actions: In [-1, 1], [B, action_dim]
-    :return: What each of the agent's critics says, [B, n_critics]
+    :return: [B, n_critics]
     """
     return actor_critic(model, name).critic(latents, actions).squeeze(2)
 
 
 def one_update(model: CuReSAC, batch_size: int = 8, seed: int = 1) -> dict[str, float]:
-    """One call of ``train`` for one agent step, on a batch and with noise that depend on the seed alone.
+    """Call ``train`` for one update, on a batch and with noise that depend on the seed alone.
 
     :return: What it logged, without the prefix ``train/``
     """
@@ -67,8 +70,9 @@ def one_update(model: CuReSAC, batch_size: int = 8, seed: int = 1) -> dict[str, 
 
 
 def steps_of(optimizer: Any) -> int:
-    """
+    """Count the steps of an optimiser.
+
     :param optimizer: An Adam
-    :return: How many steps it has made
+    :return: Steps that it has made
     """
     return max((int(state["step"]) for state in optimizer.state.values()), default=0)

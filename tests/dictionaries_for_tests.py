@@ -64,7 +64,7 @@ class Goal(gym.Env):
 
 
 def sensor_model(env: Any = None, algorithm: type[CuReSAC] = CuReSAC, **kwargs: Any) -> CuReSAC:
-    """A tiny model on ``SensorBox``.
+    """Make a tiny model on ``SensorBox``.
 
     :param env: Another environment
     :param algorithm: Class of the model

@@ -52,19 +52,21 @@ class VectorBox(gym.Env):
         return self.observe(), reward, False, self.n_steps >= self.episode_length, {}
 
     def observe(self, first: bool = False) -> np.ndarray:
-        """
+        """Observe the position.
+
         :param first: Whether this is the first observation of an episode
         :return: The position, [2]
         """
         return self.position.astype(np.float32)
 
     def state_dict(self) -> dict[str, Any]:
-        """For exact resume: all that the future depends on."""
+        """Get all that the future depends on, for exact resume."""
         generator = self.np_random.bit_generator.state
         return {"position": self.position, "n_steps": self.n_steps, "generator": generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
+        """Load what ``state_dict`` has returned.
+
         :param state: Result of ``state_dict``
         """
         self.position, self.n_steps = np.array(state["position"]), state["n_steps"]
@@ -101,11 +103,11 @@ class PixelBox(VectorBox):
     """``VectorBox`` seen as the newest ``frame_stack`` frames: uint8 (3 * frame_stack, size, size), oldest first.
 
     The dot is a white square on a coloured gradient; the first frame is repeated at reset. As the package's own
-    environments do, it tells ``frame_stack`` (unless ``tells_frame_stack=False``) and ``action_repeat``.
+    environments, it has ``frame_stack`` (unless ``tells_frame_stack=False``) and ``action_repeat``.
 
     :param frame_stack: Frames per observation
     :param size: Height and width, pixels
-    :param action_repeat: What to tell (it changes nothing else)
+    :param action_repeat: Value of the attribute (it changes nothing else)
     :param channels_last: Whether observations are (size, size, 3 * frame_stack) instead
     :param tells_frame_stack: Whether there is an attribute ``frame_stack``
     :param kwargs: Arguments of ``VectorBox``
@@ -167,7 +169,7 @@ def tiny_model(policy: str, env: Any, algorithm: type[CuReSAC] = CuReSAC, **kwar
 
 
 def samples_of(model: CuReSAC, batch_size: int) -> Samples:
-    """Samples of a model's replay buffer, as heads get them when measuring: the views are the centred ones.
+    """Sample a model's replay buffer, as heads get it when measuring: the views are the centred ones.
 
     :param model: A model that has collected
     :param batch_size: How many
@@ -177,7 +179,7 @@ def samples_of(model: CuReSAC, batch_size: int) -> Samples:
 
 
 def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
-    """Gradient of every part of the agent in one update from the model's state, as its optimiser receives it.
+    """Get the gradient of every part of the agent in one update from the model's state, as optimisers receive it.
 
     :param model: A model with curiosity="separate" and update="joint"
     :param seed: Seed of the batch and of the random numbers of the update
@@ -212,13 +214,13 @@ def gradients_of_an_update(model: CuReSAC, seed: int) -> dict[str, th.Tensor]:
 
 
 def state_of(model: SAC) -> dict[str, Any]:
-    """A copy of all that learning changes: networks, optimisers, temperatures."""
+    """Copy all that learning changes: networks, optimisers, temperatures."""
     _, variables = model._get_torch_save_params()
     return copy.deepcopy({**model.get_parameters(), **{name: recursive_getattr(model, name) for name in variables}})
 
 
 def differences(first: Any, second: Any, path: str = "") -> list[str]:
-    """Where two nested states are not equal bit for bit (NaNs differ, as nothing here may be NaN).
+    """Find where two nested states are not equal bit for bit (NaNs differ, as nothing here may be NaN).
 
     :param first: Nested dictionaries and sequences of tensors, arrays and plain values
     :param second: Another one

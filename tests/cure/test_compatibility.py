@@ -462,6 +462,17 @@ def test_save_and_load(extras: dict[str, Any]) -> None:
         loaded.learn(15)
 
 
+@both_modes
+@pytest.mark.parametrize("policy, env", [("MlpPolicy", VectorBox), ("CnnPolicy", PixelBox)])
+def test_policy_alone_is_saved_and_loaded(extras: dict[str, Any], policy: str, env: Any, tmp_path: Path) -> None:
+    model = tiny_model(policy, env(), **extras).learn(12)
+    model.policy.save(tmp_path / "policy")
+    loaded = type(model.policy).load(tmp_path / "policy")
+    observation, _ = env().reset(seed=0)
+    actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
+    np.testing.assert_array_equal(*actions)
+
+
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 @both_modes
 def test_from_gpu_to_cpu_and_back(extras: dict[str, Any], tmp_path: Path) -> None:
