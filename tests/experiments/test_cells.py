@@ -216,7 +216,7 @@ def test_pretrained_arms_have_the_same_warm_up(
             return True
 
     learn = CuReSAC.learn
-    monkeypatch.setattr(CuReSAC, "learn", lambda self, steps, callback: learn(self, steps, callback=[See(), *callback]))
+    monkeypatch.setattr(CuReSAC, "learn", lambda self, n, callback, *rest: learn(self, n, [See(), *callback], *rest))
     for cell in pretrained_grid(tmp_path, task, 46, budget, seeds=2).cells[:4]:
         run_cell(cell, tmp_path, pictures=False)
     assert differences(begun[0], begun[1]) == differences(begun[0], begun[2]) == []
