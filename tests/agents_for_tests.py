@@ -61,6 +61,7 @@ def one_update(model: CuReSAC, batch_size: int = 8, seed: int = 1) -> dict[str, 
     np.random.seed(seed)
     th.manual_seed(seed)
     model.logger.name_to_value.clear()
+    model.logger.name_to_count.clear()  # of which `record_mean` makes its means
     model.train(1, batch_size=batch_size)
     return {key.removeprefix("train/"): float(value) for key, value in model.logger.name_to_value.items()}
 

@@ -155,10 +155,9 @@ def tiny_model(policy: str, env: Any, algorithm: type[CuReSAC] = CuReSAC, **kwar
     Networks are tiny unless ``policy_kwargs`` says otherwise.
     """
     policy_kwargs: dict[str, Any] = {"net_arch": [16]}
-    if policy == "MlpPolicy":
-        policy_kwargs["features_extractor_kwargs"] = {"features_dim": 8, "hidden_dim": 16}
-    elif policy == "CnnPolicy":
-        policy_kwargs["features_extractor_kwargs"] = {"n_filters": 4, "n_layers": 2}
+    if "features_extractor_class" not in kwargs.get("policy_kwargs", {}):
+        sizes = {"MlpPolicy": {"features_dim": 8, "hidden_dim": 16}, "CnnPolicy": {"n_filters": 4, "n_layers": 2}}
+        policy_kwargs["features_extractor_kwargs"] = sizes.get(policy, {})
     defaults: dict[str, Any] = dict(
         learning_starts=10, batch_size=8, buffer_size=500, warmup_updates=0, precision="fp32", seed=0, device="cpu"
     )

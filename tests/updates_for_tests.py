@@ -11,6 +11,7 @@ from torch import nn
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.fast_ops import from_cells, to_cells
+from sb3_cure.networks.layers import RunningStandardize
 
 ALGORITHMS: dict[str, Any] = {"sac": CuReSAC, "tqc": CuReTQC}
 BATCH = 8
@@ -32,11 +33,17 @@ def filled_model(algorithm: str = "sac", pixels: bool = False, **kwargs: Any) ->
 
 
 def sampled(model: CuReSAC) -> Samples:
-    """The batch that ``train_once`` draws, with torch's generator where the update begins."""
+    """The batch that ``train_once`` draws, with torch's generator and the encoder's statistics as in that update.
+
+    :param model: Not trained yet, so that the statistics of its first batch stay as they are when it comes again
+    """
     np.random.seed(1)
     batch = Samples(*model.replay_buffer.sample(BATCH))  # type: ignore[union-attr]
     th.manual_seed(1)
-    return batch._replace(views=model.policy.augmentation(batch.observations))
+    batch = batch._replace(views=model.policy.augmentation(batch.observations))
+    for encoder in (model.policy.encoder, model.policy.encoder_target):
+        encoder.update_statistics(batch.views)
+    return batch
 
 
 def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool = True) -> dict[str, float]:
@@ -48,11 +55,12 @@ def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool =
     :param actors: Whether actors and temperatures follow their critics
     :return: What was logged
     """
-    model._phase = lambda: (srl, rl)  # type: ignore[method-assign]
+    model._phase = lambda: (srl and model.srl is not None, rl)  # type: ignore[method-assign]
     model._n_rl_batches = 0 if actors else 1
     np.random.seed(1)
     th.manual_seed(1)
     model.logger.name_to_value.clear()
+    model.logger.name_to_count.clear()  # of which `record_mean` makes its means
     model.train(1, BATCH)
     return {key.removeprefix("train/"): float(value) for key, value in model.logger.name_to_value.items()}
 
@@ -167,6 +175,14 @@ class StraightLine:
     def scaled(self, observations: th.Tensor) -> th.Tensor:
         return observations.float() / 255 if observations.dtype == th.uint8 else observations
 
+    @th.no_grad()
+    def standardise_by(self, observations: th.Tensor) -> None:
+        """Standardise vectors by mean and variance of the first batch."""
+        for module in (*self.encoder.modules(), *self.encoder_target.modules()):
+            if isinstance(module, RunningStandardize):
+                module.mean.copy_(observations.mean(dim=0))
+                module.variance.copy_(observations.var(dim=0, correction=0))
+
     def srl(self, batch: Samples, *latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Loss of the head, and the error of each sample."""
         return LOSSES[self.model.srl](self, batch, *latents)  # type: ignore[index]
@@ -198,6 +214,7 @@ class StraightLine:
         :param sequential: Whether the encoder steps after each loss, or once on their normalised gradients
         :return: Losses by their logged names
         """
+        self.standardise_by(batch.views)
         obs = self.scaled(batch.views)
         self.next_obs = next_obs = self.scaled(self.model.policy.augmentation(batch.next_observations))
         with th.no_grad():
@@ -223,6 +240,8 @@ class StraightLine:
             read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
             loss, errors = self.srl(batch, *read)
             found["srl_loss"] = loss
+            if self.model.curiosity_target == "next_observation":  # before the steps of head and encoder
+                _, errors = self.srl(batch._replace(observations=batch.next_observations), next_shared)
             learn(loss, self.head, *read)
         if self.model.srl == "spr":
             self.follow(self.head.target_projection, self.head.projection, 0.05)

@@ -165,7 +165,7 @@ class CuRe(CuReBase):
             return learns_srl, False
         if not self._alternates:
             return learns_srl, True
-        srl_phase = self._n_updates // self.srl_period % 2 == 0
+        srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy
         return learns_srl and srl_phase, not srl_phase
 
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
@@ -184,9 +184,11 @@ class CuRe(CuReBase):
         reward = policy.intrinsic if learns_rl else None
         judges_head = reward is not None and reward.needs_srl
         if policy.srl is not None and (learns_srl or judges_head):
-            srl_loss, inputs.srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
-        # A reward made of the head's error is that of the head before its step.
-        curious_rewards = self._curious_rewards(inputs, metrics) if judges_head else None
+            srl_loss, srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
+        curious_rewards = None
+        if judges_head:  # the reward is of the head before its step
+            inputs.srl_error = self._judged_error(policy.srl, batch, srl_error)
+            curious_rewards = self._curious_rewards(inputs, metrics)
         if learns_srl:
             self._update_srl(srl_loss)
         if reward is not None and not judges_head:
@@ -198,7 +200,7 @@ class CuRe(CuReBase):
         return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
 
     def _srl_loss(self, srl: SRLHead, batch: Samples, learns: bool, metrics: Metrics) -> tuple[th.Tensor, th.Tensor]:
-        """Loss of the head, and the error of each sample that an intrinsic reward may be made of, [B]."""
+        """Loss of the head, and the error of each sample, [B]."""
         source = "srl" if learns else "measured"
         names = ["observations", "next_observations"] if srl.needs_next_latents else ["observations"]
         latents = [self.policy.encoder_update.latents(source, name) for name in names]
@@ -211,17 +213,17 @@ class CuRe(CuReBase):
             )
         variance = latents[0].detach().var(dim=0, correction=0).mean()
         metrics |= {"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance}
-        of_transitions = srl.needs_next_latents or srl.models_transitions
-        if self.curiosity_target == "next_observation" and not of_transitions and self.policy.intrinsic is not None:
-            error = self._next_srl_error(srl, batch)
         return loss.float(), error.float()
 
     @th.no_grad()
-    def _next_srl_error(self, srl: SRLHead, batch: Samples) -> th.Tensor:
+    def _judged_error(self, srl: Any, batch: Samples, error: th.Tensor) -> th.Tensor:
+        """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
+        if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
+            return error
         views = self.policy.augmentation(batch.next_observations)
         latents = self.policy.encoder(views)
         # With nothing else, so that no head takes (s', a, s') for a transition.
-        return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error  # type: ignore[arg-type]
+        return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error.float()  # type: ignore[arg-type]
 
     def _update_srl(self, loss: th.Tensor) -> None:
         """UpdateSRL: train the head and, through the latents, the encoder."""

@@ -95,6 +95,8 @@ class EncoderUpdate:
         self._forget()
         self.views, self._check = views, check
         self._n_updates += 1
+        # What was measured at the parameters is logged until it is measured again.
+        self.metrics = {name: value for name, value in self.metrics.items() if not name.startswith("latent_")}
 
     def features(self, name: str = "observations") -> Any:
         """Features of the trunk without their graph, which actors read.

@@ -152,7 +152,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         row: dict[str, Any] = {"actions": np.asarray(action).reshape(self.n_envs, self.action_dim)}
         row |= {"rewards": reward, "dones": done}
         if self.handle_timeout_termination:
-            row["timeouts"] = [info.get("TimeLimit.truncated", False) for info in infos]
+            row["timeouts"] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(self.n_envs)
         counts = {}
         for key, ring in self.rings.items():
             tails = self.rows[f"slots/{key}"][before, :, 1] if self._n_valid else None

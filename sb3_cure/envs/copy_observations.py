@@ -7,7 +7,17 @@ import numpy as np
 from gymnasium import spaces
 
 
-class CopyObservations(gym.Wrapper[Any, Any, Any, Any]):
+class TransparentWrapper(gym.Wrapper[Any, Any, Any, Any]):
+    """Passes attributes that are set on it to the environment: SB3's ``set_attr`` sets them on the outermost layer."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "env" or name.startswith("_"):
+            super().__setattr__(name, value)
+        else:
+            setattr(self.env, name, value)
+
+
+class CopyObservations(TransparentWrapper):
     """Copies observations, and checks their sizes and types against the space.
 
     Renderers such as MuJoCo's draw every frame into the same array, so that the last observation of an episode would
@@ -19,13 +29,6 @@ class CopyObservations(gym.Wrapper[Any, Any, Any, Any]):
 
     :param env: The environment
     """
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        # SB3's `set_attr` sets attributes of the outermost layer; they are meant for the environment.
-        if name == "env" or name.startswith("_"):
-            super().__setattr__(name, value)
-        else:
-            setattr(self.env, name, value)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, with the arguments that it takes.

@@ -1,5 +1,6 @@
 """Wrappers from an environment that can render itself, or returns images, to one that an agent sees through pixels."""
 
+import copy
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -302,13 +303,16 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _push(self, observation: Any, first: bool) -> Any:
         parts = observation if isinstance(observation, dict) else {"": observation}
+        # Everything is copied, as an environment may write the next observation into the same arrays.
         for key, frames in self._frames.items():
-            frame = np.array(parts[key])  # an environment may write the next one into it
+            frame = np.array(parts[key])
             if first:
                 frames.extend([frame if self.padding == "first" else np.zeros_like(frame)] * self.frame_stack)
             frames.append(frame)
         stacked = {key: np.concatenate(frames, self._axes[key]) for key, frames in self._frames.items()}
-        return {**parts, **stacked} if isinstance(observation, dict) else stacked[""]
+        if not isinstance(observation, dict):
+            return stacked[""]
+        return {key: stacked[key] if key in stacked else copy.copy(part) for key, part in parts.items()}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)

@@ -31,6 +31,7 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper, VecMonitor
 
+from sb3_cure.envs.copy_observations import TransparentWrapper
 from sb3_cure.envs.physics import integration_state, is_of_the_suite, load_integration_state
 from sb3_cure.persistence.encoding import encode
 
@@ -74,7 +75,7 @@ def load_random_streams(state: dict[str, Any]) -> None:
     th.set_rng_state(state["torch"])
 
 
-class ResumableEnv(gym.Wrapper):
+class ResumableEnv(TransparentWrapper):
     """Outermost wrapper of an environment in a worker process, which lets it be resumed exactly.
 
     ``make_vec_env(make_env, 4, vec_env_cls=SubprocVecEnv, wrapper_class=ResumableEnv)``. SB3's ``SubprocVecEnv`` gives

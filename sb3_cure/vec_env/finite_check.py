@@ -91,10 +91,6 @@ class FiniteCheck(VecEnvWrapper):
             f"must be finite in float32: nothing of this step was stored; {fix}."
         )
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "FiniteCheck":
-        """Copy all wrappers, for copies of models; SB3's keep something of their class that cannot be copied."""
-        return _copied(self, memo)
-
 
 def _find_bad(values: Any) -> tuple[int, str, float] | None:
     """Find the first number that is not finite in float32: its environment, its key or "", and the number."""
@@ -106,14 +102,3 @@ def _find_bad(values: Any) -> tuple[int, str, float] | None:
                 where = tuple(np.argwhere(~finite)[0])
                 return int(where[0]), key, float(part[where])
     return None
-
-
-def _copied(venv: Any, memo: dict[int, Any]) -> Any:
-    if not isinstance(venv, VecEnvWrapper):
-        return copy.deepcopy(venv, memo)
-    inner = _copied(venv.venv, memo)
-    copied = memo[id(venv)] = type(venv).__new__(type(venv))
-    shared = {"class_attributes": venv.class_attributes, "venv": inner}
-    own = {name: value for name, value in vars(venv).items() if name not in shared}
-    vars(copied).update(copy.deepcopy(own, memo), **shared)
-    return copied

@@ -1,27 +1,31 @@
 """CuRe's own arguments: what is out of range, or would train something else than was asked for, is refused."""
 
+import inspect
 from typing import Any
 
 import numpy as np
 import pytest
+from dictionaries_for_tests import Goal
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer
-from stable_baselines3.common.envs import SimpleMultiObsEnv
-from stable_baselines3.sac.policies import MultiInputPolicy
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.sac.policies import CnnPolicy, MultiInputPolicy
 
-from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.cure.arguments import CuReArguments
-from sb3_cure.intrinsic import IntrinsicReward
+from sb3_cure import CuReSAC
+from sb3_cure.cure.base import CuReBase
+from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 BAD: dict[str, list[Any]] = {
     "srl": [3, "autoencoder"],
     "srl_kwargs": [["bits"]],
     "srl_schedule": ["in turn"],
-    "srl_period": [0, 2.5],
-    "intrinsic": ["novelty", 1],
+    "srl_period": [0],
+    "intrinsic": ["novelty"],
     "intrinsic_kwargs": [1],
-    "curiosity": ["always", True],
+    "curiosity": [True],
     "curiosity_prob": [-0.1, 1.1, "often"],
     "curiosity_bout": [0.5, "forever"],
     "curiosity_beta": [-1.0, float("inf")],
@@ -41,26 +45,18 @@ BAD: dict[str, list[Any]] = {
     "update": ["together"],
     "precision": ["fp16"],
     "overlap": ["no"],
-    "on_bad_transition": ["ignore"],
 }
 
 
-def test_table_names_every_argument() -> None:
-    assert BAD.keys() == CuReArguments.model_fields.keys()
-
-
-@pytest.mark.parametrize("name, value", [(name, value) for name, values in BAD.items() for value in values])
-def test_bad_value_is_named(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=rf"^{name} is ") as caught:
-        tiny_model("CnnPolicy", PixelBox(), **{name: value})
-    assert "\n" not in str(caught.value)
-
-
-class FromNothing(IntrinsicReward):
-    """Needs no SRL."""
-
-    def loss(self, inputs: Any) -> Any:
-        return None, inputs.batch.rewards[:, 0].square()
+def test_bad_values_are_named() -> None:
+    """Of each argument that SB3 does not have."""
+    ours = inspect.signature(CuReBase.__init__).parameters.keys() - inspect.signature(SAC).parameters.keys()
+    assert BAD.keys() == ours - {"self", "_init_setup_model", "kwargs"}
+    for name, values in BAD.items():
+        for value in values:
+            with pytest.raises(ValueError, match=name) as caught:
+                tiny_model("CnnPolicy", PixelBox(), **{name: value})
+            assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -68,14 +64,16 @@ class FromNothing(IntrinsicReward):
     [
         (dict(srl=None, srl_kwargs=dict(bits=5), curiosity=None), "srl_kwargs is"),
         (dict(srl=None), "srl is None"),
-        (dict(srl=None, curiosity="bonus"), "srl is None"),
         (dict(task=False, curiosity="bonus"), "task=False leaves nothing to learn"),
         (dict(curiosity_gamma=0), "curiosity_gamma=0"),
         (dict(n_steps=3, curiosity="bonus"), "n_steps=3"),
-        (dict(replay_buffer_class=NStepReplayBuffer), "give n_steps"),
+        (dict(n_steps=3, replay_buffer_class=ReplayBuffer), "leave replay_buffer_class out, and set n_steps"),
+        (dict(replay_buffer_class=NStepReplayBuffer), "leave replay_buffer_class out, and set n_steps"),
+        (dict(optimize_memory_usage=True, replay_buffer_class=ReplayBuffer), "optimize_memory_usage=True"),
         (dict(use_sde=True), "use_sde=True"),
+        (dict(policy_kwargs=dict(share_features_extractor=True)), "share_features_extractor"),
         (dict(srl="curl", augmentation=None), "augmentation is None"),
-        (dict(augmentation="crop"), "cuts 84 x 84 pixels out of images of 36 x 36"),
+        (dict(augmentation="crop", augmentation_kwargs=dict(size=84)), "cannot cut 84 x 84 pixels out of images of 36"),
     ],
 )
 def test_combination_that_learns_something_else_is_refused(arguments: dict[str, Any], sentence: str) -> None:
@@ -83,21 +81,30 @@ def test_combination_that_learns_something_else_is_refused(arguments: dict[str, 
         tiny_model("CnnPolicy", PixelBox(), **arguments)
 
 
-def test_reward_without_srl_trains_without_head() -> None:
-    model = tiny_model("CnnPolicy", PixelBox(), srl=None, intrinsic=FromNothing).learn(14)
-    assert model.policy.srl is None and model._n_updates == 4
+@pytest.mark.parametrize("policy, env", [(CnnPolicy, PixelBox), (MultiInputPolicy, Goal)])
+def test_policies_of_sb3_are_refused(policy: Any, env: Any) -> None:
+    with pytest.raises(ValueError, match="no shared encoder: use 'CnnPolicy', 'MlpPolicy' or 'MultiInputPolicy'"):
+        CuReSAC(policy, env())
 
 
-def test_numpy_numbers_and_schedules_are_accepted() -> None:
-    arguments: dict[str, Any] = dict(srl_period=np.int64(3), curiosity_beta=np.float32(0.5), curiosity_bout=np.int64(2))
-    tiny_model("MlpPolicy", VectorBox(), curiosity_prob=lambda progress: progress, **arguments).learn(12)
+def test_evaluation_in_the_training_environment_is_refused() -> None:
+    """Also of a callback in another one."""
+    env = DummyVecEnv([VectorBox])
+    callback = EveryNTimesteps(5, EvalCallback(env))
+    with pytest.raises(ValueError, match="EvalCallback evaluates in the training environment"):
+        tiny_model("MlpPolicy", env).learn(5, callback=[callback])
+    tiny_model("MlpPolicy", env).learn(5, callback=EvalCallback(DummyVecEnv([VectorBox]), eval_freq=10))
 
 
-def test_attribute_changed_to_nonsense_is_refused_by_the_next_load() -> None:
-    model = tiny_model("MlpPolicy", VectorBox())
-    model.update = "together"
-    with pytest.raises(ValueError, match="update is 'together'"):
-        model._setup_model()
+def test_hindsight_with_restarting_workers_is_refused() -> None:
+    """Other buffers than this package's cannot leave out the steps of workers that died."""
+    her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, learning_starts=20)
+    venv = FaultTolerantSubprocVecEnv([Goal], on_env_fault="restart")
+    try:
+        with pytest.raises(ValueError, match="use on_env_fault='raise', or leave replay_buffer_class out"):
+            tiny_model("MultiInputPolicy", venv, **her).learn(10)
+    finally:
+        venv.close()
 
 
 def test_contrast_needs_images() -> None:
@@ -109,27 +116,36 @@ def test_images_of_floats_are_refused() -> None:
     """Encoder and buffer would cast them to bytes, without a word."""
     env = PixelBox()
     env.observation_space = spaces.Box(0, 1, env.observation_space.shape, np.float32)
-    with pytest.raises(ValueError, match=r"images arrive as float32"):
+    with pytest.raises(ValueError, match="if it is an image, return it as uint8"):
         tiny_model("CnnPolicy", env)
 
 
-@pytest.mark.parametrize("cls", [CuReSAC, CuReTQC])
-def test_dictionaries_of_sb3s_own_environment(cls: type[CuReSAC]) -> None:
-    """With everything on and off; another policy is refused in SB3's words, or in ours where it is not one of them."""
-    env = SimpleMultiObsEnv(discrete_actions=False)
-    tiny_model("MultiInputPolicy", env, cls, learning_starts=5, buffer_size=20).learn(7)
-    cls("MultiInputPolicy", env, srl=None, curiosity=None, buffer_size=20, learning_starts=5).learn(7)
-    with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):
-        cls("CnnPolicy", env)
-    with pytest.raises(ValueError, match="a kind of CuRePolicy: use 'CnnPolicy', 'MlpPolicy' or 'MultiInputPolicy'"):
-        cls(MultiInputPolicy, env)
+def test_pretraining_needs_a_head_and_a_collector() -> None:
+    with pytest.raises(ValueError, match="srl is None"):
+        tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None).pretrain(10)
+    with pytest.raises(ValueError, match="'nobody'"):
+        tiny_model("CnnPolicy", PixelBox()).pretrain(10, collector="nobody")
+
+
+def test_numbers_of_numpy_and_schedules_are_accepted() -> None:
+    """As from ``numpy.arange``; some are compared to Python's in every update."""
+    arguments: dict[str, Any] = dict(
+        srl_schedule="alternating", srl_period=np.int64(3), actor_update_interval=np.int64(2),
+        curiosity_beta=np.float32(0.5), curiosity_bout=np.int64(2), curiosity_prob=lambda progress: progress,
+    )  # fmt: skip
+    tiny_model("MlpPolicy", VectorBox(), **arguments).learn(20)
 
 
 @pytest.mark.parametrize("name", ["learning_rat", "srl_kwarg"])
 def test_unknown_argument_is_an_error(name: str) -> None:
-    with pytest.raises(TypeError, match=name):
-        CuReSAC("MlpPolicy", VectorBox(), **{name: 1})
-    with pytest.raises(TypeError, match=name):
-        tiny_model("MlpPolicy", VectorBox(), policy_kwargs={name: 1})
-    with pytest.raises(TypeError, match=name):
-        tiny_model("MlpPolicy", VectorBox(), srl_kwargs={name: 1})
+    for arguments in ({name: 1}, {"policy_kwargs": {name: 1}}, {"srl_kwargs": {name: 1}}):
+        with pytest.raises(TypeError, match=name):
+            tiny_model("MlpPolicy", VectorBox(), **arguments)
+
+
+@pytest.mark.parametrize("extras", [{}, {"srl": None, "curiosity": None}])
+def test_users_dictionaries_stay_as_they_were(extras: dict[str, Any]) -> None:
+    """One dictionary of settings can serve several models and be written down afterwards."""
+    given: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "replay_buffer_kwargs": {}, "srl_kwargs": {}}
+    CuReSAC("MlpPolicy", VectorBox(), buffer_size=10, device="cpu", **given, **extras)
+    assert given == {"policy_kwargs": {"net_arch": [8]}, "replay_buffer_kwargs": {}, "srl_kwargs": {}}

@@ -74,8 +74,6 @@ def make(algorithm: str, head: str | None, reward: str, sensors: str) -> CuReSAC
     )
     if algorithm == "tqc":
         settings["policy_kwargs"] = {"n_quantiles": 5}
-    if head is None:  # the smallest networks are those of the shared encoder
-        settings["policy_kwargs"] = {"share_encoder": True, **settings.get("policy_kwargs", {})}
     if sensors == "dictionary":
         return sensor_model(SensorBox(), **settings)
     policy, env = ("CnnPolicy", PixelBox()) if sensors == "image" else ("MlpPolicy", VectorBox())

@@ -1,10 +1,8 @@
-"""Where CuReSAC stands in for SB3's SAC: the same habits, on the plain path and with the shared encoder.
-
-Most tests do the same with three agents: SB3's own SAC, CuReSAC with everything off, and CuReSAC as it comes.
-"""
+"""What users of SB3's SAC rely on, of CuReSAC as it comes and with ``srl=None, curiosity=None``."""
 
 import copy
-import warnings
+import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,51 +10,178 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from dictionaries_for_tests import Goal
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
-from sb3_contrib import TQC
-from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import (
-    BaseCallback,
     CallbackList,
     CheckpointCallback,
     EvalCallback,
     EveryNTimesteps,
-    ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
     StopTrainingOnRewardThreshold,
 )
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
 
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.data.buffers import FrameStackReplayBuffer
 
-PLAIN: dict[str, Any] = {"srl": None, "curiosity": None}
-AGENTS = pytest.mark.parametrize("agent", ["sac", "plain", "cure"])
-OURS = pytest.mark.parametrize("agent", ["plain", "cure"])
+OFF: dict[str, Any] = dict(srl=None, curiosity=None)
+both_modes = pytest.mark.parametrize("extras", [{}, OFF], ids=["default", "off"])
 
 
-def vectors(n_envs: int = 1, **kwargs: Any) -> VecEnv:
-    return DummyVecEnv([lambda: Monitor(VectorBox(**kwargs))] * n_envs)
+def vec_env(n_envs: int = 1, make: Callable[[], gym.Env] = VectorBox, **kwargs: Any) -> DummyVecEnv:
+    return DummyVecEnv([lambda: Monitor(make(**kwargs))] * n_envs)
 
 
-def agent_of(agent: str, env: Any, **kwargs: Any) -> SAC:
-    """The same settings for each: 10 random steps, then an update per step on batches of 8."""
-    if agent != "sac":
-        return tiny_model("MlpPolicy", env, **{**(PLAIN if agent == "plain" else {}), **kwargs})
-    defaults: dict[str, Any] = dict(
-        learning_starts=10, batch_size=8, buffer_size=500, gradient_steps=-1, learning_rate=1e-3, seed=0, device="cpu"
+def vector_model(env: Any = None, **kwargs: Any) -> CuReSAC:
+    return tiny_model("MlpPolicy", vec_env() if env is None else env, **kwargs)
+
+
+# ----------------------------------------------------------- arguments of the networks
+
+
+@both_modes
+@pytest.mark.parametrize("net_arch", [[], [4, 6], dict(pi=[5], qf=[7, 8])], ids=str)
+def test_net_arch_is_widths_of_hidden_layers(extras: dict[str, Any], net_arch: Any) -> None:
+    policy = vector_model(policy_kwargs=dict(net_arch=net_arch, n_critics=3), **extras).learn(13).policy
+    hidden = net_arch if isinstance(net_arch, dict) else dict(pi=net_arch, qf=net_arch)
+    for agent in policy.agents.values():
+        layers = [*agent.actor.latent_pi, agent.actor.mu, agent.actor.log_std]
+        assert [each.out_features for each in layers if isinstance(each, nn.Linear)] == [*hidden["pi"], 2, 2]
+        biases = [layer.bias for layer in agent.critic.ensemble if list(layer.parameters())]
+        assert [bias.shape for bias in biases] == [(3, 1, width) for width in [*hidden["qf"], 1]]
+
+
+@both_modes
+def test_optimizer_arguments_reach_every_network(extras: dict[str, Any]) -> None:
+    policy_kwargs = dict(optimizer_class=th.optim.AdamW, optimizer_kwargs=dict(weight_decay=0.2, eps=1e-3))
+    policy = vector_model(policy_kwargs=policy_kwargs, **extras).learn(13).policy
+    optimizers = [each.optimizer for agent in policy.agents.values() for each in (agent.actor, agent.critic)]
+    optimizers += policy.encoder_update.optimizers.values()
+    assert len(optimizers) == (3 if extras else 5)
+    for optimizer in optimizers:
+        assert type(optimizer) is th.optim.AdamW
+        assert (optimizer.param_groups[0]["weight_decay"], optimizer.param_groups[0]["eps"]) == (0.2, 1e-3)
+    if policy.srl is not None:  # has a weight decay of its own
+        assert type(policy.srl.optimizer) is th.optim.AdamW and policy.srl.optimizer.defaults["eps"] == 1e-3
+    chosen = vector_model(policy_kwargs=dict(optimizer_kwargs=dict(foreach=True)), **extras).policy
+    assert chosen.critic.optimizer.defaults["foreach"] and not chosen.critic.optimizer.defaults["fused"]
+
+
+class BatchNorm(BaseFeaturesExtractor):
+    """Flattened observation, with layers that differ between training and evaluation."""
+
+    def __init__(self, observation_space: spaces.Space, dropout: float = 0.0):
+        size = spaces.flatdim(observation_space)
+        super().__init__(observation_space, features_dim=size + 1)  # two are too few for LayerNorm
+        self.layers = nn.Sequential(nn.Flatten(), nn.BatchNorm1d(size), nn.Dropout(dropout), nn.ZeroPad1d((0, 1)))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layers(observations)
+
+
+@both_modes
+def test_any_features_extractor_is_the_encoder(extras: dict[str, Any]) -> None:
+    """Its running statistics move in ``train`` only and are copied to the target; dropout is off when acting."""
+    policy_kwargs = dict(features_extractor_class=BatchNorm, features_extractor_kwargs=dict(dropout=0.5))
+    model = vector_model(policy_kwargs=policy_kwargs, encoder_tau=0.0, gradient_steps=0, **extras)
+    online, target = (each.trunk.extractor for each in (model.policy.encoder, model.policy.encoder_target))
+    assert type(online) is BatchNorm and online.layers[2].p == 0.5
+    observation = np.array([0.3, -0.7], np.float32)
+    model.learn(25)
+    model.predict(observation)
+    means = [extractor.layers[1].running_mean for extractor in (online, target)]
+    assert not any(mean.any() for mean in means)
+    model.train(1, batch_size=8)
+    assert means[0].any() and th.equal(*means)
+    for predict in [model.predict] if extras else [model.predict, model.predict_curious]:
+        first, second = (predict(observation, deterministic=True)[0] for _ in range(2))
+        np.testing.assert_array_equal(first, second)
+
+
+@both_modes
+@pytest.mark.parametrize("ent_coef, initial", [("auto", 1.0), ("auto_0.25", 0.25), (0.3, 0.3)])
+def test_temperature(extras: dict[str, Any], ent_coef: str | float, initial: float) -> None:
+    """Learned temperatures start where they are told and move; a fixed one stays."""
+    model = vector_model(ent_coef=ent_coef, **extras)
+    agents = model.policy.agents.values()
+    assert [agent.temperature().item() for agent in agents] == pytest.approx([initial] * len(agents))
+    model.learn(14)
+    assert [agent.temperature().item() != pytest.approx(initial, rel=1e-6) for agent in agents] == [
+        isinstance(ent_coef, str)
+    ] * len(agents)
+
+
+# -------------------------------------------------------------------- acting
+
+
+@pytest.mark.parametrize("name", ["predict", "predict_curious"])
+def test_predict(name: str) -> None:
+    """One observation or a batch, deterministic or not; actions fill asymmetric bounds; wrong shapes are refused."""
+    model = vector_model(VectorBox(low=-1.0, high=3.0))
+    predict = getattr(model, name)
+    for agent in model.policy.agents.values():  # wide distributions, so that draws come close to the bounds
+        nn.init.constant_(agent.actor.log_std.bias, 3.0)
+    batch = np.random.default_rng(0).uniform(-1, 1, (50, 2)).astype(np.float32)
+    actions, state = predict(batch, deterministic=True)
+    assert actions.shape == (50, 2) and state is None
+    single, _ = predict(batch[7], deterministic=True)
+    assert single.shape == (2,)
+    np.testing.assert_allclose(single, actions[7], rtol=1e-5, atol=1e-6)
+    draws = np.concatenate([predict(batch)[0] for _ in range(20)])
+    assert (draws >= -1).all() and (draws <= 3).all() and draws.max() > 2.9 and draws.min() < -0.9
+    for wrong in (batch[:, :1], batch[None]):
+        with pytest.raises(ValueError):
+            predict(wrong)
+
+
+@both_modes
+def test_channels_last_images(extras: dict[str, Any]) -> None:
+    """They are transposed, and ``predict`` takes both layouts; images are divided by 255 exactly once."""
+    model = tiny_model("CnnPolicy", PixelBox(channels_last=True, tells_frame_stack=False), **extras).learn(13)
+    assert model.observation_space.shape == model.replay_buffer.sample(4).observations.shape[1:] == (6, 36, 36)
+    image, _ = PixelBox(channels_last=True).reset(seed=5)
+    seen: list[th.Tensor] = []
+    next(each for each in model.policy.encoder.modules() if isinstance(each, nn.Conv2d)).register_forward_pre_hook(
+        lambda _, inputs: seen.append(inputs[0])
     )
-    return SAC("MlpPolicy", env, policy_kwargs={"net_arch": [16]}, **{**defaults, **kwargs})
+    first, last = (model.predict(each, deterministic=True)[0] for each in (image.transpose(2, 0, 1), image))
+    assert last.shape == (2,)
+    np.testing.assert_array_equal(first, last)
+    assert all(each.max() == 1 for each in seen)
+
+
+class MatrixActions(VectorBox):
+    """``VectorBox`` whose actions are a 2x1 matrix of float64."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.action_space = spaces.Box(-2.0, 1.0, (2, 1), np.float64)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        assert action.shape == (2, 1) and (action >= -2).all() and (action <= 1).all()
+        self.n_steps += 1
+        return self.observe(), 0.0, False, self.n_steps >= self.episode_length, {}
+
+
+@pytest.mark.parametrize("curiosity", ["separate", "random", None])
+def test_matrix_actions(curiosity: str | None) -> None:
+    """Actions need not be vectors of float32."""
+    model = vector_model(vec_env(2, MatrixActions), curiosity=curiosity, curiosity_prob=0.5).learn(30)
+    assert model.predict(model.observation_space.sample())[0].shape == (2, 1)
+    assert np.abs(model.replay_buffer.actions).max() <= 1
 
 
 class Rooms(gym.ObservationWrapper):
-    """Tells only in which of two rooms the agent is."""
+    """Shows only in which of two rooms the dot is."""
 
     def __init__(self) -> None:
         super().__init__(VectorBox())
@@ -66,189 +191,144 @@ class Rooms(gym.ObservationWrapper):
         return np.int64(observation[0] > 0)
 
 
-@AGENTS
-def test_discrete_observations(agent: str) -> None:
+@both_modes
+def test_discrete_observations(extras: dict[str, Any]) -> None:
     """They are stored as numbers and seen one-hot."""
-    model = agent_of(agent, DummyVecEnv([Rooms])).learn(20)
+    model = vector_model(DummyVecEnv([Rooms]), **extras).learn(20)
     assert set(np.unique(model.replay_buffer.observations[:20])) <= {0, 1}
     assert model.predict(np.int64(1))[0].shape == (2,)
 
 
-# ------------------------------------------------------------------------------ callbacks
+@both_modes
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_action_noise(extras: dict[str, Any], n_envs: int) -> None:
+    """Noise is added to the scaled action of every environment, whoever acts, and clipped."""
+    # Far outside [-1, 1], so that whatever the policies want, the upper bound is executed.
+    noise = NormalActionNoise(np.full(2, 5.0), np.zeros(2))
+    model = vector_model(vec_env(n_envs), action_noise=noise, curiosity_prob=0.5, **extras).learn(30)
+    assert (model.replay_buffer.actions[: model.replay_buffer.pos] == 1).all()
 
 
-@AGENTS
-def test_callbacks(agent: str, tmp_path: Path) -> None:
-    """SB3's own: what they write, how often they act, and when they stop, is the same for each agent."""
+# ------------------------------------------------------------------ training
+
+
+@both_modes
+def test_equal_seeds_equal_runs(extras: dict[str, Any]) -> None:
+    first, second, other = (state_of(vector_model(seed=seed, **extras).learn(25)) for seed in (1, 1, 2))
+    assert differences(first, second) == []
+    assert differences(first, other)
+
+
+@both_modes
+def test_train_freq_and_gradient_steps(extras: dict[str, Any]) -> None:
+    """Steps or episodes, and 0 or -1 (as many as steps) updates per call; learning begins after step 10."""
+    cases: list[tuple[int, Any, int, int, int]] = [
+        # total steps, train_freq, gradient_steps, n_envs -> updates
+        (30, 3, 2, 1, 2 * 7),  # calls at 12, 15, ..., 30
+        (30, (3, "step"), -1, 1, 3 * 7),
+        (40, (1, "episode"), -1, 1, 40),  # episodes of 20 steps
+        (40, (2, "episode"), 3, 1, 3),
+        (30, 1, 0, 1, 0),
+        (30, 1, -1, 3, 3 * 7),  # calls at 12, 15, ..., 30
+        (30, 2, 5, 3, 5 * 4),  # calls at 12, 18, 24, 30
+    ]
+    for total, train_freq, gradient_steps, n_envs, updates in cases:
+        model = vector_model(vec_env(n_envs), train_freq=train_freq, gradient_steps=gradient_steps, **extras)
+        model.learn(total)
+        assert (model.num_timesteps, model._n_updates) == (total, updates), (train_freq, gradient_steps, n_envs)
+
+
+@both_modes
+def test_learning_twice(extras: dict[str, Any], tmp_path: Path) -> None:
+    """Counters and schedules start anew or continue; the logger that was set stays."""
+    seen: list[float] = []
+
+    def schedule(remaining: float) -> float:
+        seen.append(remaining)
+        return 1e-3 * remaining
+
+    model = vector_model("Pendulum-v1", learning_rate=schedule, **extras)
+    logger = configure(str(tmp_path), ["csv"])
+    model.set_logger(logger)
+    model.learn(25)
+    assert model.logger is logger and min(seen) == 0 and model.actor.optimizer.param_groups[0]["lr"] == 0
+    seen.clear()
+    model.learn(25, reset_num_timesteps=False)  # without random steps
+    assert (model.num_timesteps, model._total_timesteps, model._n_updates, max(seen) <= 0.5) == (50, 50, 40, True)
+    model.learn(15)
+    assert (model.num_timesteps, model._n_updates) == (15, 45)
+
+
+@both_modes
+def test_set_env(extras: dict[str, Any]) -> None:
+    """A new environment replaces the old one and is reset first; another number of environments is refused."""
+    old = VectorBox()
+    model = vector_model(old, **extras).learn(25)
+    with pytest.raises(AssertionError, match="number of environments"):
+        model.set_env(vec_env(2))
+    model.set_env(VectorBox(episode_length=7))
+    old.step = None  # type: ignore[method-assign, assignment]
+    model.learn(14)
+    assert [episode["l"] for episode in model.ep_info_buffer] == [7, 7]
+
+
+@both_modes
+def test_callbacks(extras: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SB3's own act when they should, stop training, and write what loads; training can then continue."""
     calls: list[int] = []
 
-    class Count(BaseCallback):
+    class Recorder(StopTrainingOnMaxEpisodes):
         def _on_step(self) -> bool:
             calls.append(self.num_timesteps)
             return True
 
-    best = StopTrainingOnRewardThreshold(reward_threshold=-1.0)  # rewards are in [0, 1]
+    reached = StopTrainingOnRewardThreshold(reward_threshold=-1.0)  # rewards are in [0, 1]
+    folder = str(tmp_path)
     callbacks = CallbackList(
         [
-            CheckpointCallback(20, str(tmp_path), save_replay_buffer=True),
-            EveryNTimesteps(15, Count()),
-            EvalCallback(vectors(), best, n_eval_episodes=1, eval_freq=50, log_path=str(tmp_path), verbose=0),
+            CheckpointCallback(20, folder, save_replay_buffer=True),
+            EveryNTimesteps(15, Recorder(10)),
+            EvalCallback(
+                vec_env(), reached, n_eval_episodes=1, eval_freq=30, log_path=folder, best_model_save_path=folder
+            ),
         ]
     )
-    model = agent_of(agent, vectors()).learn(1000, callback=callbacks)
-    assert model.num_timesteps == 50  # where the threshold stopped it
-    assert calls == [15, 30, 45]
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {
-        *(f"rl_model_{n}_steps.zip" for n in (20, 40)),
-        *(f"rl_model_replay_buffer_{n}_steps.pkl" for n in (20, 40)),
-        "evaluations.npz",
-    }
-    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [50]
+    model = vector_model(verbose=1, **extras).learn(1000, callbacks, log_interval=1, progress_bar=True)
+    assert model.num_timesteps == 30 and calls == [15, 30]
+    names = {"rl_model_20_steps.zip", "rl_model_replay_buffer_20_steps.pkl", "evaluations.npz", "best_model.zip"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [30]
+    printed = capsys.readouterr().out
+    assert "critic_loss" in printed and "environment_steps" in printed and "tensor(" not in printed
+    best = CuReSAC.load(tmp_path / "best_model", env=vec_env())
+    assert best.learn(1000, StopTrainingOnMaxEpisodes(2), reset_num_timesteps=False).num_timesteps <= 30 + 41
 
 
-@AGENTS
-def test_stopping_after_episodes(agent: str) -> None:
-    """A stop in the middle of ``learn`` leaves a model that goes on."""
-    model = agent_of(agent, vectors()).learn(1000, callback=StopTrainingOnMaxEpisodes(2))
-    assert model.num_timesteps == 40
-    assert model.learn(20, reset_num_timesteps=False).num_timesteps == 60
-
-
-@AGENTS
-def test_progress_bar(agent: str) -> None:
-    """Of tqdm and rich, as a callback and as an argument."""
-    pytest.importorskip("tqdm.rich")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = agent_of(agent, vectors()).learn(12, callback=ProgressBarCallback())
-        assert model.learn(12, progress_bar=True).num_timesteps == 12
-
-
-@AGENTS
-def test_a_function_as_callback(agent: str) -> None:
-    """It gets the local variables of the loop, in which SB3's own names are."""
-    seen = []
-
-    def look(local: dict[str, Any], _: dict[str, Any]) -> bool:
-        seen.append({"rewards", "infos", "dones"} <= local.keys())
-        return len(seen) < 12
-
-    assert agent_of(agent, vectors()).learn(100, callback=look).num_timesteps == 12
-    assert all(seen)
-
-
-# --------------------------------------------------------------------------- VecNormalize
-
-
-@AGENTS
-def test_normalised_rewards(agent: str, tmp_path: Path) -> None:
-    """The buffer keeps rewards as they are, updates see them divided, statistics survive saving."""
-    env = VecNormalize(vectors(2), norm_obs=False, norm_reward=True)
-    model = agent_of(agent, env).learn(60)
-    assert model.get_vec_normalize_env() is env
-    buffer = model.replay_buffer
+@both_modes
+def test_vec_normalize(extras: dict[str, Any], tmp_path: Path) -> None:
+    """The buffer keeps what the environment gave, updates see it normalised; statistics are saved and loaded."""
+    env = VecNormalize(vec_env(2))
+    model = vector_model(env, gamma=0.0, learning_rate=0.0, **extras).learn(60)
+    buffer: Any = model.replay_buffer
     stored = buffer.rewards[: buffer.pos]
-    assert 0 <= stored.min() and stored.max() <= 1  # those of the environment
-    np.random.seed(1)
-    raw = buffer.sample(32).rewards
-    np.random.seed(1)
-    normalised = buffer.sample(32, env=model._vec_normalize_env).rewards
-    scale = np.sqrt(env.ret_rms.var + env.epsilon)
-    np.testing.assert_allclose(normalised, raw / scale, rtol=1e-5)
-    assert abs(scale - 1) > 0.05
+    assert (stored >= 0).all() and (stored <= 1).all() and np.abs(buffer.observations[: buffer.pos]).max() <= 1
+    np.random.seed(5)
+    batch = buffer.sample(8, env)
+    np.random.seed(5)
+    model.set_logger(configure(None, []))
+    model.train(1, 8)
+    with th.no_grad():  # without a future the rewards are the targets
+        values = model.critic(model.policy.encode(batch.observations), batch.actions).squeeze(2)
+        expected = 0.5 * (values - batch.rewards).square().mean(dim=0).sum()
+    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected.item(), rel=1e-4)
     model.save(tmp_path / "model")
-    env.save(str(tmp_path / "statistics.pkl"))
-    again = VecNormalize.load(str(tmp_path / "statistics.pkl"), vectors(2))
-    loaded = type(model).load(tmp_path / "model", env=again)
+    env.save(str(tmp_path / "statistics"))
+    loaded = CuReSAC.load(tmp_path / "model", env=VecNormalize.load(str(tmp_path / "statistics"), vec_env(2)))
     assert loaded.get_vec_normalize_env().ret_rms.var == env.ret_rms.var
     assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 80
 
 
-@pytest.mark.parametrize("update", ["joint", "sequential"])
-def test_normalised_rewards_are_the_tasks_alone(update: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The task agent is trained on the divided reward, the curious one on the SRL error of the same batch."""
-    env = VecNormalize(DummyVecEnv([PixelBox]), norm_obs=False, norm_reward=True)
-    model = tiny_model("CnnPolicy", env, update=update).learn(20)
-    seen: dict[str, Any] = {}
-    update_actor_critic, update_intrinsic = CuReSAC._update_actor_critic, CuReSAC._update_intrinsic
-
-    def watch_update(self: CuReSAC, name: str, batch: Any, rewards: Any, *rest: Any) -> None:
-        seen[name] = rewards.clone()
-        update_actor_critic(self, name, batch, rewards, *rest)
-
-    def watch_reward(self: CuReSAC, *arguments: Any) -> th.Tensor:
-        seen["reward"] = update_intrinsic(self, *arguments)
-        return seen["reward"]
-
-    monkeypatch.setattr(CuReSAC, "_update_actor_critic", watch_update)
-    monkeypatch.setattr(CuReSAC, "_update_intrinsic", watch_reward)
-    np.random.seed(5)
-    raw = model.replay_buffer.sample(8).rewards
-    np.random.seed(5)
-    model.train(1, 8)
-    scale = float(np.sqrt(env.ret_rms.var + env.epsilon))
-    th.testing.assert_close(seen["task"], (raw / scale).clamp(-10, 10))
-    assert th.equal(seen["curious"], seen["reward"])
-
-
-# -------------------------------------------------------------- dictionaries, replay buffers
-
-
-class Goal(gym.Env):
-    """A dot that is to come near to a goal, as ``HerReplayBuffer`` wants it."""
-
-    def __init__(self) -> None:
-        box = spaces.Box(-1, 1, (2,), np.float32)
-        self.observation_space = spaces.Dict(observation=box, achieved_goal=box, desired_goal=box)
-        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
-
-    def observe(self) -> dict[str, np.ndarray]:
-        place = self.place.astype(np.float32)
-        return {"observation": place, "achieved_goal": place, "desired_goal": self.goal}
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict]:
-        super().reset(seed=seed)
-        self.place, self.n = np.zeros(2), 0
-        self.goal = self.np_random.uniform(-1, 1, 2).astype(np.float32)
-        return self.observe(), {}
-
-    def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
-        return -(np.linalg.norm(achieved - desired, axis=-1) > 0.2).astype(np.float32)
-
-    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
-        self.place = np.clip(self.place + 0.3 * action, -1, 1)
-        self.n += 1
-        reward = float(self.compute_reward(self.place, self.goal, None))
-        return self.observe(), reward, False, self.n >= 10, {}
-
-
-@pytest.mark.parametrize("hindsight", [False, True])
-def test_dictionaries_without_extras_are_sacs(hindsight: bool) -> None:
-    """With and without hindsight, bit for bit."""
-    kwargs: dict[str, Any] = dict(
-        learning_starts=12, batch_size=8, buffer_size=200, seed=3, device="cpu", policy_kwargs={"net_arch": [16]},
-        learning_rate=1e-3, tau=0.01, ent_coef="auto_0.1", gradient_steps=1, target_update_interval=1,
-    )  # fmt: skip
-    if hindsight:
-        kwargs["replay_buffer_class"] = HerReplayBuffer
-        kwargs["replay_buffer_kwargs"] = {"n_sampled_goal": 2, "goal_selection_strategy": "future"}
-    theirs = SAC("MultiInputPolicy", Goal(), **kwargs).learn(60)
-    ours = CuReSAC("MultiInputPolicy", Goal(), **PLAIN, **kwargs).learn(60)
-    assert type(ours.replay_buffer) is type(theirs.replay_buffer)
-    assert differences(state_of(ours), state_of(theirs)) == []
-
-
-@pytest.mark.parametrize("n_steps", [30, 35], ids=["between episodes", "within one"])
-def test_hindsight_after_pretraining(n_steps: int) -> None:
-    """Nothing that was collected in pretraining is learned from: ``HerReplayBuffer.reset`` would keep its episodes."""
-    her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=10)
-    model: Any = tiny_model("MultiInputPolicy", Goal(), **her).pretrain(n_steps)
-    buffer = model.replay_buffer
-    buffer.observations["observation"][:] = 7  # wherever it lies
-    model.learn(40)
-    assert buffer.pos == np.sum(buffer.ep_length > 0) == 40
-    assert buffer.sample(200).observations["observation"].max() <= 1
+# ---------------------------------------------------------- replay buffers
 
 
 class Counting(ReplayBuffer):
@@ -263,200 +343,138 @@ class Counting(ReplayBuffer):
         return super().sample(batch_size, env)
 
 
-@AGENTS
-@pytest.mark.parametrize("kind", [ReplayBuffer, Counting])
-def test_other_replay_buffers(agent: str, kind: type[ReplayBuffer], tmp_path: Path) -> None:
-    """They are used, with their arguments, and survive."""
-    kwargs = {"start": 100} if kind is Counting else {}
-    model = agent_of(agent, vectors(), replay_buffer_class=kind, replay_buffer_kwargs=kwargs).learn(30)
-    assert type(model.replay_buffer) is kind
-    if kind is Counting:
-        assert model.replay_buffer.given == 100 + 8 * model._n_updates > 100
+@both_modes
+def test_replay_buffer_of_a_users_class(extras: dict[str, Any], tmp_path: Path) -> None:
+    """It is used with its arguments, and a loaded model has one if it is given the class."""
+    arguments: dict[str, Any] = dict(replay_buffer_class=Counting, replay_buffer_kwargs={"start": 100})
+    model = vector_model(**arguments, **extras).learn(30)
+    assert model.replay_buffer.given == 100 + 8 * 20
     model.save(tmp_path / "model")
-    # A class of one's own is not in the file.
-    loaded = type(model).load(tmp_path / "model", env=vectors(), custom_objects={"replay_buffer_class": kind})
-    assert type(loaded.replay_buffer) is kind
+    loaded = CuReSAC.load(tmp_path / "model", env=vec_env(), custom_objects={"replay_buffer_class": Counting})
+    assert type(loaded.replay_buffer) is Counting and loaded.learn(15).replay_buffer.given == 100 + 8 * 5
 
 
-def test_a_chosen_buffer_beats_the_one_for_stacked_frames() -> None:
-    """And gives the same batches."""
-    models = [tiny_model("CnnPolicy", PixelBox(), replay_buffer_class=kind).learn(15) for kind in (None, ReplayBuffer)]
-    assert [type(model.replay_buffer) for model in models] == [FrameStackReplayBuffer, ReplayBuffer]
-    assert differences(state_of(models[0]), state_of(models[1])) == []
+@both_modes
+def test_frame_stack_buffer_changes_only_memory(extras: dict[str, Any]) -> None:
+    """A run with it ends with the bits of a run with SB3's buffer, over resets and in several environments."""
+    states = []
+    for buffer_class in (FrameStackReplayBuffer, ReplayBuffer):
+        chosen = {} if buffer_class is FrameStackReplayBuffer else dict(replay_buffer_class=buffer_class)
+        env = vec_env(2, PixelBox, channels_last=True, episode_length=9)
+        model = tiny_model("CnnPolicy", env, buffer_size=40, **chosen, **extras).learn(60)
+        assert type(model.replay_buffer) is buffer_class
+        states.append(state_of(model))
+    assert differences(*states) == []
 
 
-@OURS
-def test_n_step_returns(agent: str) -> None:
-    """Of the task, beside curiosity; with everything off they are SB3's."""
-    assert agent_of(agent, vectors(), n_steps=3).learn(40)._n_updates > 0
-    model = agent_of(agent, vectors(), n_steps=3, srl=None, curiosity=None).learn(40)
-    assert type(model.replay_buffer) is NStepReplayBuffer
-    assert model.replay_buffer.n_steps == 3 and model.replay_buffer.gamma == model.gamma
-    assert model.replay_buffer.sample(8).discounts is not None
+@both_modes
+def test_stored_replay_buffer_trains_another_model(extras: dict[str, Any]) -> None:
+    """Offline, without a step of an environment; loaded, it samples on the model's device."""
+    file = io.BytesIO()
+    collector = tiny_model("CnnPolicy", PixelBox(), gradient_steps=0, **extras).learn(40)
+    collector.save_replay_buffer(file)
+    file.seek(0)
+    model = tiny_model("CnnPolicy", PixelBox(), **extras)
+    model.load_replay_buffer(file)
+    np.testing.assert_array_equal(model.replay_buffer.rewards, collector.replay_buffer.rewards)
+    model.set_logger(configure(None, []))
+    before = state_of(model)
+    model.train(gradient_steps=5, batch_size=8)
+    assert (model._n_updates, model.num_timesteps) == (5, 0) and differences(before, state_of(model))
+    model.device = th.device("meta")  # any machine has it
+    file.seek(0)
+    model.load_replay_buffer(file)
+    assert model.replay_buffer.sample(4).actions.device.type == "meta"
 
 
-# --------------------------------------------------------------- parameters, environments
+@both_modes
+@pytest.mark.parametrize("buffer_class", [HerReplayBuffer, DictReplayBuffer])
+def test_dictionaries_with_buffers_of_sb3(extras: dict[str, Any], buffer_class: Any, tmp_path: Path) -> None:
+    """Hindsight included; the loaded model continues."""
+    more: dict[str, Any] = dict(learning_starts=20)
+    if buffer_class is HerReplayBuffer:
+        more |= dict(replay_buffer_kwargs=dict(n_sampled_goal=2, goal_selection_strategy="future"))
+    env = vec_env(2, Goal)
+    model = tiny_model("MultiInputPolicy", env, replay_buffer_class=buffer_class, **more, **extras).learn(60)
+    assert type(model.replay_buffer) is buffer_class and model._n_updates > 0
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = CuReSAC.load(tmp_path / "model", env=env)
+    loaded.load_replay_buffer(tmp_path / "buffer", trusted=True)
+    assert type(loaded.replay_buffer) is buffer_class
+    assert loaded.learn(40, reset_num_timesteps=False).num_timesteps == 100
 
 
-@OURS
-def test_models_of_the_same_parameters_go_their_own_ways(agent: str) -> None:
-    """What one learns moves nothing of the other, the optimisers' counts among it."""
-    first, second = agent_of(agent, vectors()).learn(30), agent_of(agent, vectors(), seed=9)
-    second.set_parameters(first.get_parameters())
-    before = copy.deepcopy(first.get_parameters())
-    second.learn(30)
-    assert differences(first.get_parameters(), before) == []
-
-
-@AGENTS
-def test_set_parameters(agent: str, tmp_path: Path) -> None:
-    """From a dictionary, from an archive, and part of them."""
-    trained = agent_of(agent, vectors()).learn(30)
-    trained.save(tmp_path / "model.zip")
-    for source in (trained.get_parameters(), tmp_path / "model.zip"):
-        fresh = agent_of(agent, vectors(), seed=9)
-        fresh.set_parameters(source)
-        assert differences(fresh.get_parameters(), trained.get_parameters()) == []
-    part = {"policy": trained.get_parameters()["policy"]}
-    fresh = agent_of(agent, vectors(), seed=9)
-    with pytest.raises(ValueError, match=r"do not match|Names of parameters"):
-        fresh.set_parameters(part)
-    fresh = agent_of(agent, vectors(), seed=9)
-    before = state_of(fresh)
-    fresh.set_parameters(part, exact_match=False)
-    after = state_of(fresh)
-    assert differences(after["policy"], part["policy"]) == []
-    assert {d.split(".")[1] for d in differences(before, after)} == {"policy"}
-    with pytest.raises(ValueError, match="not_there"):
-        fresh.set_parameters({"not_there": {}}, exact_match=False)
-
-
-@AGENTS
-def test_set_env(agent: str) -> None:
-    """An environment of the same kind is taken, with the last observation forgotten; another number is refused."""
-    model = agent_of(agent, vectors()).learn(15)
-    other = vectors(episode_length=7)
-    model.set_env(other)
-    assert model.get_env() is other and model._last_obs is None
-    model.learn(15, reset_num_timesteps=False)
-    assert model.num_timesteps == 30
-    with pytest.raises(AssertionError, match=r"number of environments to be set is different.*2 != 1"):
-        model.set_env(vectors(2))
-    with pytest.raises(ValueError, match="Observation spaces do not match"):
-        model.set_env(PixelBox())
-    assert model.get_env() is other
-
-
-@AGENTS
-def test_learning_twice(agent: str, tmp_path: Path) -> None:
-    """Counters and schedules start anew or go on; the logger that was set stays."""
-    seen: list[float] = []
-
-    def schedule(remaining: float) -> float:
-        seen.append(remaining)
-        return 1e-3 * remaining
-
-    model = agent_of(agent, vectors(), learning_rate=schedule)
-    logger = configure(str(tmp_path), ["csv"])
-    model.set_logger(logger)
-    model.learn(40, log_interval=1)
-    assert model.logger is logger and (tmp_path / "progress.csv").stat().st_size > 0
-    assert min(seen) == 0.0
-    seen.clear()
-    model.learn(40, reset_num_timesteps=False)
-    assert model.num_timesteps == 80 and model._total_timesteps == 80 and max(seen) <= 0.5
-    updates = model._n_updates
-    assert updates == 70
+@pytest.mark.parametrize("n_steps", [30, 35], ids=["between episodes", "within one"])
+def test_hindsight_after_pretraining(n_steps: int) -> None:
+    """Nothing that was collected in pretraining is learned from: ``HerReplayBuffer.reset`` would keep its episodes."""
+    her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=10)
+    model: Any = tiny_model("MultiInputPolicy", Goal(), **her).pretrain(n_steps)
+    buffer = model.replay_buffer
+    buffer.observations["observation"][:] = 7  # wherever it lies
     model.learn(40)
-    assert model.num_timesteps == 40 and model._n_updates == updates + 30
+    assert buffer.pos == np.sum(buffer.ep_length > 0) == 40
+    assert buffer.sample(200).observations["observation"].max() <= 1
 
 
-@AGENTS
-def test_training_by_episodes(agent: str) -> None:
-    """As many updates as the episode had steps; several environments are refused, by us when the model is made."""
-    model = agent_of(agent, vectors(), train_freq=(1, "episode"), learning_starts=0).learn(40)
-    assert model.num_timesteps == 40 and model._n_updates == 40
-    with pytest.raises((ValueError, AssertionError), match=r"episod"):
-        agent_of(agent, vectors(2), train_freq=(1, "episode")).learn(10)
+# ------------------------------------------------------ parameters and files
 
 
-@AGENTS
-def test_action_noise(agent: str) -> None:
-    """Of one and of two environments; actions stay in their bounds."""
-    noise = NormalActionNoise(np.zeros(2), np.full(2, 5.0))
-    for n_envs in (1, 2):
-        model = agent_of(agent, vectors(n_envs), action_noise=noise, learning_starts=0).learn(40)
-        actions = model.replay_buffer.actions[: model.replay_buffer.pos]
-        assert np.abs(actions).max() <= 1 and (np.abs(actions) == 1).mean() > 0.5
-    assert isinstance(model.action_noise, VectorizedActionNoise)
+@both_modes
+def test_parameters(extras: dict[str, Any]) -> None:
+    """Whole, they give the old actions and optimisers back; a part may be set alone if that is said."""
+    model, observations = vector_model(**extras).learn(20), np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    saved = copy.deepcopy(model.get_parameters())
+    actions, _ = model.predict(observations, deterministic=True)
+    model.learn(20)
+    assert not np.array_equal(actions, model.predict(observations, deterministic=True)[0])
+    model.set_parameters(saved)
+    np.testing.assert_array_equal(actions, model.predict(observations, deterministic=True)[0])
+    assert differences(saved, model.get_parameters()) == []
+    other = vector_model(seed=9, **extras)
+    other.set_parameters(saved)
+    other.learn(20)  # moves nothing of the first, not even counts of optimisers
+    assert differences(saved, model.get_parameters()) == []
+
+    with pytest.raises(ValueError, match="invalid object name"):
+        model.set_parameters({**saved, "no_such_net": {}})
+    for name in saved:
+        with pytest.raises(ValueError, match="do not match"):
+            model.set_parameters({key: value for key, value in saved.items() if key != name})
+    key = "task.actor.mu.weight"
+    part = {"policy": {key: th.full_like(saved["policy"][key], 0.125)}}
+    before = state_of(model)
+    model.set_parameters(part, exact_match=False)
+    assert differences(before, state_of(model)) == [f".policy.{key}"]
 
 
-# ----------------------------------------------------------------- archives, devices, others
-
-
-@AGENTS
-def test_custom_objects(agent: str, tmp_path: Path) -> None:
-    """They replace what was saved; those that nobody needs are ignored, as rl-zoo gives some."""
-    agent_of(agent, vectors(), learning_rate=lambda remaining: remaining).save(tmp_path / "model")
-    objects = {"learning_rate": 0.0, "lr_schedule": lambda _: 0.0, "clip_range": lambda _: 0.2}
-    cls = SAC if agent == "sac" else CuReSAC
-    loaded = cls.load(tmp_path / "model", env=vectors(), custom_objects=objects)
-    before = state_of(loaded)["policy"]
-    loaded.learn(20)
-    # Targets move towards networks that stay, and running statistics run.
-    moving = [
-        name for name in differences(before, state_of(loaded)["policy"]) if not ("target" in name or ".scale." in name)
-    ]
-    assert moving == []
-
-
-@AGENTS
-def test_devices(agent: str, tmp_path: Path) -> None:
-    """``device=`` of load; where there is no CUDA it is the CPU, as in SB3."""
-    model = agent_of(agent, vectors()).learn(15)
-    model.policy.to("cpu")
-    model.save(tmp_path / "model")
-    observation = VectorBox().reset(seed=0)[0]
-    action, _ = model.predict(observation, deterministic=True)
-    for device in ["cpu"] if th.cuda.is_available() else ["cpu", "cuda"]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # CuReSAC tells
-            loaded = type(model).load(tmp_path / "model", env=vectors(), device=device)
-        assert loaded.device.type == "cpu"
-        np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], action)
+@both_modes
+def test_save_and_load(extras: dict[str, Any]) -> None:
+    """In memory and on the device that is asked for, which is the CPU without CUDA; arguments can be replaced."""
+    model = vector_model(**extras).learn(15)
+    archive = io.BytesIO()
+    model.save(archive)
+    for device in ("cpu", "auto"):
+        archive.seek(0)
+        loaded = CuReSAC.load(archive, env=vec_env(), device=device, gamma=0.5)
+        assert (loaded.gamma, loaded.num_timesteps, loaded.device) == (0.5, 15, loaded.policy.device)
+        assert device == "auto" or differences(state_of(model), state_of(loaded)) == []
         loaded.learn(15)
 
 
 @pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
-@AGENTS
-def test_from_gpu_to_cpu_and_back(agent: str, tmp_path: Path) -> None:
+@both_modes
+def test_from_gpu_to_cpu_and_back(extras: dict[str, Any], tmp_path: Path) -> None:
     """Trained on one, loaded on the other, trained on."""
     observation = VectorBox().reset(seed=0)[0]
     for device, other in (("cuda", "cpu"), ("cpu", "cuda")):
-        model = agent_of(agent, vectors(), device=device).learn(20)
+        model = vector_model(device=device, **extras).learn(20)
         model.save(tmp_path / "model")
-        loaded = type(model).load(tmp_path / "model", env=vectors(), device=other)
+        loaded = CuReSAC.load(tmp_path / "model", env=vec_env(), device=other)
         actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
         np.testing.assert_allclose(*actions, atol=1e-5)
         assert next(loaded.policy.parameters()).device.type == other
         assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 40
-
-
-def test_gsde_without_extras_is_sacs() -> None:
-    """Bit for bit."""
-    kwargs: dict[str, Any] = dict(
-        use_sde=True, sde_sample_freq=4, use_sde_at_warmup=True, learning_rate=1e-3, tau=0.01, ent_coef="auto_0.1",
-        gradient_steps=1, target_update_interval=1,
-    )  # fmt: skip
-    theirs, ours = (agent_of(agent, vectors(), **kwargs).learn(40) for agent in ("sac", "plain"))
-    assert differences(state_of(ours), state_of(theirs)) == []
-
-
-def test_other_algorithms_are_untouched() -> None:
-    """sb3-contrib's, on our environments, in the same process."""
-    model = TQC("MlpPolicy", vectors(), learning_starts=5, policy_kwargs={"net_arch": [8]}, device="cpu").learn(12)
-    returns, _ = evaluate_policy(model, vectors(), n_eval_episodes=1)
-    assert 0 <= returns <= 20
 
 
 @pytest.mark.parametrize("srl", ["rae", "curl"])
@@ -464,7 +482,6 @@ def test_pixels_of_dm_control(srl: str, tmp_path: Path) -> None:
     """Trained, saved, loaded, trained on: on a real task, with whichever versions are installed."""
     env = make_dmc_env("cartpole", "swingup", image_size=36, action_repeat=100, renderer="fast", seed=0)
     model = tiny_model("CnnPolicy", env, srl=srl).learn(25)
-    assert type(model.replay_buffer) is FrameStackReplayBuffer and model._n_updates == 15
     model.save(tmp_path / "model")
     loaded = CuReSAC.load(tmp_path / "model", env=env)
     observation, _ = env.reset(seed=1)

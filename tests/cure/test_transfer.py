@@ -39,7 +39,6 @@ class Constant(IntrinsicReward):
         return None, th.ones(len(inputs.batch.actions))
 
 
-both_algorithms = pytest.mark.parametrize("algorithm", list(ALGORITHMS))
 REPRESENTATION = ("encoder.", "encoder_target.", "srl.")
 CROP_33: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=33))
 CURIOUS = ("curious.", "intrinsic.", "scale.")
@@ -49,17 +48,22 @@ def tensors(model: Any, parts: tuple[str, ...]) -> dict[str, th.Tensor]:
     return {name: t.clone() for name, t in model.policy.state_dict().items() if name.startswith(parts)}
 
 
-def saved(path: Path, algorithm: str = "sac", **kwargs: Any) -> Any:
-    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], **kwargs).learn(16)
+def untrained(algorithm: str = "sac", policy: str = "CnnPolicy", **kwargs: Any) -> Any:
+    env = PixelBox() if policy == "CnnPolicy" else VectorBox()
+    return tiny_model(policy, env, ALGORITHMS[algorithm], **kwargs)
+
+
+def saved(path: Path, **kwargs: Any) -> Any:
+    model = untrained(**kwargs).learn(16)
     model.save(path)
     return model
 
 
-@both_algorithms
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("curiosity", ["separate", None])
 def test_parts_are_taken_and_the_task_begins_anew(algorithm: str, curiosity: str | None, tmp_path: Path) -> None:
-    source = saved(tmp_path / "model.zip", algorithm, curiosity=curiosity)
-    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], seed=5)
+    source = saved(tmp_path / "model.zip", algorithm=algorithm, curiosity=curiosity)
+    model = untrained(algorithm, seed=5)
     before = tensors(model, ("task.", *CURIOUS))
     assert model.transfer_from(tmp_path / "model") is model
     assert differences(tensors(source, REPRESENTATION), tensors(model, REPRESENTATION)) == []
@@ -76,24 +80,32 @@ def test_parts_are_taken_and_the_task_begins_anew(algorithm: str, curiosity: str
     assert differences(encoder, tensors(model, ("encoder.",))) != [], "it is trained on"
 
 
-@both_algorithms
-@pytest.mark.parametrize(
-    ("update", "srl"), [("joint", "rae"), ("sequential", "rae"), ("joint", "spr"), ("joint", "curl"), ("joint", Norms)]
-)
-def test_frozen_representation_stays(algorithm: str, update: str, srl: Any, tmp_path: Path) -> None:
+FROZEN: dict[str, Any] = {
+    "rae, joint": dict(),
+    "rae, sequential": dict(update="sequential"),
+    "tqc": dict(algorithm="tqc"),
+    "curl": dict(srl="curl"),
+    "moving average": dict(srl="spr"),
+    "batch norm": dict(srl=Norms),
+    "vectors": dict(policy="MlpPolicy"),
+}
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_frozen_representation_stays(name: str, tmp_path: Path) -> None:
     """While all agents learn; also in a model that was saved and loaded; with its statistics and moving averages."""
-    saved(tmp_path / "model", algorithm, srl=srl)
-    model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm], seed=5, update=update, srl=srl)
-    source = tensors(model.transfer_from(tmp_path / "model", freeze=True), ("encoder.", "srl."))
+    kwargs = FROZEN[name]
+    source = saved(tmp_path / "model", **kwargs)
+    model = untrained(**kwargs, seed=5).transfer_from(tmp_path / "model", freeze=True)
+    assert differences(tensors(source, ("encoder.", "srl.")), tensors(model, ("encoder.", "srl."))) == []
     kept, agents = tensors(model, REPRESENTATION), tensors(model, ("task.", "curious."))
     model.learn(16)
     model.save(tmp_path / "frozen")
-    objects = {"srl": srl} if srl is Norms else None
-    loaded = ALGORITHMS[algorithm].load(tmp_path / "frozen", env=PixelBox(), custom_objects=objects)
+    objects = {"srl": Norms} if kwargs.get("srl") is Norms else None
+    loaded = type(model).load(tmp_path / "frozen", env=model.get_env(), custom_objects=objects)
     loaded.learn(12, reset_num_timesteps=False)
     for each in (model, loaded):
         assert each._n_updates > 0 and differences(kept, tensors(each, REPRESENTATION)) == []
-        assert differences(source, tensors(each, ("encoder.", "srl."))) == []
     moved = {name.split(".")[1] for name in agents if not th.equal(agents[name], tensors(model, (name,))[name])}
     assert {"actor", "critic", "critic_target"} <= moved
     for call in (model.pretrain, model.fit_representation):
@@ -102,9 +114,9 @@ def test_frozen_representation_stays(algorithm: str, update: str, srl: Any, tmp_
 
 
 def test_frozen_representation_of_a_dictionary_stays(tmp_path: Path) -> None:
-    """The deviations by which errors of images are compared, too."""
-    sensor_model(SensorBox(("front", "wrist"))).learn(12).save(tmp_path / "model")
-    model = sensor_model(SensorBox(("front", "wrist")), curiosity_target="next_observation", seed=5)
+    """The deviations by which errors of images are compared, and statistics of joints, too."""
+    sensor_model(SensorBox()).learn(12).save(tmp_path / "model")
+    model = sensor_model(SensorBox(), curiosity_target="next_observation", seed=5)
     kept = tensors(model.transfer_from(tmp_path / "model", freeze=True), REPRESENTATION)
     assert model.learn(16)._n_updates > 0 and differences(kept, tensors(model, REPRESENTATION)) == []
 
@@ -113,40 +125,40 @@ def test_statistics_of_rnd_stay_final(tmp_path: Path, monkeypatch: pytest.Monkey
     """Of another whitening the predictor would know nothing."""
     monkeypatch.setattr(rnd, "ENOUGH", 8)
     source = saved(tmp_path / "model", intrinsic="rnd")
-    model = tiny_model("CnnPolicy", PixelBox(), intrinsic="rnd", seed=5).transfer_from(tmp_path / "model").learn(16)
+    model = untrained(intrinsic="rnd", seed=5).transfer_from(tmp_path / "model").learn(16)
     for name in ("mean", "variance"):
         assert th.equal(getattr(source.policy.intrinsic, name), getattr(model.policy.intrinsic, name))
 
 
-def test_encoder_goes_to_a_model_without_head(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kwargs", [dict(srl=None, curiosity=None), dict(augmentation="shift")])
+def test_other_settings_are_taken(kwargs: dict[str, Any], tmp_path: Path) -> None:
+    """A model without a head, and one that learns from other views: to act, all see the centred one."""
     source = saved(tmp_path / "model")
-    model = tiny_model(
-        "CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True), seed=5
-    )
-    model.transfer_from(tmp_path / "model", freeze=True).learn(16)
+    model = untrained(**kwargs, seed=5).transfer_from(tmp_path / "model", freeze=True).learn(16)
     assert differences(tensors(source, ("encoder.",)), tensors(model, ("encoder.",))) == []
 
 
+def check_refused(model: Any, path: Path, sentence: str) -> None:
+    """Nothing of a model that refuses has changed."""
+    before = tensors(model, ("",))
+    with pytest.raises(ValueError, match=sentence):
+        model.transfer_from(path)
+    assert differences(before, tensors(model, ("",))) == []
+
+
 @pytest.mark.parametrize(
-    ("kwargs", "env", "name"),
+    ("kwargs", "frames", "name"),
     [
-        (dict(policy_kwargs=dict(features_extractor_kwargs=dict(n_filters=5, n_layers=2))), PixelBox, "encoder."),
-        (dict(srl="curl"), PixelBox, "srl."),
-        (dict(), lambda: PixelBox(3), "encoder."),
-        (dict(intrinsic="reconstruction"), PixelBox, "intrinsic."),
-        (dict(srl=None, curiosity=None), PixelBox, "encoder."),
+        (dict(policy_kwargs=dict(features_extractor_kwargs=dict(n_filters=5, n_layers=2))), 2, "encoder."),
+        (dict(srl="curl"), 2, "srl."),
+        (dict(), 3, "encoder."),
+        (dict(intrinsic="reconstruction"), 2, "intrinsic."),
     ],
-    ids=["encoder", "head", "image", "reward", "everything off"],
+    ids=["encoder", "head", "image", "reward"],
 )
-def test_other_networks_are_refused_in_one_sentence(
-    kwargs: dict[str, Any], env: Any, name: str, tmp_path: Path
-) -> None:
+def test_other_networks_are_refused(kwargs: dict[str, Any], frames: int, name: str, tmp_path: Path) -> None:
     saved(tmp_path / "model")
-    model = tiny_model("CnnPolicy", env(), **kwargs)
-    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
-    with pytest.raises(ValueError, match=f"has {name}.* of shape .*: transfer needs equal images"):
-        model.transfer_from(tmp_path / "model")
-    assert differences(before, dict(model.policy.state_dict())) == []
+    check_refused(tiny_model("CnnPolicy", PixelBox(frames), **kwargs), tmp_path / "model", f"has {name}.* of shape")
 
 
 class Sensors(SensorBox):
@@ -163,56 +175,25 @@ class Sensors(SensorBox):
         return {key: self.observation_space[key].sample() if key == "mode" else image for key in self.keys}
 
 
-@pytest.mark.parametrize(
-    ("make", "there", "here", "sentence"),
-    [
-        (
-            sensor_model,
-            dict(env=Sensors("left", "right")),
-            dict(env=Sensors("right", "left")),
-            r"observations=\['left: image .*and this model \['right: image",
-        ),
-        (
-            sensor_model,
-            dict(env=Sensors("left", "mode")),
-            dict(env=Sensors("left", "mode", mode=spaces.Box(-1, 1, (3,)))),
-            r"observations=.*'mode: Discrete .*'mode: Box",
-        ),
-        (
-            tiny_model,
-            CROP_33,
-            dict(augmentation="crop", augmentation_kwargs=dict(size=34)),
-            r"views='image \(6, 33, 33\)', and this model 'image \(6, 34, 34\)'",
-        ),
-        (
-            tiny_model,
-            dict(srl="curl", **CROP_33),
-            dict(srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True), **CROP_33),
-            "tanh=False, and this model True",
-        ),
-        (tiny_model, dict(), dict(srl=Doubtful), "srl='RAE'.* 'Doubtful'"),
-        (tiny_model, dict(), dict(intrinsic=Constant), "intrinsic='SRLError', and this model 'Constant'"),
-    ],
-    ids=["cameras", "number", "crop", "tanh", "head", "reward"],
-)
-def test_what_would_mean_something_else_is_refused(
-    make: Any, there: dict[str, Any], here: dict[str, Any], sentence: str, tmp_path: Path
-) -> None:
-    """All shapes are equal."""
-    pixels = () if make is sensor_model else ("CnnPolicy", PixelBox())
-    make(*pixels, **there).save(tmp_path / "model")
-    model = make(*pixels, **here)
-    before = tensors(model, ("",))
-    with pytest.raises(ValueError, match=f"{sentence}.*: of equal shapes.*here.$"):
-        model.transfer_from(tmp_path / "model")
-    assert differences(before, tensors(model, ("",))) == []
+MEANINGS: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
+    "observations": (sensor_model, dict(env=Sensors("left", "right")), dict(env=Sensors("right", "left"))),
+    "mode: Box": (
+        sensor_model,
+        dict(env=Sensors("left", "mode")),
+        dict(env=Sensors("left", "mode", mode=spaces.Box(-1, 1, (3,)))),
+    ),
+    "views": (untrained, CROP_33, dict(augmentation="crop", augmentation_kwargs=dict(size=34))),
+    "tanh": (untrained, dict(srl="curl", **CROP_33), dict(srl=None, curiosity=None, **CROP_33)),
+    "srl": (untrained, dict(), dict(srl=Doubtful)),
+    "intrinsic": (untrained, dict(), dict(intrinsic=Constant)),
+}
 
 
-def test_other_augmentations_are_taken(tmp_path: Path) -> None:
-    """An encoder that has learned from shifted images sees the same to act."""
-    source = saved(tmp_path / "model", augmentation="shift")
-    model = tiny_model("CnnPolicy", PixelBox(), seed=5).transfer_from(tmp_path / "model")
-    assert differences(tensors(source, REPRESENTATION), tensors(model, REPRESENTATION)) == []
+@pytest.mark.parametrize("name", MEANINGS)
+def test_equal_shapes_of_other_meaning_are_refused(name: str, tmp_path: Path) -> None:
+    make, there, here = MEANINGS[name]
+    make(**there).save(tmp_path / "model")
+    check_refused(make(**here), tmp_path / "model", f"{name}.*with equal shapes")
 
 
 def test_pickles_are_refused(tmp_path: Path) -> None:
@@ -224,6 +205,6 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
 def test_memories_of_another_replay_buffer_stay_behind(tmp_path: Path) -> None:
     """What a reward remembers of its model's transitions is not that of this one."""
     saved(tmp_path / "model", intrinsic="particle")
-    model = tiny_model("CnnPolicy", PixelBox(), intrinsic="particle", seed=5).transfer_from(tmp_path / "model")
+    model = untrained(intrinsic="particle", seed=5).transfer_from(tmp_path / "model")
     assert (model.policy.intrinsic.places == -1).all()  # type: ignore[union-attr]
     assert model.learn(16)._n_updates > 0

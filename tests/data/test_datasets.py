@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from dictionaries_for_tests import Goal
 from envs_for_tests import Cliff, PixelBox, VectorBox, differences, state_of, tiny_model
+from logs_for_tests import KeptRows
 from minari.data_collector import EpisodeBuffer
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecNormalize
 from updates_for_tests import ALGORITHMS
 
@@ -235,12 +237,11 @@ def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_pa
     model = tiny_model("CnnPolicy", PixelBox(), ALGORITHMS[algorithm])
     model.load_transitions(tmp_path)
     before = state_of(model)
-    losses = []
-    step = model._update_srl
-    model._update_srl = lambda *args: losses.append(step(*args).mean().item()) or step(*args)  # type: ignore[method-assign, func-returns-value]
+    kept = KeptRows()
+    model.set_logger(Logger(None, [kept]))
     model.fit_representation(60, log_interval=25)
-    del model._update_srl  # type: ignore[attr-defined]
-    assert np.mean(losses[-10:]) < np.mean(losses[:10])
+    losses = [row["train/srl_loss"] for row in kept.rows]
+    assert len(losses) == 3 and losses[-1] < losses[0]
     changed = {name.split("[")[0].split(".")[0] for name in _changed(before["policy"], state_of(model)["policy"])}
     assert changed == {"encoder", "encoder_target", "srl"}
     assert (model.num_timesteps, model._n_updates, model.task, model.curiosity) == (0, 0, True, "separate")

@@ -5,11 +5,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_for_tests import PixelBox, VectorBox
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure.envs import CopyObservations, ResizeImages, StackFrames, check_observation_space, make_pixel_env
+from sb3_cure.persistence import ResumableEnv
 
 
 class Returns(gym.Env):
@@ -74,9 +75,10 @@ def test_observations_are_copies_of_the_keys_in_the_space() -> None:
     assert observation.keys() == {"front", "joint"} and observation["front"].all() and observation["joint"].all()
 
 
-def test_attributes_that_are_set_are_the_environments() -> None:
+@pytest.mark.parametrize("wrapper", [CopyObservations, ResumableEnv])
+def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
     """As with SB3's `set_attr`, which sets attributes of the outermost layer."""
-    venv = DummyVecEnv([lambda: CopyObservations(VectorBox())])
+    venv = DummyVecEnv([lambda: wrapper(VectorBox())])
     venv.set_attr("episode_length", 2)
     venv.reset()
     dones = [venv.step(np.zeros((1, 2), np.float32))[2][0] for _ in range(2)]
@@ -138,6 +140,21 @@ def test_policy_for_another_space_is_refused(space: spaces.Space, policy: str | 
         check_observation_space(space, policy)
 
 
+@pytest.mark.parametrize(
+    ("policy", "space", "value", "advice"),
+    [
+        ("MultiInputPolicy", spaces.Dict(front=image(1, 48, 48, 3)), None, "StackFrames"),
+        ("MultiInputPolicy", spaces.Dict(pixels=spaces.Dict(top=image(48, 48, 3))), None, "flatten it"),
+        ("MultiInputPolicy", image(48, 48, 3), None, "use 'CnnPolicy'"),
+        ("CnnPolicy", image(3, 36, 36), np.full((3, 36, 36), -0.5, np.float32), "with numbers such as -0.5"),
+    ],
+)
+def test_model_refuses_what_it_would_see_wrongly(policy: str, space: spaces.Space, value: Any, advice: str) -> None:
+    """Spaces before training, numbers at the first reset."""
+    with pytest.raises(ValueError, match=advice):
+        tiny_model(policy, Returns(space, value)).learn(1)
+
+
 # ------------------------------------------------------------------------------------------------------------- resize
 
 
@@ -183,10 +200,11 @@ def test_own_images_are_resized_and_stacked() -> None:
 
 
 def test_images_of_a_dictionary_are_stacked() -> None:
-    """The rest stays as it is."""
+    """The rest stays as it is, as a copy."""
     env = StackFrames(camera_and_joints(), 2)
     (first, _), (second, *_) = env.reset(), env.step(None)
     assert first["front"].shape == (48, 64, 6) and (first["front"] == second["front"]).all()
     assert env.observation_space["joints"] == spaces.Box(-1, 1, (2,)) and first in env.observation_space
+    assert np.array_equal(first["joints"], second["joints"]) and not np.shares_memory(first["joints"], second["joints"])
     with pytest.raises(ValueError, match="cannot be stacked: expected a Box"):
         StackFrames(gym.wrappers.FilterObservation(camera_and_joints(), ["joints"]), 2)

@@ -139,5 +139,5 @@ def test_training_from_camera_and_joints() -> None:
     model = CuReSAC(
         "MultiInputPolicy", env, learning_starts=20, warmup_updates=0, batch_size=8, policy_kwargs=network, seed=0
     ).learn(40)
-    assert model._n_updates == 20 and model.replay_buffer.images["image"].frame_stack == 3
-    assert model.policy.encoder.features_dim == 50 + 5 + 2
+    assert model._n_updates == 20 and model.replay_buffer.rings["image"].frame_stack == 3
+    assert model.policy.encoder.features_dim == 50 + 5

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, tiny_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from updates_for_tests import filled_model, train_once
 
 from sb3_cure.intrinsic import RewardScale
 
@@ -103,9 +103,8 @@ def test_broken_errors_leave_the_statistics_alone() -> None:
 
 @pytest.mark.parametrize("curiosity, centred", [("separate", True), ("bonus", False)])
 def test_the_agents_reward_is_centred_the_bonus_is_not(curiosity: str, centred: bool) -> None:
-    model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, curiosity_beta=0.5).learn(20)
-    logged = {name: float(value) for name, value in model._metrics.latest.items()}
-    mean, spread = logged["train/curious_reward_mean"], logged["train/curious_reward_std"]
+    logged = train_once(filled_model(pixels=True, curiosity=curiosity, curiosity_beta=0.5))
+    mean, spread = logged["curious_reward_mean"], logged["curious_reward_std"]
     assert spread > 0
     assert abs(mean) < 1e-3 if centred else 0.25 < mean < 1
 

@@ -190,7 +190,7 @@ def test_unusable_augmentations_are_refused() -> None:
     [
         ("rae", "auto", 36, Augmentation),
         ("curl", "auto", 36, RandomShift),
-        ("curl", "auto", 100, RandomCrop),
+        ("curl", "auto", 120, RandomCrop),
         (None, "auto", 36, Augmentation),
         (None, "shift", 36, RandomShift),
         ("rae", "shift", 36, RandomShift),
@@ -200,10 +200,11 @@ def test_unusable_augmentations_are_refused() -> None:
 def test_auto_is_chosen_by_the_head(srl: str | None, augmentation: str | None, size: int, expected: type) -> None:
     """The policy owns one, which its head shares; without a head augmentation alone is DrQ's idea."""
     arguments: dict[str, Any] = dict(srl=srl, augmentation=augmentation, buffer_size=40, curiosity=None)
-    model = tiny_model("CnnPolicy", PixelBox(size=size), **arguments, policy_kwargs={"share_encoder": True})
+    model = tiny_model("CnnPolicy", PixelBox(size=size), **arguments)
     policy = model.policy
     assert type(policy.augmentation) is expected
     assert policy.encoder.view_space == policy.augmentation.view_space
+    assert policy.encoder.view_space.shape[1] == (round(0.84 * size) if expected is RandomCrop else size)
     assert policy.srl is None or policy.srl.augment is policy.augmentation
 
 

@@ -20,6 +20,7 @@ from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_mode
 from gymnasium import spaces
 from stable_baselines3 import TD3, HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -40,6 +41,7 @@ from benchmarks.fuzz import (
 from sb3_cure import CuReSAC
 from sb3_cure.networks.encoders import VectorEncoder
 from sb3_cure.persistence import ArchiveError, Persistence
+from sb3_cure.persistence.replay_buffers import buffer_state
 
 
 def saved(model: Any, **kwargs: Any) -> io.BytesIO:
@@ -262,7 +264,7 @@ def test_parameters_of_another_model_are_refused() -> None:
     for source in (saved(wide), wide.get_parameters()):
         with pytest.raises(RuntimeError, match="size mismatch"):
             model.set_parameters(source)
-    alone = tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None, policy_kwargs=dict(share_encoder=True))
+    alone = tiny_model("CnnPolicy", PixelBox(), srl=None, curiosity=None)
     with pytest.raises(RuntimeError, match="Missing key"):
         model.set_parameters(saved(alone))
 
@@ -321,20 +323,23 @@ def test_moments_of_other_shapes_are_refused(moment: th.Tensor) -> None:
 # --------------------------------------------------------------- replay buffers
 
 
-def test_dictionaries_and_pickled_buffers(tmp_path: Path) -> None:
-    """Dict observations need no pickle; HER's buffer is SB3's pickle, which needs trust, and says why."""
-    kwargs: dict[str, Any] = dict(srl=None, curiosity=None, policy_kwargs=dict(net_arch=[4]), learning_starts=5)
-    model = CuReSAC("MultiInputPolicy", Goal(), buffer_size=50, device="cpu", **kwargs).learn(12)
+def goal_model(buffer_class: Any, **kwargs: Any) -> CuReSAC:
+    kwargs |= dict(srl=None, curiosity=None, replay_buffer_class=buffer_class)
+    return tiny_model("MultiInputPolicy", Goal(), **kwargs).learn(12)
+
+
+@pytest.mark.parametrize("buffer_class", [None, DictReplayBuffer])
+def test_dictionaries_are_saved_without_pickle(buffer_class: Any, tmp_path: Path) -> None:
+    model, other = goal_model(buffer_class), goal_model(buffer_class, seed=1)
     model.save_replay_buffer(tmp_path / "dictionaries")
-    model.save(tmp_path / "model")
-    loaded = CuReSAC.load(tmp_path / "model", env=Goal())
-    loaded.load_replay_buffer(tmp_path / "dictionaries")
-    for name in ("observations", "next_observations"):
-        stored = getattr(model.replay_buffer, name), getattr(loaded.replay_buffer, name)
-        assert differences(*({key: array[:12] for key, array in arrays.items()} for arrays in stored)) == []
-    her = CuReSAC(
-        "MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer, buffer_size=50, device="cpu", **kwargs
-    ).learn(12)
+    other.load_replay_buffer(tmp_path / "dictionaries")
+    assert differences(buffer_state(model.replay_buffer), buffer_state(other.replay_buffer)) == []
+
+
+def test_pickled_buffers_need_trust(tmp_path: Path) -> None:
+    """HER's buffer is SB3's pickle."""
+    goal_model(DictReplayBuffer).save_replay_buffer(tmp_path / "dictionaries")
+    her: Any = goal_model(HerReplayBuffer)
     her.save_replay_buffer(tmp_path / "her")
     with pytest.raises(ArchiveError, match=r"her' is no replay buffer .* without pickle.*trusted=True"):
         her.load_replay_buffer(tmp_path / "her")

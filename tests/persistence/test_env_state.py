@@ -366,7 +366,7 @@ def test_state_of_other_environments_is_refused() -> None:
     [
         (dict(task="balance"), "with id='dmc_pixels/cartpole-swingup-v0', and here is id='dmc_pixels/cartpole-balance"),
         (dict(action_repeat=4), "ActionRepeat with num_repeats=8, and here is num_repeats=4"),
-        (dict(renderer="dmc", camera_id=1), "DMCPixels with camera_id=0, and here is camera_id=1"),
+        (dict(renderer="dmc", camera_id=1), r"DMCPixels with cameras=\[\('', 0\)\], and here is cameras=\[\('', 1\)\]"),
     ],
 )
 def test_environments_built_otherwise_are_refused(other: dict[str, Any], sentence: str, workers: bool) -> None:

@@ -22,7 +22,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from dictionaries_for_tests import Goal, SensorBox
+from dictionaries_for_tests import Goal, SensorBox, sensor_model
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium.wrappers import NormalizeReward
 from hypothesis import given, settings
@@ -38,7 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from benchmarks import faults
 from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.data.buffers import FrameRing, transitions
+from sb3_cure.data.buffers import FrameRing, stored_places, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -462,6 +462,30 @@ def test_frames_are_written_once(tmp_path: Path) -> None:
     before = {path.name for path in kept.segments.iterdir()}
     CuReSAC.resume(tmp_path, pixels()()).learn(10, callback=ExactCheckpoint(10, tmp_path), reset_num_timesteps=False)
     assert len({path.name for path in kept.segments.iterdir()} - before) == 1
+
+
+def test_frames_of_each_image_are_written_once(tmp_path: Path) -> None:
+    """The new ones of each image alone; all come back."""
+    env = CASES["dictionaries, small rings"].make_env
+    model: Any = sensor_model(env(), gradient_steps=0, buffer_size=50)
+    model.learn(60, ExactCheckpoint(10, tmp_path, keep=2))
+    kept, buffer = Generations(tmp_path), model.replay_buffer
+    state = read_state(kept.folder(kept.numbers()[-1]) / "state.safetensors")
+    sizes = {path.name: path.stat().st_size for path in kept.segments.iterdir()}
+    assert state["segments"].keys() == buffer.rings.keys() == {"front", "wrist"}
+    for key, ring in buffer.rings.items():
+        spans = state["segments"][key]
+        assert [first for _, first, _ in spans][1:] == [last for *_, last in spans[:-1]]
+        assert spans[-1][2] == buffer.counts[key] and len(spans) >= 5
+        frame = int(np.prod(ring.frame_shape))
+        assert all(sizes[name] == (last - first) * frame for name, first, last in spans)
+    resumed: Any = CuReSAC.resume(tmp_path, env(), device="cpu")
+    rows, env_inds, _ = stored_places(buffer)
+    found: Any
+    expected: Any
+    found, expected = (transitions(each, rows, env_inds) for each in (resumed.replay_buffer, buffer))
+    for key in ("front", "joints", "wrist"):
+        np.testing.assert_array_equal(found.next_observations[key], expected.next_observations[key])
 
 
 def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def cups() -> gym.Env:
 
 
 def model_of_cups(env: gym.Env, srl: str | None, hidden: int = 16, **kwargs: Any) -> CuReSAC:
-    small = dict(net_arch=[hidden], features_extractor_kwargs=dict(n_filters=8), share_encoder=True)
+    small = dict(net_arch=[hidden], features_extractor_kwargs=dict(n_filters=8))
     return tiny_model("CnnPolicy", env, srl=srl, curiosity=None, policy_kwargs=small, buffer_size=1000, **kwargs)
 
 
@@ -147,7 +147,9 @@ def r2_of_positions(model: CuReSAC, env: gym.Env, episodes: list[Episode]) -> fl
     return float(np.mean([found[name] for name in ("cup_x", "cup_z", "ball_x", "ball_z")]))
 
 
-@pytest.mark.parametrize("srl", LEARNS)
+@pytest.mark.parametrize(
+    "srl", [*(pytest.param(srl, marks=pytest.mark.long) for srl in ("vae", "spr")), "forward", "inverse"]
+)
 def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[Episode]]) -> None:
     """The positions of cup and ball, from images, by a linear map: far better than those of the untrained encoder.
 
@@ -164,6 +166,7 @@ def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[
     assert untrained < 0.15 and trained > 0.4, (untrained, trained)
 
 
+@pytest.mark.long
 def test_augmentation_alone_makes_latents_tell_the_state(real_frames: tuple[gym.Env, Any, list[Episode]]) -> None:
     """Without a head, by what the task's critics teach the encoder of shifted images (DrQ's idea)."""
     env, buffer, episodes = real_frames

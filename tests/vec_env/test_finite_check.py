@@ -1,18 +1,17 @@
 """Rewards, observations and actions are finite, or an error; nothing of such a step is stored."""
 
-import copy
 import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from envs_for_tests import PixelBox, VectorBox, differences, tiny_model
+from envs_for_tests import VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_cure import CuReSAC
 from sb3_cure.vec_env import BadTransitionError, FiniteCheck, check_environments
@@ -151,15 +150,3 @@ def test_check_is_put_on_once_and_hides_nothing(tmp_path: Path) -> None:
     loaded = CuReSAC.load(tmp_path / "model", env=model.get_env())
     assert loaded.env.venv is venv
     loaded.learn(12)
-
-
-@pytest.mark.parametrize("wrapper", [VecNormalize, VecTransposeImage])
-def test_deep_copies_continue_identically(wrapper: Any) -> None:
-    """As copies of models need; SB3's own wrappers cannot be copied."""
-    env = VectorBox if wrapper is VecNormalize else functools.partial(PixelBox, channels_last=True)
-    venv: VecEnv = check_environments(wrapper(DummyVecEnv([env])))
-    venv.reset()
-    other = copy.deepcopy(venv)
-    assert other.unwrapped is not venv.unwrapped
-    action = np.ones((1, 2), np.float32)
-    assert differences(list(venv.step(action)), list(other.step(action))) == []

@@ -21,7 +21,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_cure import make_dmc_env
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
@@ -452,6 +452,17 @@ def test_algorithms_survive_restarts() -> None:
             stands = (buffer.observations[: buffer.pos] == buffer.next_observations[: buffer.pos]).all(axis=-1)
             assert stands.sum() == (2 if type(model) is SAC else 0)
     env.close()
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize])
+def test_rows_around_a_fault_are_transitions(wrap: Any) -> None:
+    """No stored observation is of another episode than its successor, also where what is stored is not what is seen."""
+    env = wrap(make([partial(VectorBox, episode_length=6)] * 2))
+    buffer: Any = tiny_model("MlpPolicy", env).learn(40, callback=KillNow(3, 12)).replay_buffer
+    env.close()
+    rows = slice(0, buffer.pos)
+    after = np.clip(buffer.observations[rows] + 0.3 * buffer.actions[rows], -1, 1)
+    np.testing.assert_allclose(buffer.next_observations[rows], after, atol=1e-6)
 
 
 def test_monitor_keeps_episodes_before_a_fault(tmp_path: Path) -> None:
