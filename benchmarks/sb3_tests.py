@@ -23,7 +23,6 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 
 from sb3_cure import CuReSAC
 
-
 #: SAC's defaults, and no extras
 DEFAULTS: dict[str, Any] = dict(
     learning_rate=3e-4, buffer_size=1_000_000, learning_starts=100, batch_size=256, tau=0.005, gradient_steps=1,
