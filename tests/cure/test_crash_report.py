@@ -112,7 +112,9 @@ def test_guard_finds_the_first_bad_step(loss: float | None, gradient: float, sou
     guard.report()
     guard.update = 7
     with pytest.raises(NonFiniteError) if not sound else pytest.MonkeyPatch.context() as caught:
-        guard.check("some", [th.full((1,), gradient), th.full((2,), gradient)], None if loss is None else th.tensor(loss))
+        guard.check(
+            "some", [th.full((1,), gradient), th.full((2,), gradient)], None if loss is None else th.tensor(loss)
+        )
         guard.check("later", [th.ones(3)], th.tensor(np.nan if deferred and not sound else 1.0))
         guard.report()
     if not sound:

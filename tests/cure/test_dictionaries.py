@@ -13,13 +13,11 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
-from torch.nn import functional as F
-from updates_for_tests import BATCH, StraightLine, prepare, sampled, train_once
+from updates_for_tests import StraightLine, prepare, sampled, train_once
 
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
-from sb3_cure.networks.encoders import DictEncoder
 from sb3_cure.srl import RAE, DictHead
 
 # ---------------------------------------------------------------- one key is no other method
@@ -78,61 +76,18 @@ def test_hindsight_trains_with_sb3s_own_buffer() -> None:
 # ---------------------------------------------------------------- several keys, written out
 
 
-class HandWrittenEncoder(th.nn.Module):
-    """What the encoder of two images and a vector computes, from its parameters.
-
-    :param encoder: A ``DictEncoder``, copied
-    :param joints: Vectors of the batch, whose mean and deviation standardise in a first update, [B, 2]
-    """
-
-    def __init__(self, encoder: DictEncoder, joints: th.Tensor):
-        super().__init__()
-        self.of = encoder
-        self.mean, self.deviation = joints.mean(dim=0), joints.std(dim=0, correction=0)
-
-    def trunk(self, observations: dict[str, th.Tensor]) -> Any:
-        features = []
-        for key, trunk in zip(("front", "wrist"), self.of.trunk.trunks, strict=True):
-            first, second = (layer for layer in trunk if isinstance(layer, th.nn.Conv2d))
-            hidden = F.relu(F.conv2d(observations[key], first.weight, first.bias, stride=2))
-            hidden = F.relu(F.conv2d(hidden, second.weight, second.bias))
-            features.append(hidden.permute(0, 2, 3, 1).reshape(len(hidden), -1))
-        return (*features, (observations["joints"] - self.mean) / self.deviation)
-
-    def projection(self, features: tuple[th.Tensor, ...]) -> th.Tensor:
-        front, wrist = self.of.projection.parts
-        latents = []
-        for part, feature in ((front, features[0]), (wrist, features[1])):
-            projected = feature @ part.linear.weight.T + part.linear.bias
-            latents.append(th.tanh(self.normalise(projected, part.norm)))
-        return th.cat([*latents, features[2]], dim=1)
-
-    def normalise(self, values: th.Tensor, norm: Any) -> th.Tensor:
-        centred = values - values.mean(dim=1, keepdim=True)
-        size = (centred.square().mean(dim=1, keepdim=True) + 1e-5).sqrt()
-        return centred / size * norm.weight + norm.bias
-
-    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        return self.projection(self.trunk(observations))
-
-
 class TwoCameras(StraightLine):
     """An update of the agent with two images and a vector."""
 
-    def __init__(self, model: CuReSAC, joints: th.Tensor):
-        super().__init__(model)
-        encoders = self.encoder, self.encoder_target
-        self.encoder, self.encoder_target = (HandWrittenEncoder(each, joints) for each in encoders)
-
     def standardise_by(self, observations: Any) -> None:
-        """The encoders above do so themselves."""
+        super().standardise_by(observations["joints"])
 
     def scaled(self, observations: Any) -> Any:
         if isinstance(observations, dict):
-            return {key: self.scaled(part) for key, part in observations.items()}
+            return {key: super(TwoCameras, self).scaled(part) for key, part in observations.items()}
         return super().scaled(observations)
 
-    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
         losses, errors, joint = [], [], self.head
         for i, key in enumerate(("front", "wrist")):
             self.head = joint.heads[i]
@@ -168,7 +123,7 @@ def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[Cu
     ).learn(40)
     prepare(model)
     batch = sampled(model)
-    written_out = TwoCameras(model, batch.observations["joints"])
+    written_out = TwoCameras(model)
     expected = written_out.update(batch, update == "sequential")
     before = StraightLine(model).groups()
     logged = train_once(model)
@@ -181,14 +136,14 @@ def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[Cu
 # ---------------------------------------------------------------- the encoder
 
 
-def test_target_encoder_shares_nothing_with_the_encoder() -> None:
-    """Its encoders of single images, which heads are given, are made of its own weights; and nothing is there twice."""
-    policy = sensor_model().policy
+def test_latents_are_those_of_each_image_then_vectors() -> None:
+    """Of the encoder and of its moving average, which share no parameter."""
+    policy = sensor_model().learn(12).policy
+    seen = {key: th.as_tensor(part[None]) for key, part in policy.observation_space.sample().items()}
     for encoder in (policy.encoder, policy.encoder_target):
-        own = {id(parameter) for parameter in encoder.parameters()}
-        parts = [parameter for image in encoder.images.values() for parameter in image.parameters()]
-        assert own == {id(part) for part in parts}
-        assert len(list(encoder.state_dict())) == len(own) + 3  # the vectors' statistics
+        joints = (seen["joints"] - encoder.trunk.vectors.mean) / encoder.trunk.vectors.variance.sqrt()
+        expected = [encoder.images["front"](seen["front"]), encoder.images["wrist"](seen["wrist"]), joints]
+        th.testing.assert_close(encoder(seen), th.cat(expected, dim=1))
     assert not {id(p) for p in policy.encoder.parameters()} & {id(p) for p in policy.encoder_target.parameters()}
 
 
@@ -271,7 +226,7 @@ def test_stacks_of_sb3_are_stored_once() -> None:
     """``VecFrameStack`` stacks images and vectors."""
     env = VecFrameStack(make_vec_env(SensorBox, 2, env_kwargs={"frame_stack": 1, "tells_frame_stack": False}), 3)
     model = sensor_model(env).learn(30)
-    assert {key: image.frame_stack for key, image in model.replay_buffer.images.items()} == {"front": 3, "wrist": 3}
+    assert {key: ring.frame_stack for key, ring in model.replay_buffer.rings.items()} == {"front": 3, "wrist": 3}
     assert model.policy.encoder.vector_dim == 6
 
 

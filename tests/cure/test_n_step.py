@@ -106,7 +106,7 @@ def recorded_targets(model: CuReSAC, monkeypatch: pytest.MonkeyPatch) -> tuple[S
             return loss(latents, actions, target)
 
         monkeypatch.setattr(agent.critic, "loss", noted_loss)
-        monkeypatch.setattr(agent.critic_target, "target_values", lambda latents, actions: latents.mean(1, keepdim=True))
+        monkeypatch.setattr(agent.critic_target, "target_values", lambda latents, _: latents.mean(1, keepdim=True))
         monkeypatch.setattr(
             agent.actor, "action_log_prob", lambda seen: (th.zeros(len(seen), 2), seen.float().mean(1, keepdim=True))
         )
