@@ -395,11 +395,15 @@ class CuReBase(OffPolicyAlgorithm):
         """Objects with a state besides tensors and settings, by name."""
         return {"mixer": self._mixer}
 
+    def _before_save(self) -> None:
+        """Refuse to save parameters that are not finite."""
+        self._guard.report()
+
     def _before_checkpoint(self) -> None:
-        """Finish deferred updates; nothing that is not finite is kept."""
+        """Finish deferred updates, and refuse what ``save`` refuses."""
         if self._overlapped is not None:
             self._overlapped.finish()
-        self._guard.report()
+        self._before_save()
 
     def _excluded_save_params(self) -> list[str]:
         made_anew = ["_guard", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]

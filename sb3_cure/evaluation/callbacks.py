@@ -350,7 +350,9 @@ class ReconstructionCallback(PeriodicCallback):
             return
         title, *pair = drawn
         frame_stack = self.frame_stack or infer_frame_stack(self.training_env)
-        seen, row = ({key: as_arrays(newest_frames(each[key], frame_stack)) for key in pair[1]} for each in pair)
+        seen, row = (
+            {key: np.array(as_arrays(newest_frames(each[key], frame_stack))) for key in pair[1]} for each in pair
+        )
         self.rows.append((self.num_timesteps, row.get("", row)))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
         for key, images in seen.items():

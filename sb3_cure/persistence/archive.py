@@ -161,6 +161,7 @@ class SavesModels(OffPolicyAlgorithm):
         :param include: Names of settings that are saved although they are in ``exclude``
         :raises ValueError: if ``include`` names parts of the running model
         """
+        getattr(self, "_before_save", lambda: None)()  # raises if parameters are not finite
         included, (state_dicts, variables) = {*(include or ())}, self._get_torch_save_params()
         left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in [*state_dicts, *variables])}
         if impossible := sorted(left_out & included):

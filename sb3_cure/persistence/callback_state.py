@@ -49,7 +49,7 @@ def callback_state(callback: BaseCallback) -> dict[str, Any]:
         try:
             check_sharing(state["changed"].values(), state["class"])
         except NotKept as error:
-            state["missing"].append(f"(as one object, as {error})")
+            state["missing"].append(f"which memory {state['class']} shares ({error})")
     return state
 
 

@@ -1,7 +1,5 @@
 """Observations that are dictionaries: of images and vectors, and of vectors alone."""
 
-import io
-import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -9,25 +7,20 @@ import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import Goal, SensorBox, sensor_model
-from envs_for_tests import KillNow, PixelBox, VectorBox, differences, state_of, tiny_model
+from envs_for_tests import PixelBox, differences, state_of, tiny_model
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
-from torch.nn import functional as F
-from updates_for_tests import BATCH, StraightLine, prepare, sampled, train_once
+from updates_for_tests import StraightLine, prepare, sampled, train_once
 
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.data.buffers import DictFrameStackReplayBuffer, unmarked
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
-from sb3_cure.networks.encoders import DictEncoder
-from sb3_cure.srl import CURL, RAE, DictHead, SRLHead, SRLOutput
-from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
+from sb3_cure.srl import RAE, DictHead
 
-# ------------------------------------------------------------------------------- one key is no other method
+# ---------------------------------------------------------------- one key is no other method
 
 
 @pytest.mark.parametrize(
@@ -35,7 +28,6 @@ from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
     [
         {},
         {"srl": "curl", "update": "sequential"},
-        {"intrinsic": "reconstruction", "intrinsic_kwargs": {"n_filters": 4, "n_layers": 2}},
         {"srl": "curl", "augmentation": "crop", "augmentation_kwargs": {"size": 28}, "curiosity": "bonus"},
         {"srl": None, "curiosity": None, "augmentation": "shift"},
     ],
@@ -43,16 +35,15 @@ from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 def test_one_image_trains_as_without_dictionary(kwargs: dict[str, Any]) -> None:
     """Latents, actions and every parameter after updates are those of the plain image, bit for bit."""
     network = {"features_extractor_kwargs": {"features_dim": 8, "n_filters": 4, "n_layers": 2}}
-    plain = tiny_model("CnnPolicy", PixelBox(), **kwargs, policy_kwargs=network).learn(30)
-    ours = sensor_model(SensorBox(("front",)), **kwargs).learn(30)
-    assert plain._n_updates == ours._n_updates == 20
+    plain = tiny_model("CnnPolicy", PixelBox(), **kwargs, policy_kwargs=network).learn(20)
+    ours = sensor_model(SensorBox(("front",)), **kwargs).learn(20)
+    assert plain._n_updates == ours._n_updates == 10
     for mine, theirs in zip(ours.policy.parameters(), plain.policy.parameters(), strict=True):
         assert th.equal(mine, theirs)
     image = plain.observation_space.sample()
     actions, _ = ours.predict({"front": image}, deterministic=True)
     np.testing.assert_array_equal(actions, plain.predict(image, deterministic=True)[0])
-    seen = th.as_tensor(image[None])
-    assert th.equal(ours.policy.encode({"front": seen}), plain.policy.encode(seen))
+    assert type(plain.policy.srl) is not DictHead
 
 
 class Flat(gym.ObservationWrapper):
@@ -66,78 +57,37 @@ class Flat(gym.ObservationWrapper):
         return np.concatenate([observation[key] for key in self.env.observation_space]).astype(np.float32)
 
 
-@pytest.mark.parametrize("kwargs", [{}, {"srl": None, "intrinsic": "reconstruction"}, {"update": "sequential"}])
+@pytest.mark.parametrize("kwargs", [{}, {"srl": None, "intrinsic": "reconstruction"}])
 def test_dictionary_without_images_acts_as_one_vector(kwargs: dict[str, Any]) -> None:
     """Of an environment in the style of Gymnasium-Robotics, bit for bit."""
     network = {"features_extractor_kwargs": {"features_dim": 8, "hidden_dim": 16}}
-    ours = tiny_model("MultiInputPolicy", Goal(), **kwargs, policy_kwargs=network).learn(30)
-    plain = tiny_model("MlpPolicy", Flat(Goal()), **kwargs, policy_kwargs=network).learn(30)
-    assert ours._n_updates == 20
+    ours = tiny_model("MultiInputPolicy", Goal(), **kwargs, policy_kwargs=network).learn(20)
+    plain = tiny_model("MlpPolicy", Flat(Goal()), **kwargs, policy_kwargs=network).learn(20)
+    assert ours._n_updates == 10
     assert differences(state_of(ours), state_of(plain)) == []
 
 
-def test_hindsight() -> None:
-    """With SB3's own buffer for it."""
-    model = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer, policy_kwargs={}).learn(30)
+def test_hindsight_trains_with_sb3s_own_buffer() -> None:
+    model = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer).learn(30)
     assert type(model.replay_buffer) is HerReplayBuffer
-    assert model._n_updates > 0 and np.isfinite(float(model._metrics.latest["train/srl_error"]))
+    assert model._n_updates > 0 and np.isfinite(train_once(model)["srl_error"])
 
 
-# --------------------------------------------------------------------------------- several keys, written out
-
-
-class HandWrittenEncoder(th.nn.Module):
-    """What the encoder of two images and a vector computes, from its parameters.
-
-    :param encoder: A ``DictEncoder``, copied
-    :param joints: Vectors of the batch, whose mean and deviation standardise in a first update, [B, 2]
-    """
-
-    def __init__(self, encoder: DictEncoder, joints: th.Tensor):
-        super().__init__()
-        self.of = encoder
-        self.mean, self.deviation = joints.mean(dim=0), joints.std(dim=0, correction=0)
-
-    def trunk(self, observations: dict[str, th.Tensor]) -> Any:
-        features = []
-        for key, trunk in zip(("front", "wrist"), self.of.trunk.trunks, strict=True):
-            first, second = (layer for layer in trunk if isinstance(layer, th.nn.Conv2d))
-            hidden = F.relu(F.conv2d(observations[key], first.weight, first.bias, stride=2))
-            hidden = F.relu(F.conv2d(hidden, second.weight, second.bias))
-            features.append(hidden.permute(0, 2, 3, 1).reshape(len(hidden), -1))
-        return (*features, (observations["joints"] - self.mean) / self.deviation)
-
-    def projection(self, features: tuple[th.Tensor, ...]) -> th.Tensor:
-        front, wrist = self.of.projection.parts
-        latents = []
-        for part, feature in ((front, features[0]), (wrist, features[1])):
-            projected = feature @ part.linear.weight.T + part.linear.bias
-            latents.append(th.tanh(self.normalise(projected, part.norm)))
-        return th.cat([*latents, features[2]], dim=1)
-
-    def normalise(self, values: th.Tensor, norm: Any) -> th.Tensor:
-        centred = values - values.mean(dim=1, keepdim=True)
-        size = (centred.square().mean(dim=1, keepdim=True) + 1e-5).sqrt()
-        return centred / size * norm.weight + norm.bias
-
-    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
-        return self.projection(self.trunk(observations))
+# ---------------------------------------------------------------- several keys, written out
 
 
 class TwoCameras(StraightLine):
     """An update of the agent with two images and a vector."""
 
-    def __init__(self, model: CuReSAC, joints: th.Tensor):
-        super().__init__(model)
-        encoders = self.encoder, self.encoder_target
-        self.encoder, self.encoder_target = (HandWrittenEncoder(each, joints) for each in encoders)
+    def standardise_by(self, observations: Any) -> None:
+        super().standardise_by(observations["joints"])
 
     def scaled(self, observations: Any) -> Any:
         if isinstance(observations, dict):
-            return {key: self.scaled(part) for key, part in observations.items()}
+            return {key: super(TwoCameras, self).scaled(part) for key, part in observations.items()}
         return super().scaled(observations)
 
-    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def srl(self, batch: Samples, latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
         losses, errors, joint = [], [], self.head
         for i, key in enumerate(("front", "wrist")):
             self.head = joint.heads[i]
@@ -172,11 +122,8 @@ def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[Cu
         },
     ).learn(40)
     prepare(model)
-    np.random.seed(1)
-    batch = Samples(*model.replay_buffer.sample(BATCH))
-    batch = batch._replace(views=batch.observations)
-    th.manual_seed(1)
-    written_out = TwoCameras(model, batch.observations["joints"])
+    batch = sampled(model)
+    written_out = TwoCameras(model)
     expected = written_out.update(batch, update == "sequential")
     before = StraightLine(model).groups()
     logged = train_once(model)
@@ -186,32 +133,18 @@ def test_whole_update_of_two_images_equals_straight_line_code(algorithm: type[Cu
         assert float((actual - wanted).norm()) < 2e-3 * distance + 1e-6 * float(old.norm()) + 1e-7
 
 
-# -------------------------------------------------------------------------------------------------- the encoder
+# ---------------------------------------------------------------- the encoder
 
 
-def test_target_encoder_shares_nothing_with_the_encoder() -> None:
-    """Its encoders of single images, which heads are given, are made of its own weights; and nothing is there twice."""
-    policy = sensor_model().policy
+def test_latents_are_those_of_each_image_then_vectors() -> None:
+    """Of the encoder and of its moving average, which share no parameter."""
+    policy = sensor_model().learn(12).policy
+    seen = {key: th.as_tensor(part[None]) for key, part in policy.observation_space.sample().items()}
     for encoder in (policy.encoder, policy.encoder_target):
-        own = {id(parameter) for parameter in encoder.parameters()}
-        parts = [parameter for image in encoder.images.values() for parameter in image.parameters()]
-        assert own == {id(part) for part in parts}
-        assert len(list(encoder.state_dict())) == len(own) + 3  # the vectors' statistics
+        joints = (seen["joints"] - encoder.trunk.vectors.mean) / encoder.trunk.vectors.variance.sqrt()
+        expected = [encoder.images["front"](seen["front"]), encoder.images["wrist"](seen["wrist"]), joints]
+        th.testing.assert_close(encoder(seen), th.cat(expected, dim=1))
     assert not {id(p) for p in policy.encoder.parameters()} & {id(p) for p in policy.encoder_target.parameters()}
-
-
-def test_vectors_are_not_drowned() -> None:
-    """A joint moves what the actor reads as much as an image does, whose features are 450 times as many."""
-    model = sensor_model()
-    policy, space = model.policy, model.observation_space
-    space.seed(0)
-    seen = [{key: th.as_tensor(part[None]) for key, part in space.sample().items()} for _ in range(2)]
-    features = [policy.encoder.trunk(policy.center(each)) for each in seen]
-    latents = policy.actor.features_extractor(features[0])
-    assert latents.shape == (1, 8 + 8 + 2)
-    moved = policy.actor.features_extractor((*features[0][:2], features[1][2]))
-    assert (moved - latents)[:, 16:].norm() > 0.5
-    assert features[0][0].numel() == 900 and features[0][2].numel() == 2
 
 
 def test_each_image_has_its_own_settings() -> None:
@@ -251,7 +184,7 @@ def test_head_chooses_an_augmentation_for_each_image() -> None:
     assert th.equal(shifted.center(seen)["front"], index)
 
 
-# ------------------------------------------------------------------------------------------------ heads, rewards
+# ---------------------------------------------------------------- heads, rewards
 
 
 def test_error_is_the_mean_over_images_in_their_own_deviations() -> None:
@@ -278,164 +211,22 @@ def test_error_is_the_mean_over_images_in_their_own_deviations() -> None:
     assert head.mean_error.variances.isfinite().all()
 
 
-@pytest.mark.parametrize("target", ["observation", "next_observation"])
-def test_error_per_pixel_is_that_of_each_images_own_head(target: str) -> None:
-    """Over the running deviation of each pixel; then the mean over images, each in its own deviation."""
-    settings: dict[str, Any] = dict(intrinsic_kwargs={"per_pixel": True}, curiosity_target=target)
-    model = sensor_model(**settings, learning_rate=0.0, learning_starts=40).learn(40)
-    policy, found = model.policy, []
-    policy.scale.register_forward_pre_hook(lambda _, args: found.append(args[0].clone()))
-    batch = sampled(model)
-    about: Any = batch.observations if target == "observation" else batch.next_observations
-    latents, errors = policy.encode(about), []
-    for key, head in zip(("front", "wrist"), policy.srl.heads, strict=True):  # type: ignore[arg-type, union-attr]
-        drawn = head.reconstruct(latents[:, policy.encoder.slices[key]]).float() / 255  # type: ignore[operator, index]
-        seen = about[key].float() / 255
-        errors.append(((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1))
-    train_once(model)
-    # A spread below a thousandth of the errors' size counts as rounding.
-    expected = sum(e / th.maximum(e.var(correction=0), 1e-6 * e.square().mean()).sqrt() for e in errors) / 2
-    th.testing.assert_close(found[0], expected.detach(), rtol=1e-3, atol=1e-5)  # type: ignore[union-attr]
-    measured = policy.samples(model.replay_buffer.sample(5), random=False)  # type: ignore[union-attr]
-    assert policy.error(measured).shape == (5,)
+# ---------------------------------------------------------------- environments
 
 
-class Dynamics(SRLHead):
-    """Predicts the joined latents of the next step."""
-
-    needs_next_latents = True
-
-    def __init__(self, encoder: Any, observation_space: spaces.Space):
-        super().__init__(encoder, observation_space)
-        self.model = th.nn.Linear(encoder.features_dim + 2, encoder.features_dim)
-
-    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        assert next_latents is not None and latents.shape == next_latents.shape == (len(batch.actions), 20)
-        assert set(batch.observations) == {"front", "joints", "wrist"}
-        error = (self.model(th.cat([latents, batch.actions], dim=1)) - next_latents).square().mean(dim=1)
-        return SRLOutput(error.mean(), error.detach())
+@pytest.mark.parametrize("curiosity", ["separate", "random"])
+def test_discrete_keys_and_several_environments(curiosity: str) -> None:
+    """Numbers are one-hot; the second actor acts in some environments of several."""
+    env = make_vec_env(SensorBox, 3, env_kwargs={"keys": ("front", "joints", "mode")})
+    model = sensor_model(env, curiosity=curiosity, curiosity_prob=0.5).learn(45)
+    assert model.policy.encoder.vector_dim == 2 + 3 and model._n_updates > 0
 
 
-class Brightness(SRLHead):
-    """A head of a user who knows of images alone."""
-
-    def __init__(self, encoder: Any, observation_space: spaces.Box, start: float = 0.0):
-        super().__init__(encoder, observation_space)
-        self.map = th.nn.Linear(encoder.features_dim, 1)
-        th.nn.init.constant_(self.map.bias, start)
-
-    def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-        goal = (batch.views.float() / 255).mean(dim=(1, 2, 3))
-        error = (self.map(latents)[:, 0] - goal).square()
-        return SRLOutput(error.mean(), error.detach())
-
-
-MODES: dict[str, tuple[type[CuReSAC], dict[str, Any]]] = {
-    "rae, joint": (CuReSAC, {}),
-    "curl, sequential": (CuReTQC, {"srl": "curl", "update": "sequential"}),
-    "next observation": (CuReSAC, {"curiosity_target": "next_observation", "curiosity_gamma": 0.0}),
-    "bonus": (CuReTQC, {"curiosity": "bonus", "intrinsic": "reconstruction"}),
-    "random": (CuReSAC, {"curiosity": "random", "curiosity_prob": 0.5}),
-    "curious alone": (CuReTQC, {"task": False, "srl": "curl"}),
-    "alternating": (CuReSAC, {"srl_schedule": "alternating", "srl_period": 2}),
-    "head of one's own": (CuReTQC, {"srl": Brightness, "srl_kwargs": {"start": 0.1}}),
-    "dynamics": (CuReSAC, {"srl": Dynamics, "intrinsic": "reconstruction"}),
-    "no head": (CuReSAC, {"srl": None, "intrinsic": "reconstruction", "augmentation": "shift"}),
-    "episodes": (CuReSAC, {"curiosity_bout": "episode", "precision": "bf16"}),
-}
-
-
-@pytest.mark.parametrize("name", MODES)
-def test_every_mode_trains_saves_and_loads(name: str) -> None:
-    """To equal predictions, and to an equal next update."""
-    algorithm, kwargs = MODES[name]
-    if "reconstruction" in kwargs.values():
-        kwargs = {**kwargs, "intrinsic_kwargs": {"n_filters": 4, "n_layers": 2}}
-    model = sensor_model(make_vec_env(SensorBox, 2, seed=0), algorithm, **kwargs).learn(30)
-    assert model._n_updates > 0 and isinstance(model.replay_buffer, DictFrameStackReplayBuffer)
-    assert all(value.isfinite() for value in model._metrics.latest.values())
-    archive, buffer = io.BytesIO(), io.BytesIO()
-    model.save(archive)
-    model.save_replay_buffer(buffer)
-    own = {"srl": kwargs["srl"]} if isinstance(kwargs.get("srl"), type) else {}
-    loaded = algorithm.load(archive, make_vec_env(SensorBox, 2), custom_objects=own, device="cpu")
-    loaded.load_replay_buffer(buffer)
-    observation = {key: np.stack([part] * 2) for key, part in model.observation_space.sample().items()}
-    for _ in range(2):
-        actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
-        np.testing.assert_array_equal(*actions)
-        for each in (model, loaded):
-            np.random.seed(0)
-            th.manual_seed(0)
-            each.set_logger(model.logger)
-            each.train(2, 8)
-        assert differences(state_of(model), state_of(loaded)) == []
-
-
-@pytest.mark.parametrize("collector", ["curious", "random"])
-def test_pretraining(collector: str) -> None:
-    model = sensor_model(curiosity=None)
-    before = [parameter.clone() for parameter in model.policy.encoder.images["wrist"].parameters()]
-    model.pretrain(16, collector=collector)
-    assert not all(map(th.equal, before, model.policy.encoder.images["wrist"].parameters()))
-    assert model.replay_buffer.size() == 0 and model.learn(14)._n_updates == 4
-
-
-# ------------------------------------------------------------------------------------------------ environments
-
-
-def test_other_vectors_and_several_environments() -> None:
-    """Discrete numbers are one-hot; curious and random actors act in some environments of several."""
-    keys = ("front", "joints", "mode")
-    for curiosity in ("separate", "random"):
-        env = make_vec_env(SensorBox, 3, env_kwargs={"keys": keys})
-        model = sensor_model(env, curiosity=curiosity, curiosity_prob=0.5).learn(45)
-        assert model.policy.encoder.vector_dim == 2 + 3 and model._n_updates > 0
-
-
-class Flawed(SensorBox):
-    """Every fifth observation has a joint that is not a number."""
-
-    def observe(self, first: bool = False) -> Any:
-        seen = super().observe(first)
-        return {**seen, "joints": seen["joints"] * np.float32(np.nan if self.n_steps % 5 == 4 else 1)}
-
-
-@pytest.mark.parametrize("env_class", [Flawed, Goal])
-def test_faulty_transitions_are_never_sampled(env_class: Any) -> None:
-    """With and without images; faults of a worker are survived, too."""
-    environments = [lambda: Monitor(env_class())] * 2
-    env = FaultTolerantSubprocVecEnv(environments, on_env_fault="restart", start_method="fork")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        kwargs = {"policy_kwargs": {"features_extractor_kwargs": {"features_dim": 8}}} if env_class is Goal else {}
-        model = sensor_model(env, on_bad_transition="skip", curiosity_prob=0.5, **kwargs).learn(40, KillNow(7, 15))
-    buffer = model.replay_buffer
-    assert isinstance(buffer, DictFrameStackReplayBuffer) and buffer.marked.sum() >= 2
-    assert sum(env.restarts) == 2
-    rows, env_inds, _ = unmarked(buffer)
-    assert not buffer.marked[rows, env_inds].any() and len(rows) == buffer.size() * 2 - buffer.marked.sum()
-    assert all(value.isfinite().all() for value in buffer.sample(500).observations.values())
-    env.close()
-
-
-def test_black_camera_is_told_apart() -> None:
-    """A camera that stays black beside one that does not is warned of by its key."""
-
-    class Dark(SensorBox):
-        def observe(self, first: bool = False) -> Any:
-            seen = super().observe(first)
-            return {**seen, "wrist": seen["wrist"] // 255}
-
-    with pytest.warns(UserWarning, match=r"no pixel of the images 'wrist' so far is brighter than 1 of 255"):
-        sensor_model(Dark(), learning_starts=200).learn(101)
-
-
-def test_stacked_by_sb3() -> None:
-    """``VecFrameStack`` stacks images and vectors; frames are kept once."""
+def test_stacks_of_sb3_are_stored_once() -> None:
+    """``VecFrameStack`` stacks images and vectors."""
     env = VecFrameStack(make_vec_env(SensorBox, 2, env_kwargs={"frame_stack": 1, "tells_frame_stack": False}), 3)
     model = sensor_model(env).learn(30)
-    assert {key: image.frame_stack for key, image in model.replay_buffer.images.items()} == {"front": 3, "wrist": 3}
+    assert {key: ring.frame_stack for key, ring in model.replay_buffer.rings.items()} == {"front": 3, "wrist": 3}
     assert model.policy.encoder.vector_dim == 6
 
 
@@ -450,29 +241,12 @@ def test_normalised_vectors_beside_images() -> None:
     expected = (batches[1]["joints"].numpy() - env.obs_rms["joints"].mean) / np.sqrt(env.obs_rms["joints"].var + 1e-8)
     np.testing.assert_allclose(batches[0]["joints"], expected, rtol=1e-4, atol=1e-5)
     assert th.equal(batches[0]["front"], batches[1]["front"]) and batches[0]["front"].dtype == th.uint8
-    with pytest.raises(ValueError, match="images arrive as float32"):
-        sensor_model(VecNormalize(make_vec_env(SensorBox, 1)))
 
 
-# ---------------------------------------------------------------------------------------------------- refusals
-
-
-def test_extractor_that_mixes_images_cannot_have_heads() -> None:
+def test_extractor_that_mixes_images_trains_without_head() -> None:
+    """Heads need the latents of each image."""
     network = {"features_extractor_class": CombinedExtractor, "features_extractor_kwargs": {"cnn_output_dim": 8}}
-    env, alone = SensorBox(size=64, keys=("front", "joints")), {**network, "share_encoder": True}
-    with pytest.raises(ValueError, match="srl=RAE learns from each image of a dictionary by itself"):
+    env = SensorBox(size=64, keys=("front", "joints"))
+    with pytest.raises(ValueError, match="needs the latents of each image"):
         sensor_model(env, policy_kwargs=network)
-    model = sensor_model(env, srl=None, curiosity=None, policy_kwargs=alone)
-    assert model.learn(14)._n_updates == 4
-
-
-def test_contrast_needs_an_image() -> None:
-    with pytest.raises(ValueError, match="srl='curl' compares two views of one image"):
-        tiny_model("MultiInputPolicy", Goal(), srl="curl")
-
-
-def test_heads_of_a_plain_image_are_not_in_a_dictionary() -> None:
-    """Nothing is between an image and its head."""
-    assert type(tiny_model("CnnPolicy", PixelBox()).policy.srl) is RAE
-    assert type(tiny_model("CnnPolicy", PixelBox(), srl="curl").policy.srl) is CURL
-    assert type(tiny_model("MlpPolicy", VectorBox()).policy.augmentation) is Augmentation
+    assert sensor_model(env, srl=None, curiosity=None, policy_kwargs=network).learn(14)._n_updates == 4

@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from hypothesis import HealthCheck, given, settings
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 from twins_for_tests import Twins, assert_equal, seeded_sample, streams
@@ -87,25 +87,26 @@ def test_normalised_rewards_and_observations() -> None:
 
 
 def recorded_targets(model: CuReSAC, monkeypatch: pytest.MonkeyPatch) -> tuple[Samples, list[th.Tensor]]:
-    """One update, of which the batch and the critics' targets are returned, the task's first.
+    """Make one update, and return its batch and the critics' targets, the task's first.
 
     Target critics return the mean of the latents that they get, and actors log-probabilities made of theirs.
     """
     batches, targets = [], []
-    step, loss = model._gradient_step, model._critics.loss
+    update = model._update
 
-    def gradient_step(batch: Samples, *args: Any) -> None:
+    def noted_update(batch: Samples, *args: Any) -> Any:
         batches.append(batch)
-        step(batch, *args)
+        return update(batch, *args)
 
-    def noted(values: th.Tensor, target: th.Tensor) -> th.Tensor:
-        targets.append(target)
-        return loss(values, target)
-
-    monkeypatch.setattr(model, "_gradient_step", gradient_step)
-    monkeypatch.setattr(model._critics, "loss", noted)
-    monkeypatch.setattr(model._critics, "next_values", lambda target, latents, actions: latents.mean(1, keepdim=True))
+    monkeypatch.setattr(model, "_update", noted_update)
     for agent in model.policy.agents.values():
+
+        def noted_loss(latents: th.Tensor, actions: th.Tensor, target: th.Tensor, loss: Any = agent.critic.loss) -> Any:
+            targets.append(target)
+            return loss(latents, actions, target)
+
+        monkeypatch.setattr(agent.critic, "loss", noted_loss)
+        monkeypatch.setattr(agent.critic_target, "target_values", lambda latents, _: latents.mean(1, keepdim=True))
         monkeypatch.setattr(
             agent.actor, "action_log_prob", lambda seen: (th.zeros(len(seen), 2), seen.float().mean(1, keepdim=True))
         )
@@ -127,7 +128,7 @@ def test_task_bootstraps_after_n_steps_and_curiosity_after_one(
     batch, targets = recorded_targets(model, monkeypatch)
     assert batch.n_step is not None
     assert not th.equal(batch.n_step.next_observations, batch.next_observations)
-    assert len(targets) == len(passes) == (1 if curiosity is None else 2), "one pass more, if one-step returns are read"
+    assert len(targets) == len(passes) == (1 if curiosity is None else 2)
 
     def soft_value(observations: th.Tensor, agent: Any) -> th.Tensor:
         with th.no_grad():
@@ -160,9 +161,3 @@ def test_heads_and_rewards_see_single_steps(algorithm: str, monkeypatch: pytest.
     assert one.n_step is None and three.n_step is not None
     for name in ("observations", "actions", "next_observations", "dones", "rewards"):
         assert th.equal(getattr(one, name), getattr(three, name)), name
-
-
-def test_buffer_that_looks_no_steps_ahead_is_warned_of() -> None:
-    with pytest.warns(UserWarning, match="is ignored because a custom `replay_buffer_class`"):
-        model = tiny_model("MlpPolicy", VectorBox(), n_steps=3, replay_buffer_class=ReplayBuffer)
-    model.learn(14)

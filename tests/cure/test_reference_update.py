@@ -1,17 +1,13 @@
-"""Sequential updates beside SAC-AE (``benchmarks/sac_ae.py``) and CURL, written plainly: equal weights and batches."""
-
-from typing import Any
+"""Sequential updates beside SAC-AE, written plainly in ``benchmarks/sac_ae.py``: equal weights and batches."""
 
 import numpy as np
 import pytest
 import torch as th
 from envs_for_tests import PixelBox
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
-from torch.nn import functional as F
 
-from benchmarks.sac_ae import FEATURES, PlainSacAe
+from benchmarks.sac_ae import PlainSacAe
 from sb3_cure import CuReSAC
 from sb3_cure.networks.layers import Projection, conv_sizes
 from sb3_cure.srl import autoencoder
@@ -44,42 +40,6 @@ def copy_projection(target: Projection, source: nn.Module) -> None:
     copy_layers(target.norm, source.ln)
 
 
-def shift(images: th.Tensor, pad: int = 4) -> th.Tensor:
-    """Each image repeats its border, and a window is cut out of it (DrQ)."""
-    down, right = (th.randint(-pad, pad + 1, (len(images), 1)).flatten().tolist() for _ in range(2))
-    wide = F.pad(images.float(), [pad] * 4, mode="replicate")
-    size = images.shape[-1]
-    cut = [each[:, pad + y :, pad + x :][:, :size, :size] for each, y, x in zip(wide, down, right, strict=True)]
-    return th.stack(cut)
-
-
-class PlainCurl(PlainSacAe):
-    """CURL's update: in place of the autoencoder's step one of InfoNCE, with keys by the momentum encoder."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self.W = nn.Parameter(th.rand(FEATURES, FEATURES))
-        self.w_optimizer = th.optim.Adam([self.W], lr=1e-3)
-
-    def update(self, batch: ReplayBufferSamples) -> None:
-        self.stored = batch.observations
-        views, next_views = shift(batch.observations), shift(batch.next_observations)
-        super().update(batch._replace(observations=views, next_observations=next_views))
-
-    def _update_decoder(self, images: th.Tensor) -> None:
-        with th.no_grad():
-            keys = self.critic_target.encoder(shift(self.stored))
-        logits = self.critic.encoder(images) @ self.W @ keys.T
-        logits = logits - logits.max(dim=1, keepdim=True).values
-        loss = (logits.exp().sum(dim=1).log() - logits.diagonal()).mean()
-        self.losses["decoder"] = loss.detach()
-        self.encoder_optimizer.zero_grad()
-        self.w_optimizer.zero_grad()
-        loss.backward()
-        self.encoder_optimizer.step()
-        self.w_optimizer.step()
-
-
 @th.no_grad()
 def copy_weights(model: CuReSAC, plain: PlainSacAe) -> None:
     policy = model.policy
@@ -98,9 +58,6 @@ def copy_weights(model: CuReSAC, plain: PlainSacAe) -> None:
             mine.weight[i].copy_(theirs.weight.T)
             mine.bias[i].copy_(theirs.bias)
     policy.critic_target.load_state_dict(policy.critic.state_dict())
-    if isinstance(plain, PlainCurl):
-        policy.srl.W.copy_(plain.W)
-        return
     decoder = policy.srl.decoder
     decoder.linear.weight.copy_(plain.decoder.fc.weight.view(FILTERS, LAST, LAST, -1).permute(1, 2, 0, 3).flatten(0, 2))
     decoder.linear.bias.copy_(plain.decoder.fc.bias.view(FILTERS, LAST, LAST).permute(1, 2, 0).flatten())
@@ -108,15 +65,11 @@ def copy_weights(model: CuReSAC, plain: PlainSacAe) -> None:
     copy_layers(decoder.output, plain.decoder.output)
 
 
-@pytest.mark.parametrize(("srl", "reference"), [("rae", PlainSacAe), ("curl", PlainCurl)])
-def test_sequential_updates_are_the_references(
-    srl: str, reference: type[PlainSacAe], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sequential_updates_are_those_of_sac_ae(monkeypatch: pytest.MonkeyPatch) -> None:
     """Losses and temperature of ten updates; what differs in any step shows in the losses of those after it."""
     model = CuReSAC(
         "CnnPolicy",
         PixelBox(),
-        srl=srl,
         curiosity=None,
         update="sequential",
         precision="fp32",
@@ -133,7 +86,7 @@ def test_sequential_updates_are_the_references(
     model.learn(40)  # random actions
     assert model._n_updates == 0
     channels, actions = model.observation_space.shape[0], model.action_space.shape[0]
-    plain = reference(channels, actions, HIDDEN, size=SIZE, filters=FILTERS, decoder_first=True)
+    plain = PlainSacAe(channels, actions, HIDDEN, size=SIZE, filters=FILTERS, decoder_first=True)
     copy_weights(model, plain)
     for name, optimizer in vars(plain).items():
         if name.endswith("_optimizer") and name != "alpha_optimizer":

@@ -35,7 +35,7 @@ def steps(model: CuReSAC) -> dict[str, int]:
 
 @UPDATES
 def test_phases_alternate_and_catch_up(update: str) -> None:
-    """Two updates per step, first of the head alone, then of the agents alone; after whole periods as many as at once."""
+    """Two updates per step, first of the head, then of the agents; after whole periods as many as simultaneously."""
     model = model_with_transitions(srl_schedule="alternating", update=update)
     for step in range(1, 2 * PERIOD + 1):
         model.train(1, batch_size=8)

@@ -19,7 +19,6 @@ from hypothesis import HealthCheck, event, given, settings
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, save_to_pkl
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 from twins_for_tests import (
     ACTIONS,
@@ -35,7 +34,6 @@ from twins_for_tests import (
 
 from sb3_cure.data import buffers
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack, stored_places, transitions
-from sb3_cure.data.samples import Samples
 
 pytestmark = pytest.mark.filterwarnings("ignore:Frames do not slide", "ignore:The full replay buffer needs")
 all_kinds = pytest.mark.parametrize("kind", KINDS)
@@ -499,10 +497,3 @@ def test_transitions_of_sb3s_buffers_are_those_it_samples() -> None:
         assert rows.tolist() == [1, 0, 6, 5, 4, 3, 2] and ages.tolist() == list(range(7))
         assert isinstance(twins.sb3, DictReplayBuffer if kind == "dictionary" else ReplayBuffer)
         assert_equal(transitions(twins.sb3, rows, envs), twins.sb3._get_samples(rows))
-
-
-def test_samples_begin_with_sb3s_fields() -> None:
-    twins = Twins(4)
-    twins.step([("step", 1, 0)])
-    batch = Samples(*twins.ours.sample(4))
-    assert batch._fields[:6] == ReplayBufferSamples._fields and batch[5:] == (None,) * 3

@@ -116,7 +116,9 @@ class Head(RAE):
 
 
 @pytest.mark.usefixtures("few_rows")
-def test_own_environment_and_head_are_named_by_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_environment_and_head_are_named_by_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
     """Images have the channels last, and frames lie on disk; the model that is kept loads with what the cell names."""
     (tmp_path / "camera_of_a_grid.py").write_text(OWN)
     (tmp_path / "frames").mkdir()
@@ -133,6 +135,7 @@ def test_own_environment_and_head_are_named_by_module(tmp_path: Path, monkeypatc
         gym.registry.pop("tests/Camera-v0", None)
     assert cell.folder == Path("tiny", "Camera", "cure", "seed0") and cell.is_done(tmp_path / "out")
     assert (folder / "reconstructions.png").is_file()
+    assert not [each for each in recwarn if "checkpoints" in str(each.message)], "all callbacks are kept"
     loaded = CuReSAC.load(folder / "model.zip", custom_objects=cell.custom_objects())
     assert type(loaded.policy.srl).__name__ == "Head"
     assert json.loads((folder / "config.json").read_text())["arguments"]["srl"] == "camera_of_a_grid.Head"
@@ -216,7 +219,7 @@ def test_pretrained_arms_have_the_same_warm_up(
             return True
 
     learn = CuReSAC.learn
-    monkeypatch.setattr(CuReSAC, "learn", lambda self, steps, callback: learn(self, steps, callback=[See(), *callback]))
+    monkeypatch.setattr(CuReSAC, "learn", lambda self, n, callback, *rest: learn(self, n, [See(), *callback], *rest))
     for cell in pretrained_grid(tmp_path, task, 46, budget, seeds=2).cells[:4]:
         run_cell(cell, tmp_path, pictures=False)
     assert differences(begun[0], begun[1]) == differences(begun[0], begun[2]) == []

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from sb3_cure import CuReSAC
 from sb3_cure.networks import layers, precision
-from sb3_cure.networks.layers import Conv2dReLU, Convolutions, EnsembleLinear, run_mlp
+from sb3_cure.networks.layers import Conv2dReLU, Convolutions, run_mlp
 from sb3_cure.networks.precision import compute_in, resolve_precision
 
 IMAGES = spaces.Box(0, 255, (3, 36, 36), "uint8")
@@ -212,15 +212,6 @@ def test_only_wide_hidden_layers_compute_in_bf16(monkeypatch: pytest.MonkeyPatch
     assert run_mlp(mlp, inputs, th.bfloat16).dtype == th.float32
     assert formats == [th.float32, th.float32, th.bfloat16, th.bfloat16, th.float32]
     assert th.equal(run_mlp(mlp, inputs), mlp(inputs))
-
-
-def test_ensemble_is_separate_linear_maps() -> None:
-    ensemble = EnsembleLinear(3, 4, 5)
-    nn.init.normal_(ensemble.bias)
-    inputs = th.randn(3, 6, 4, generator=th.Generator().manual_seed(0))
-    maps = zip(inputs, ensemble.weight, ensemble.bias[:, 0], strict=True)
-    expected = th.stack([F.linear(each, weight.T, bias) for each, weight, bias in maps])
-    th.testing.assert_close(ensemble(inputs), expected)
 
 
 def test_torchs_convolutions_follow_the_context() -> None:

@@ -169,9 +169,7 @@ class KillAt(BaseCallback):
 _REFERENCE: dict[str, dict[str, Any]] = {}
 
 
-@pytest.mark.parametrize(
-    ("name", "calls"), [*((name, 31) for name in CASES), ("rae, joint", 1), ("rae, joint", 57), ("pretraining", 57)]
-)
+@pytest.mark.parametrize(("name", "calls"), [*((name, 31) for name in CASES), ("rae, joint", 1)])
 def test_interrupted_training_continues_bit_for_bit(
     name: str, calls: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -193,12 +191,13 @@ def test_any_kills_at_any_steps(kills: list[int], save_freq: int, tmp_path_facto
     if "kills" not in _REFERENCE:
         _REFERENCE["kills"] = outcome(train(case, tmp_path_factory.mktemp("reference")))
     folder = tmp_path_factory.mktemp("killed")
-    for attempt, calls in enumerate(kills):
+    for attempt, calls in enumerate([*kills, 99]):
         try:
-            train(case, folder, attempt > 0, KillAt(calls))
+            model = train(case, folder, attempt > 0, KillAt(calls))
+            break
         except Killed:
             continue
-    assert differences(_REFERENCE["kills"], outcome(train(case, folder, True))) == []
+    assert differences(_REFERENCE["kills"], outcome(model)) == []
 
 
 SCRIPT = textwrap.dedent(

@@ -9,7 +9,6 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from srl_for_tests import batch_of, encode, image_space, make, noise_images, randomise, seeded
 
-from sb3_cure.networks.augmentations import Augmentation, make_augmentation
 from sb3_cure.networks.encoders import Encoder
 from sb3_cure.srl import CURL
 
@@ -39,37 +38,6 @@ def test_infonce_against_straight_line_code(size: int | None) -> None:
     np.testing.assert_allclose(error.numpy(), expected, rtol=1e-3, atol=1e-4)
     assert float(loss.detach()) == pytest.approx(np.mean(expected), rel=1e-3)
     assert th.equal(loss.detach(), error.mean())
-
-
-class Lookup(Encoder):
-    """An encoder that gives each image the row of a table that its first pixel names."""
-
-    def __init__(self, space: spaces.Box, table: th.Tensor):
-        super().__init__(space, table.shape[1], table.shape[1])
-        self.table = table
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.table[observations[:, 0, 0, 0].long()]
-
-
-@pytest.mark.parametrize("batch_size", [2, 16, 128])
-def test_infonce_of_a_perfect_and_of_a_constant_encoder(batch_size: int) -> None:
-    """Keys that only their anchor resembles: 0; keys all alike: log B, what guessing scores."""
-    space = image_space(1, 8)
-    observations = th.arange(batch_size, dtype=th.uint8).view(-1, 1, 1, 1).expand(-1, 1, 8, 8)
-    for table, expected in [(th.eye(batch_size), 0.0), (th.ones(batch_size, 4), np.log(batch_size))]:
-        encoder = Lookup(space, table)
-        head = CURL(encoder, space)
-        head.bind(encoder, Augmentation(space))
-        previous = np.inf
-        for scale in (1.0, 5.0, 50.0):
-            with th.no_grad():
-                head.W.copy_(scale * th.eye(table.shape[1]))
-            latents = encode(encoder, observations)
-            loss = float(head.loss(batch_of(observations), latents).loss.detach())
-            assert expected <= loss + 1e-5 and loss <= previous + 1e-5
-            previous = loss
-        assert loss == pytest.approx(expected, abs=1e-4)
 
 
 def test_keys_come_from_the_momentum_encoder_without_gradient() -> None:
@@ -204,19 +172,6 @@ def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
 
 
 # ---------------------------------------------------------------- what the encoder sees
-
-
-@pytest.mark.parametrize("height, width, seen", [(100, 100, (84, 84)), (240, 320, (202, 269))])
-def test_curl_crops_large_images_in_its_proportion(height: int, width: int, seen: tuple[int, int]) -> None:
-    """84 of 100 pixels per side, the centre to act, and latents without tanh."""
-    space = image_space(3, height, width)
-    assert CURL.choose_augmentation(space) == "crop"
-    augmentation = make_augmentation(CURL.choose_augmentation, space)
-    assert augmentation.view_space.shape == (3, *seen)
-    assert CURL.configure_encoder(augmentation) == {"tanh": False}
-    images = noise_images(space, 1)
-    top, left = (height - seen[0]) // 2, (width - seen[1]) // 2
-    assert th.equal(augmentation.center(images), images[:, :, top : top + seen[0], left : left + seen[1]])
 
 
 @pytest.mark.parametrize(
