@@ -118,11 +118,12 @@ def prepare(model: CuReSAC) -> None:
 
 
 def critic_values(critic: Any, latents: th.Tensor, actions: th.Tensor) -> list[th.Tensor]:
-    """
+    """Compute the values of each critic, one layer of one network after the other.
+
     :param critic: A ``LatentCritic``
     :param latents: [B, features_dim]
     :param actions: [B, action_dim]
-    :return: Values of each critic, one layer of one network after the other, [B, n_values]
+    :return: [B, n_values] each
     """
     values = [th.cat([latents, actions], dim=1)] * critic.n_critics
     for layer in critic.ensemble:
@@ -191,7 +192,8 @@ class StraightLine:
         return critic_values(critic, latents, actions)
 
     def critic_loss(self, values: list[th.Tensor], target: th.Tensor) -> th.Tensor:
-        """
+        """Compute SAC's squared errors, or TQC's quantile Huber loss in loops.
+
         :param values: Of each critic, [B, 1] or [B, n_quantiles]
         :param target: [B, 1] or [B, kept quantiles]
         """
@@ -209,7 +211,8 @@ class StraightLine:
         return th.stack(total).mean()
 
     def update(self, batch: Samples, sequential: bool) -> dict[str, float]:
-        """
+        """Make the update.
+
         :param batch: What is sampled, torch's generator where the update begins
         :param sequential: Whether the encoder steps after each loss, or once on their normalised gradients
         :return: Losses by their logged names

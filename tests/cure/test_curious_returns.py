@@ -56,9 +56,9 @@ def test_dying_is_not_preferred_by_default(arguments: dict[str, Any], dies: bool
 
 
 def test_curious_values_of_terminal_states_stay_bounded() -> None:
-    """No sample starts from them, so that no update corrects what is bootstrapped from: over 20 000 updates they stay
-    beside the values of the states that are learned, far from the limit of 500 that rewards of 5 would allow.
+    """Over 20 000 updates they stay near those of the states that are learned, far from what rewards of 5 allow (500).
 
+    No sample starts from terminal states, so that no update corrects their values, which targets bootstrap from.
     By default a tenth of the updates, with targets that follow ten times as fast: as many horizons of the return.
     """
     speed = 1 if os.environ.get("SB3_CURE_TEST_ALL") else 10

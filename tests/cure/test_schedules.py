@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from agents_for_tests import steps_of
 from envs_for_tests import VectorBox, differences, state_of, tiny_model
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import SubprocVecEnv
 from updates_for_tests import equal, filled_model, groups, prepare
 
@@ -93,6 +94,25 @@ def test_targets_follow_every_few_updates(interval: int) -> None:
     with_critics = [index for index, (_, rl) in enumerate(phases) if rl]
     assert times["encoder target"] == list(range(0, 6, interval))
     assert times["critic target"] == times["curious critic target"] == with_critics[::interval]
+
+
+class Normalised(BaseFeaturesExtractor):
+    """An extractor with running statistics."""
+
+    def __init__(self, observation_space: Any):
+        super().__init__(observation_space, 8)
+        self.layers = th.nn.Sequential(th.nn.Linear(2, 8), th.nn.BatchNorm1d(8))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layers(observations)
+
+
+def test_targets_take_running_statistics() -> None:
+    """They have none of their own, as they never train."""
+    policy_kwargs = {"features_extractor_class": Normalised}
+    policy = tiny_model("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs).learn(15).policy
+    online, target = dict(policy.encoder.named_buffers()), dict(policy.encoder_target.named_buffers())
+    assert len(online) == 3 and differences(online, target) == []
 
 
 @pytest.mark.parametrize(("period", "interval"), [(None, 2), (1, 2), (2, 3), (3, 1)])
