@@ -39,19 +39,18 @@ from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write
 ROOT = Path(__file__).resolve().parent.parent
 #: Tests of each file or group of files, the likeliest and fastest first (paths below tests/, or options of pytest)
 GROUPS = {
-    "cure/cure.py": """cure/test_gradients.py cure/test_actor_critic.py test_polyak_rates.py
-        cure/test_schedules.py cure/test_curious_returns.py
-        persistence/test_resume_and_more.py cure/test_training.py
+    "cure/cure.py": """cure/test_gradients.py cure/test_actor_critic.py cure/test_schedules.py test_polyak_rates.py
+        persistence/test_resume.py cure/test_training.py
         srl/test_contract.py::test_error_is_one_number_per_sample_detached
-        cure/test_sb3_parity.py::test_updates_of_tqc_equal_sb3_contrib
-        -k 'not (one_update_per or vectors or can_be_changed or frame_stack or bar or csv or board)'""",
+        cure/test_update_equals_sb3.py
+        -k 'not (one_update_per or vectors or can_be_changed or frame_stack or board)'""",
     "cure/critics.py": "cure/test_critics.py cure/test_gradients.py cure/test_actor_critic.py",
     "cure/encoder_update.py": "cure/test_encoder_update.py cure/test_gradients.py",
-    "cure/mixers.py": """cure/test_mixers.py persistence/test_resume_and_more.py
-        cure/test_training.py::test_schedules_begin_where_the_call_begins""",
+    "cure/mixers.py": """cure/test_mixers.py persistence/test_resume.py
+        cure/test_training.py::test_schedules_follow_the_progress_of_the_call""",
     "cure/pretraining.py": "cure -k pretrain",
     "srl/*.py": "srl cure/test_dictionaries.py",
-    "intrinsic/*.py": "intrinsic cure/test_curious_returns.py cure/test_gradients.py cure/test_dictionaries.py",
+    "intrinsic/*.py": "intrinsic cure/test_gradients.py cure/test_dictionaries.py",
     "data/buffers.py": "data/test_buffers.py persistence/test_frame_rows.py",
 }
 #: The same by file; a pattern that matches no file stays, and is then missed
