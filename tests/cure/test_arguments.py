@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from dictionaries_for_tests import Goal
 from envs_for_tests import PixelBox, VectorBox, tiny_model
+from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
@@ -104,6 +105,14 @@ def test_hindsight_with_restarting_workers_is_refused() -> None:
             tiny_model("MultiInputPolicy", venv, **her).learn(10)
     finally:
         venv.close()
+
+
+def test_images_of_floats_are_refused() -> None:
+    """They would be read as long vectors."""
+    env = PixelBox()
+    env.observation_space = spaces.Box(0, 1, env.observation_space.shape, np.float32)
+    with pytest.raises(ValueError, match="if it is an image, return it as uint8"):
+        tiny_model("CnnPolicy", env)
 
 
 def test_pretraining_needs_a_head_and_a_collector() -> None:
