@@ -303,7 +303,6 @@ def main() -> None:
     model.learn(options.steps, callback=watch)
     seconds = time.monotonic() - start
     filled = 1.2 * buffer_size
-    marked = int(model.replay_buffer.marked.sum())  # type: ignore[union-attr]
     report = {
         "what": f"{options.steps} agent steps of {options.envs} environments ({options.env}), one update per "
         f"{2 * options.envs} agent steps, {options.start_method}, time-out {options.timeout:g} s",
@@ -312,7 +311,6 @@ def main() -> None:
         **judge(watch.rows, filled),
         "faults": {kind: watch.faults[kind] for kind in FAULTS},
         "restarts_per_environment": envs.restarts,  # type: ignore[attr-defined]
-        "marked_transitions_in_the_buffer": marked,
         "minutes": round(seconds / 60, 1),
         "machine": describe_machine(),
     }

@@ -117,15 +117,15 @@ def breakdown(updates: int = 20, **kwargs: Any) -> dict[str, float]:
     model = make_model(warmup_updates=0, **kwargs)
     model.train(4, BATCH_SIZE)
     timer = PhaseTimer()
-    timer.wrap(model.replay_buffer, "sample", "sample")
-    timer.wrap(model.policy, "augment", "augment and scale")
+    timer.wrap(model, "_sample_batch", "sample and augment")
     timer.wrap(model.policy.encoder_target, "forward", "target encoder")
-    timer.wrap(model.policy.encoder_update, "_run", "encoder forward")
-    timer.wrap(model, "_update_srl", "SRL head")
+    for method in ("latents", "features"):
+        timer.wrap(model.policy.encoder_update, method, "encoder forward")
+    for method in ("_srl_loss", "_update_srl"):
+        timer.wrap(model, method, "SRL head")
     timer.wrap(model, "_update_actor_critic", "critics")
     timer.wrap(model, "_update_actor", "actors")
-    timer.wrap(model.policy.encoder_update, "backward", "encoder backward and step")
-    timer.wrap(model.policy.encoder_update, "step", "encoder backward and step")
+    timer.wrap(model.policy.encoder_update, "finish", "encoder backward and step")
     timer.wrap(model, "_update_targets", "Polyak")
     agents = model.policy.agents.values()
     for owner in (model.policy.srl, *(part for agent in agents for part in (agent.actor, agent.critic))):

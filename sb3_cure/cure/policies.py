@@ -290,6 +290,11 @@ class CuRePolicy(BasePolicy):
         """Actor-critics by name: ``"task"``, and ``"curious"`` if there is one."""
         return {"task": self.task} if self.curious is None else {"task": self.task, "curious": self.curious}
 
+    @property
+    def encoder_optimizer(self) -> EncoderUpdate:
+        """``encoder_update`` by the name that it is saved under: SB3 takes what has no "optim" in it for a module."""
+        return self.encoder_update
+
     def _with_optimizer(self) -> dict[str, Any]:
         """Modules with an optimizer, by attribute path."""
         modules: dict[str, Any] = {"actor": self.actor, "critic": self.critic}
@@ -317,7 +322,7 @@ class CuRePolicy(BasePolicy):
         :return: Attribute paths of objects with a state dict, and of tensors
         """
         paths = [f"{path}.optimizer" for path in self._with_optimizer() if path.startswith("policy.")]
-        state_dicts, tensors = ["policy.encoder_update", *paths], []
+        state_dicts, tensors = ["policy.encoder_optimizer", *paths], []
         if self.curious is not None and self.curious.log_ent_coef is None:
             tensors = ["policy.curious.ent_coef_tensor"]
         elif self.curious is not None:
