@@ -3,6 +3,7 @@
 import copy
 import io
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -293,7 +294,8 @@ def test_callbacks(extras: dict[str, Any], tmp_path: Path, capsys: pytest.Captur
             ),
         ]
     )
-    model = vector_model(verbose=1, **extras).learn(1000, callbacks, log_interval=1, progress_bar=True)
+    has_bar = None not in map(find_spec, ("tqdm", "rich"))  # packages of an extra
+    model = vector_model(verbose=1, **extras).learn(1000, callbacks, log_interval=1, progress_bar=has_bar)
     assert model.num_timesteps == 30 and calls == [15, 30]
     names = {"rl_model_20_steps.zip", "rl_model_replay_buffer_20_steps.pkl", "evaluations.npz", "best_model.zip"}
     assert {path.name for path in tmp_path.iterdir()} == names
