@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -62,17 +63,26 @@ class PublicTraining:
         shape, actions = self.env.observation_space.shape, self.env.action_space
         assert isinstance(actions, gym.spaces.Box) and shape is not None and shape[0] < shape[1]
         assert (actions.low == -1).all() and (actions.high == 1).all()
-        self.agent = public_agent(
-            checkout,
-            shape,
-            actions.shape[0],
-            **{k: v for k, v in self.settings.items() if k in (*ARGUMENTS, "discount")},
-        )
-        self.buffer = utils.ReplayBuffer(
-            shape, actions.shape, self.settings["buffer_size"], self.settings["batch_size"], th.device("cpu")
-        )
+        #: Updates after the warm-up's last step: it counts steps, not updates, so that each of them includes the actor
+        self.first_updates = self.settings["learning_starts"]
         self.log, self.losses = Log(), list[float]()
         self.updates = 0
+        self._set_up(checkout, utils, shape, actions.shape)
+
+    def _set_up(self, checkout: Path, utils: Any, shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
+        """Make agent and replay buffer."""
+        arguments = {key: value for key, value in self.settings.items() if key in (*ARGUMENTS, "discount")}
+        self.agent = public_agent(checkout, shape, action_shape[0], **arguments)
+        sizes = self.settings["buffer_size"], self.settings["batch_size"]
+        self.buffer = utils.ReplayBuffer(shape, action_shape, *sizes, th.device("cpu"))
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Act deterministically.
+
+        :param observation: Observation of the environment
+        :return: Action
+        """
+        return self.agent.select_action(observation)
 
     def steps(self) -> Iterator[int]:
         """Train step by step.
@@ -87,11 +97,11 @@ class PublicTraining:
                 action = self.env.action_space.sample()
             else:
                 action = self.agent.sample_action(observation)
-                for _ in range(warmup if step == warmup else 1):
-                    # It counts steps, not updates: in the burst after the warm-up each update includes the actor.
+                for _ in range(self.first_updates if step == warmup else 1):
                     self.agent.update(self.buffer, self.log, step)
-                    self.losses.append(self.log.losses["decoder"])
                     self.updates += 1
+                    if "decoder" in self.log.losses:
+                        self.losses.append(self.log.losses["decoder"])
             next_observation, reward, terminated, truncated, _ = self.env.step(action)
             self.buffer.add(observation, action, reward, next_observation, terminated)
             observation = next_observation
@@ -124,7 +134,7 @@ class _PublicRun(PublicTraining):
         if not is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             return
         seeds = [EVAL_SEED, *[None] * (self.cell.eval_episodes - 1)]
-        returns = [episode_return(self.eval_env, self.agent.select_action, seed) for seed in seeds]
+        returns = [episode_return(self.eval_env, self.act, seed) for seed in seeds]
         row = (
             *(steps, step, self.updates, round(time.monotonic() - self.began, 1)),
             *(float(np.mean(returns)), float(np.std(returns)), float(np.mean(self.losses)) if self.losses else ""),

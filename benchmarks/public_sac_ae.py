@@ -20,6 +20,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
@@ -46,6 +47,13 @@ ARGUMENTS = dict(
     num_layers=4,
     num_filters=32,
 )
+#: What public code imports and does not use here, by module; NumPy has the windows of scikit-image, too
+_STUBS: dict[str, dict[str, Any]] = {
+    "gym": {"Wrapper": object, "spaces": SimpleNamespace(Box=None)},
+    "hydra": {},
+    "omegaconf": {"OmegaConf": None},
+    "skimage.util.shape": {"view_as_windows": np.lib.stride_tricks.sliding_window_view},
+}
 
 
 class Log:
@@ -87,18 +95,19 @@ class _Buffer:
 
 
 def import_public(checkout: Path, module: str) -> ModuleType:
-    """Import a module of the public implementation.
+    """Import a module of a public implementation.
 
-    :param checkout: Folder that holds the public implementation's files
+    :param checkout: Folder that holds its files
     :param module: Name of one of them, without ending
     :return: The module
     """
-    try:
-        importlib.import_module("gym")
-    except ImportError:  # it is imported for a wrapper that is not used here
-        gym: Any = ModuleType("gym")
-        gym.Wrapper, gym.spaces = object, SimpleNamespace(Box=None)
-        sys.modules["gym"] = gym
+    for name, content in _STUBS.items():
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            stub = ModuleType(name)
+            vars(stub).update(content)
+            sys.modules[name] = stub
     if str(checkout.resolve()) not in sys.path:
         sys.path.insert(0, str(checkout.resolve()))
     return importlib.import_module(module)

@@ -1,30 +1,37 @@
-"""How many minutes of training until a return is reached: ours, the public SAC-AE and SB3's SAC on cartpole-swingup.
+"""How many minutes of training until a return is reached: ours beside public code, on one thread.
 
-    git clone https://github.com/denisyarats/pytorch_sac_ae
-    python -m benchmarks.time_to_return --public pytorch_sac_ae --out results/time_to_return
+    git clone https://github.com/denisyarats/pytorch_sac_ae     # two more clones: see benchmarks/peers.py
+    python -m benchmarks.time_to_return --arms best curl public sb3_sac --seeds 20 21 --public pytorch_sac_ae
+    python -m benchmarks.time_to_return --summarise-only
 
-All arms see the pixels of the fast profile. Ours have its settings; the public code has its own (as in
-``public_returns.py``) with the profile's sizes of networks; ``sb3_sac`` is SB3's ``SAC("CnnPolicy")`` with its
-defaults, ``sb3_sac_our_sizes`` the same with our hidden layers, batch size, learning rate and warm-up.
+Arms:
 
-Each cell (arm, seed) runs in a process with one thread until it has made ``--steps`` or trained for ``--minutes``. The
-clock runs from before the training environment and the networks are made, and stands still during evaluations.
-Evaluations of all arms begin in the same states. A cell writes ``<arm>/seed<k>.csv`` after each evaluation and
-``seed<k>.json`` at its end; without the latter it begins anew. ``summary.csv``, ``table.md`` and
+- names of files in ``zoo_configs/fast/`` (``best``, ``curl``, ``sac_ae`` ...): ours;
+- ``public``: the authors' SAC-AE (as in ``public_returns.py``) with the profile's sizes of networks;
+- ``drqv2`` and ``public_curl``: the authors' code (``peers.py``) in the best of four trials, which have the profile's
+  sizes of networks and warm-up, two learning rates and two schedules. The trials are ``drqv2_{3e-4,1e-3}_{easy,medium}``
+  and ``public_curl_{1e-3,2e-3}_{slow,quick}`` on cartpole-swingup with seeds 0, 1, 2; the best one has the highest mean
+  return over the minutes of training. ``drqv2_own`` and ``public_curl_own``: in their own settings and sizes;
+- ``sb3_sac``: SB3's ``SAC("CnnPolicy")`` with its defaults; ``sb3_sac_our_sizes``: with our hidden layers, batch size,
+  learning rate and warm-up.
+
+All see the pixels of the fast profile. Each cell (task, arm, seed) runs in a process with one thread until it has
+trained for ``--minutes``, or made ``--steps``. A minute is one of CPU time: that of a quiet machine, also beside other
+work. The clock runs from before the training environment and the networks are made, and stands still during
+evaluations, which begin in the same states in all arms. A cell writes ``<task>/<arm>/seed<k>.csv`` after each
+evaluation and ``seed<k>.json`` at its end; without the latter it begins anew. ``summary.csv``, ``table.md`` and
 ``time_to_return.png`` are made of all finished cells in the folder.
 
-A return is reached at the first evaluation whose mean is at least as high. A seed that does not reach it is censored
-at its limit, and ranks behind all that do: the median is the time at which half of the seeds have reached the return
-(of Kaplan and Meier's curve, if all limits are alike), and "not reached" if fewer than half ever do.
+A return is reached at the first evaluation whose mean is at least as high. A seed that does not reach it is censored at
+the limit of minutes, also if the steps ended it before. Medians are those of Kaplan and Meier's curves, and p values
+those of log-rank tests against ``best``.
 """
 
 import argparse
 import contextlib
-import math
 import os
-import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -37,10 +44,12 @@ import numpy as np
 import pandas as pd
 import torch as th
 from matplotlib.figure import Figure
+from scipy import stats
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks import public_returns
+from benchmarks.peers import PEERS, CurlTraining, DrQv2Training
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
 from sb3_cure import CuReSAC
@@ -57,65 +66,124 @@ from sb3_cure.evaluation.result_files import (
     write_text,
 )
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
-from sb3_cure.experiments.grid import Cell, GridError, constructor_defaults, load_grid, read_kept
+from sb3_cure.experiments.grid import (
+    Cell,
+    GridError,
+    Method,
+    arm_settings,
+    constructor_defaults,
+    load_grid,
+    read_kept,
+    short_name,
+)
+from sb3_cure.experiments.statistics import area_under_curve
 from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.networks.allocator import tune_allocator
 
 PUBLIC = public_returns.ARM
-#: Grids that hold our arms
-GRIDS = {"sac_ae": "curves.yml", "cure_sac_ae": "curves.yml", "curl": "curves_curl.yml"}
 SB3 = ("sb3_sac", "sb3_sac_our_sizes")
-ARMS = (*GRIDS, PUBLIC, *SB3)
-TARGETS = (200, 250, 300)
-#: More than all steps of the default limit
-SB3_BUFFER_SIZE = 20_000
+#: The arm that the others are compared with
+OURS = "best"
+TASKS = ("cartpole-swingup", "reacher-easy", "finger-spin")
+TRIAL_TASK, TRIAL_SEEDS = "cartpole-swingup", (0, 1, 2)
+TARGETS = (300, 500, 700)
+#: Minutes after which returns are shown
+TIMES = (10, 30)
+#: More than half an hour's steps
+SB3_BUFFER_SIZE = 100_000
 COLUMNS = ("agent_steps", "environment_steps", "training_seconds", "return_mean", "return_std", "episodes", "limit")
-SUMMARY_COLUMNS = ("arm", "target", "seeds", "reached", "median_minutes", "of_public", "minutes")
+SUMMARY_COLUMNS = ("task", "arm", "target", "seeds", "reached", "median_minutes", "p_value", "minutes")
 #: One thread for each library that may start more
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
-#: Of the JSON files: what the table says about all cells
-CONDITIONS = ("budget", "minutes", "eval_every", "eval_episodes", "machine", "commit")
+#: Of the JSON files: conditions that the table names
+CONDITIONS = ("minutes", "budget", "eval_every", "eval_episodes", "machine", "commit")
 
 
 # Cells
 
 
-def make_cell(arm: str, seed: int, steps: int, every: int, episodes: int) -> Cell:
-    """
-    :param arm: One of ``ARMS``
+def make_cell(arm: str, task: str, seed: int, out: Path) -> Cell:
+    """Describe a cell, but for its limits and evaluations.
+
+    :param arm: See above
+    :param task: Short name of a task
     :param seed: Seed of weights, warm-up and environment
-    :param steps: Limit in environment steps
-    :param every: Agent steps between two evaluations
-    :param episodes: Episodes of an evaluation
+    :param out: Folder of all results, whose trials decide on a peer's settings
     :return: What to run
+    :raises GridError: if the arm is unknown, or trials are missing
     """
+    peer = peer_of(arm)
+    zoo = "sac_ae" if peer or arm in (PUBLIC, *SB3) else arm
+    settings = arm_settings(Path(__file__), f"dmc_pixels/{task}-v0", Method(config=f"fast/{zoo}"))
+    cell = Cell("time_to_return", "curves", f"dmc_pixels/{task}-v0", arm, seed, 0, 0, 0, *settings)
+    if peer:
+        return _peer_cell(cell, peer, out)
     if arm == PUBLIC:
-        cell = public_cell(load_grid(public_returns.GRID).cells[0])
-    else:
-        ours = arm if arm in GRIDS else "sac_ae"
-        cell = load_grid(public_returns.GRID.with_name(GRIDS[ours]), methods=[ours]).cells[0]
+        return replace(cell, arguments=public_cell(load_grid(public_returns.GRID).cells[0]).arguments)
     if arm in SB3:
         arguments = {"policy": "CnnPolicy", "buffer_size": SB3_BUFFER_SIZE}
         if arm == "sb3_sac_our_sizes":
             known = {**constructor_defaults(CuReSAC), **cell.arguments}
             arguments |= {name: known[name] for name in ("learning_rate", "learning_starts", "batch_size")}
             arguments["policy_kwargs"] = {"net_arch": known["policy_kwargs"]["net_arch"]}
-        cell = replace(cell, arguments=arguments)
-    return replace(cell, method=arm, seed=seed, budget=steps, eval_every=every, eval_episodes=episodes)
+        return replace(cell, arguments=arguments)
+    return cell
+
+
+def peer_of(arm: str) -> str | None:
+    """Name the peer that an arm belongs to, if any."""
+    return next((name for name in PEERS if arm == name or arm.startswith(f"{name}_")), None)
+
+
+def trial_arms(peer: str) -> list[str]:
+    """Name the arms that are a peer's trials."""
+    return [f"{peer}_{trial}" for trial in PEERS[peer].trials]
+
+
+def _peer_cell(cell: Cell, name: str, out: Path) -> Cell:
+    peer, arm = PEERS[name], best_trial(out, name) if cell.method == name else cell.method
+    known = {f"{name}_own": peer.own, **dict(zip(trial_arms(name), peer.trials.values(), strict=True))}
+    if arm not in known:
+        raise GridError(f"{arm!r} is no arm of {name}, which has {', '.join((name, *known))}.")
+    arguments = {"implementation": peer.source, "settings_of": arm, **known[arm]}
+    if name == "drqv2":
+        return replace(cell, arguments=arguments)
+    size = cell.env_kwargs["image_size"]
+    larger = {**cell.env_kwargs, "image_size": 100 * size // 84}
+    return replace(cell, arguments={**arguments, "image_size": size}, env_kwargs=larger)
+
+
+def best_trial(out: Path, peer: str) -> str:
+    """Choose a peer's settings.
+
+    :param out: Folder of all results
+    :param peer: A key of ``PEERS``
+    :return: The trial with the highest mean return over the minutes of training
+    :raises GridError: if a trial is missing
+    """
+    runs = read_runs(out).get(TRIAL_TASK, {})
+    trials = {arm: [runs.get(arm, {}).get(seed) for seed in TRIAL_SEEDS] for arm in trial_arms(peer)}
+    if missing := [arm for arm, seeds in trials.items() if None in seeds]:
+        raise GridError(
+            f"{peer} is the best of its trials, of which {', '.join(missing)} are missing: run these first on "
+            f"{TRIAL_TASK} with seeds {' '.join(map(str, TRIAL_SEEDS))}."
+        )
+    return max(trials, key=lambda arm: np.mean([run.mean_over_time for run in trials[arm] if run]))
 
 
 def settings_of(cell: Cell, minutes: float) -> dict[str, Any]:
-    """
+    """Collect the settings to keep beside the results.
+
     :param cell: From ``make_cell``
     :param minutes: Its limit
-    :return: Settings to keep beside the results
+    :return: Settings by name
     """
     names = ("method", "seed", "task", "env_kwargs", "arguments", "budget", "eval_every", "eval_episodes")
     return {**{name: getattr(cell, name) for name in names}, "minutes": minutes, "eval_seed": EVAL_SEED}
 
 
 class Record:
-    """Measures the time of training, evaluates on schedule with the clock stopped, and tells when time is up.
+    """Measure the time of training, and evaluate on schedule with the clock stopped.
 
     :param path: CSV file to write
     :param cell: What is trained
@@ -129,26 +197,37 @@ class Record:
         #: Limit in agent steps
         self.total = -(-cell.budget // self.action_repeat)
         self.rows: list[Row] = []
-        self._started = np.array([time.perf_counter(), time.process_time()])
+        self._started = self._now()
+
+    @staticmethod
+    def _now() -> np.ndarray:
+        return np.array([time.process_time(), time.perf_counter()])
 
     def times(self) -> tuple[float, float]:
+        """Read the clock.
+
+        :return: CPU and wall-clock seconds of training so far
         """
-        :return: Wall-clock and CPU seconds of training so far
-        """
-        wall, cpu = np.array([time.perf_counter(), time.process_time()]) - self._started
-        return float(wall), float(cpu)
+        cpu, wall = self._now() - self._started
+        return float(cpu), float(wall)
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
         """Stop the clock for a while."""
         times = self.times()
         yield
-        self._started = np.array([time.perf_counter(), time.process_time()]) - times
+        self._started = self._now() - times
+
+    def progress(self, step: int) -> float:
+        """Measure the share of the budget that is used up, of steps or of minutes.
+
+        :param step: Agent steps so far
+        :return: At least 1 when training ends
+        """
+        return max(step / self.total, self.times()[0] / (60 * self.minutes))
 
     def is_time_up(self) -> bool:
-        """
-        :return: Whether the limit in minutes is reached
-        """
+        """Whether the limit in minutes is reached."""
         return self.times()[0] >= 60 * self.minutes
 
     def visit(self, step: int, act: Callable[[np.ndarray], np.ndarray], finished: bool = False) -> None:
@@ -199,21 +278,35 @@ class _Visits(BaseCallback):
         self.record.visit(self.num_timesteps, self._act, finished=True)
 
 
-def train(cell: Cell, record: Record, checkout: Path | None) -> None:
+def make_training(cell: Cell, record: Record, clone: Path) -> PublicTraining:
+    """Prepare the training of public code.
+
+    :param cell: From ``make_cell``
+    :param record: Of this cell
+    :param clone: Folder of the code
+    :return: Its training
+    """
+    if cell.method == PUBLIC:
+        return PublicTraining(clone, cell)
+    if peer_of(cell.method) == "drqv2":
+        return DrQv2Training(clone, cell, record.progress)
+    return CurlTraining(clone, cell)
+
+
+def train(cell: Cell, record: Record, clone: Path | None) -> None:
     """Train one cell until either limit.
 
     :param cell: From ``make_cell``
     :param record: Of this cell
-    :param checkout: Folder that holds the public implementation's files, which only its arm needs
+    :param clone: Folder of public code, for the arms that are
     """
-    if cell.method == PUBLIC:
-        assert checkout is not None
-        public = PublicTraining(checkout, cell)
-        for step in public.steps():
-            record.visit(step, public.agent.select_action)
+    if clone is not None:
+        training = make_training(cell, record, clone)
+        for step in training.steps():
+            record.visit(step, training.act)
             if record.is_time_up():
                 break
-        record.visit(step, public.agent.select_action, finished=True)
+        record.visit(step, training.act, finished=True)
         return
     env = gym.make(cell.task, **cell.env_kwargs)
     if cell.method in SB3:
@@ -223,13 +316,13 @@ def train(cell: Cell, record: Record, checkout: Path | None) -> None:
     model.learn(record.total, callback=_Visits(record))
 
 
-def run_cell(out: Path, cell: Cell, minutes: float, checkout: Path | None) -> None:
+def run_cell(out: Path, cell: Cell, minutes: float, clone: Path | None) -> None:
     """Run one cell from its beginning.
 
     :param out: Folder of all results
     :param cell: From ``make_cell``
     :param minutes: Limit in minutes of training
-    :param checkout: Folder that holds the public implementation's files
+    :param clone: Folder of public code, for the arms that are
     """
     th.set_num_threads(1)
     tune_allocator()
@@ -237,32 +330,33 @@ def run_cell(out: Path, cell: Cell, minutes: float, checkout: Path | None) -> No
     path.parent.mkdir(parents=True, exist_ok=True)
     started = datetime.now(UTC).isoformat(timespec="seconds")
     record = Record(path, cell, minutes, gym.make(cell.task, **cell.env_kwargs))
-    train(cell, record, checkout)
-    wall, cpu = record.times()
-    times = {"training_seconds": round(wall, 1), "training_cpu_seconds": round(cpu, 1)}
+    train(cell, record, clone)
+    cpu, wall = record.times()
+    times = {"training_seconds": round(cpu, 1), "training_wall_seconds": round(wall, 1)}
     details = {"stopped_by": record.rows[-1]["limit"], **times, "load_average": os.getloadavg(), "started": started}
-    if cell.method == PUBLIC and checkout is not None:
-        details["public_commit"] = checkout_commit(checkout)
+    if clone is not None:
+        details["public_commit"] = checkout_commit(clone)
     write_json(path.with_suffix(".json"), {**settings_of(cell, minutes), **details, **describe_run()})
 
 
 def cell_path(out: Path, cell: Cell) -> Path:
-    """
+    """Name a cell's file.
+
     :param out: Folder of all results
     :param cell: From ``make_cell``
-    :return: Its CSV file; the JSON file beside it tells that it is finished
+    :return: Its CSV file; the JSON file beside it marks that it is finished
     """
-    return out / cell.method / f"seed{cell.seed}.csv"
+    return out / short_name(cell.task) / cell.method / f"seed{cell.seed}.csv"
 
 
-def run_missing(out: Path, cells: Sequence[Cell], minutes: float, jobs: int, checkout: Path | None) -> list[str]:
+def run_missing(out: Path, cells: Sequence[Cell], minutes: float, jobs: int, clones: dict[str, Path]) -> list[str]:
     """Run what is not finished, each cell in a process of its own.
 
     :param out: Folder of all results
     :param cells: From ``make_cell``
     :param minutes: Limit of each in minutes of training
     :param jobs: Cells at a time
-    :param checkout: Folder that holds the public implementation's files
+    :param clones: Folders of public code, by arm or peer
     :return: Names of the cells that failed
     :raises GridError: if the folder holds cells of other settings
     """
@@ -271,7 +365,8 @@ def run_missing(out: Path, cells: Sequence[Cell], minutes: float, jobs: int, che
         check_settings(path, settings_of(cell, minutes))
 
     def run(cell: Cell) -> bool:
-        process = get_context("spawn").Process(target=run_cell, args=(out, cell, minutes, checkout))
+        clone = clones.get(peer_of(cell.method) or cell.method)
+        process = get_context("spawn").Process(target=run_cell, args=(out, cell, minutes, clone))
         process.start()
         process.join()
         return process.exitcode == 0
@@ -298,144 +393,221 @@ class Run:
     details: dict[str, Any]
 
     @property
-    def minutes(self) -> float:
-        """Minutes of training until its limit."""
-        return self.rows[-1]["training_seconds"] / 60
+    def limit(self) -> float:
+        """Limit in minutes of training."""
+        return self.details["minutes"]
+
+    @property
+    def minutes(self) -> np.ndarray:
+        """Minutes of training at each evaluation; the last one may come a step after the limit."""
+        return np.minimum([row["training_seconds"] / 60 for row in self.rows], self.limit)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """Mean return of each evaluation."""
+        return np.array([row["return_mean"] for row in self.rows])
+
+    @property
+    def mean_over_time(self) -> float:
+        """Mean return over the minutes from 0 to the limit; the last evaluation holds where steps ended it before."""
+        minutes, returns = [0, *self.minutes, self.limit], [self.returns[0], *self.returns, self.returns[-1]]
+        return area_under_curve(np.array(minutes), np.array(returns))
 
     def minutes_to(self, target: float) -> float | None:
-        """
-        :param target: A return
-        :return: Minutes of training until the first evaluation that reaches it; None: not within the limit
-        """
-        reached = (row["training_seconds"] / 60 for row in self.rows if row["return_mean"] >= target)
-        return next(reached, None)
+        """Find when a return is reached.
 
-    def told(self, target: float) -> str:
-        """
         :param target: A return
-        :return: Minutes until it is reached, or those until the limit, and which limit that was
+        :return: Minutes of training until the first evaluation that reaches it; None: not within the limits
         """
+        reached = self.minutes[self.returns >= target]
+        return float(reached[0]) if len(reached) else None
+
+    def return_after(self, minutes: float) -> float:
+        """Find the return of the last evaluation until then.
+
+        :param minutes: Minutes of training
+        :return: Its mean; nan beyond the limit
+        """
+        return float(self.returns[self.minutes <= minutes][-1]) if minutes <= self.limit else float("nan")
+
+    def time_text(self, target: float) -> str:
+        """Format the minutes until a return is reached, or else the limit that ended training."""
         minutes = self.minutes_to(target)
-        return f">{self.minutes:.1f} ({self.details['stopped_by']})" if minutes is None else f"{minutes:.1f}"
+        return f">{self.minutes[-1]:.1f} ({self.details['stopped_by']})" if minutes is None else f"{minutes:.1f}"
 
 
-Runs = Mapping[str, Mapping[int, Run]]
+#: Runs by seed, those by arm, and those by task
+Seeds = dict[int, Run]
+Runs = dict[str, dict[str, Seeds]]
 
 
-def read_runs(out: Path) -> dict[str, dict[int, Run]]:
-    """
+def read_runs(out: Path) -> Runs:
+    """Read the finished cells.
+
     :param out: Folder of all results
-    :return: Its finished cells, by arm and seed
+    :return: Runs by task, arm and seed
     """
-    runs: dict[str, dict[int, Run]] = {}
-    for arm in ARMS:
-        for path in (out / arm).glob("seed*.json"):
-            details = read_kept(path)
-            runs.setdefault(arm, {})[details["seed"]] = Run(read_rows(path.with_suffix(".csv"), COLUMNS), details)
-    return {arm: dict(sorted(seeds.items())) for arm, seeds in runs.items()}
+    runs: Runs = {}
+    for path in sorted(out.glob("*/*/seed*.json")):
+        details, (task, arm) = read_kept(path), path.parts[-3:-1]
+        run = Run(read_rows(path.with_suffix(".csv"), COLUMNS), details)
+        runs.setdefault(task, {}).setdefault(arm, {})[details["seed"]] = run
+    return runs
 
 
-def censored_median(minutes: Sequence[float | None]) -> float | None:
-    """
-    :param minutes: Until a return is reached, one per seed; None: not within the limit
-    :return: When half of the seeds have reached it; None if fewer than half do
-    """
-    median = statistics.median_low([math.inf if each is None else each for each in minutes] or [math.inf])
-    return None if math.isinf(median) else median
+def times_to(seeds: Seeds, target: float) -> stats.CensoredData:
+    """Collect the minutes until a return is reached.
 
-
-def ratio_of_medians(ours: Mapping[int, Run], theirs: Mapping[int, Run], target: float) -> str:
-    """
-    :param ours: Runs of an arm by seed
-    :param theirs: Runs of another
+    :param seeds: Runs of an arm
     :param target: A return
-    :return: Median of ours over that of theirs; an upper bound if theirs is beyond their limits, a dash if ours is
+    :return: Times by seed, censored at the limit of minutes where it is not reached
     """
-    one, other = (censored_median([run.minutes_to(target) for run in runs.values()]) for runs in (ours, theirs))
-    if one is None or not theirs:
-        return NONE
-    if other is not None:
-        return f"{one / other:.2f}"
-    # Those that do not reach it take longer than their limits.
-    at_least = [run.minutes if (found := run.minutes_to(target)) is None else found for run in theirs.values()]
-    return f"<{one / statistics.median_low(at_least):.2f}"
+    minutes = [run.minutes_to(target) for run in seeds.values()]
+    times = [run.limit if each is None else each for run, each in zip(seeds.values(), minutes, strict=True)]
+    return stats.CensoredData.right_censored(times, [each is None for each in minutes])
+
+
+def median_time(data: stats.CensoredData) -> float | None:
+    """Estimate when half of the seeds have reached a return, by Kaplan and Meier's curve.
+
+    :param data: From ``times_to``
+    :return: Minutes; None if fewer than half reach it
+    """
+    curve = stats.ecdf(data).sf
+    reached = curve.quantiles[curve.probabilities <= 0.5 + 1e-9]
+    return float(reached[0]) if len(reached) else None
+
+
+def compare(ours: stats.CensoredData, theirs: stats.CensoredData) -> float:
+    """Test whether two arms differ in the times until they reach a return.
+
+    :param ours: From ``times_to``
+    :param theirs: Those of another arm
+    :return: p value of a log-rank test; 1 if no seed of either reaches it
+    """
+    if ours.num_censored() == len(ours) and theirs.num_censored() == len(theirs):
+        return 1.0
+    return float(stats.logrank(ours, theirs).pvalue)
 
 
 def summarise(runs: Runs) -> list[Row]:
-    """
+    """Summarise each arm on each task.
+
     :param runs: Result of ``read_runs``
     :return: Rows of ``summary.csv``
     """
     rows = []
-    for arm, seeds in runs.items():
-        for target in TARGETS:
-            minutes = [run.minutes_to(target) for run in seeds.values()]
-            median = censored_median(minutes)
-            values = (
-                *(arm, target, len(seeds), sum(each is not None for each in minutes)),
-                "not reached" if median is None else round(median, 2),
-                ratio_of_medians(seeds, runs.get(PUBLIC, {}), target),
-                "; ".join(f"seed {seed}: {run.told(target)}" for seed, run in seeds.items()),
-            )
-            rows.append(dict(zip(SUMMARY_COLUMNS, values, strict=True)))
+    for task, arms in runs.items():
+        for arm, seeds in arms.items():
+            for target in TARGETS:
+                data = times_to(seeds, target)
+                median, compares = median_time(data), OURS in arms and arm != OURS
+                values = (
+                    *(task, arm, target, len(data), len(data) - data.num_censored()),
+                    "not reached" if median is None else round(median, 2),
+                    round(compare(times_to(arms[OURS], target), data), 4) if compares else "",
+                    "; ".join(f"seed {seed}: {run.time_text(target)}" for seed, run in seeds.items()),
+                )
+                rows.append(dict(zip(SUMMARY_COLUMNS, values, strict=True)))
     return rows
 
 
+def is_trial(arm: str) -> bool:
+    """Whether an arm is one of a peer's trials."""
+    return any(arm in trial_arms(peer) for peer in PEERS)
+
+
 def tables(runs: Runs) -> str:
-    """
+    """Write the tables.
+
     :param runs: Result of ``read_runs``
-    :return: Medians by arm, minutes of each seed, and conditions, in Markdown
+    :return: Medians and returns by arm, minutes of each seed, trials, and conditions, in Markdown
     """
     summary = summarise(runs)
-    by_arm = []
-    for arm, seeds in runs.items():
-        found = [row for row in summary if row["arm"] == arm]
-        texts = [f"{row['median_minutes']} ({row['reached']} of {row['seeds']}), {row['of_public']}" for row in found]
-        last = [(run.rows[-1]["return_mean"], run.rows[-1]["environment_steps"]) for run in seeds.values()]
-        clocks = [(run.minutes, run.details["training_cpu_seconds"] / 60) for run in seeds.values()]
-        (final, steps), (wall, cpu) = np.mean(last, axis=0), np.mean(clocks, axis=0)
-        by_arm.append([arm, *texts, f"{final:.0f}", f"{steps:,.0f}", f"{wall:.1f}", f"{cpu:.1f}"])
-    columns = ["arm", *(f">{target}" for target in TARGETS)]
-    columns += [">last return", ">environment steps", ">minutes", ">CPU minutes"]
+    found = {(row["task"], row["arm"], row["target"]): row for row in summary}
+    by_arm, trials = [], []
+    for task, arms in runs.items():
+        for arm, seeds in arms.items():
+            if is_trial(arm):
+                score = np.mean([run.mean_over_time for run in seeds.values()])
+                trials.append([arm, _seeds_text(seeds), f"{score:.1f}"])
+                continue
+            texts = [_median_text(found[task, arm, target]) for target in TARGETS]
+            for minutes in TIMES:
+                returns = np.array([run.return_after(minutes) for run in seeds.values()])
+                texts.append(NONE if np.isnan(returns).any() else f"{returns.mean():.0f} ± {returns.std():.0f}")
+            steps = np.mean([run.rows[-1]["agent_steps"] for run in seeds.values()])
+            cpu, wall = (
+                np.mean([run.details[f"training_{clock}"] for run in seeds.values()])
+                for clock in ("seconds", "wall_seconds")
+            )
+            by_arm.append(
+                [
+                    task,
+                    arm,
+                    _seeds_text(seeds),
+                    *texts,
+                    f"{1e3 * cpu / steps:.0f}",
+                    f"{cpu / 60:.1f}",
+                    f"{wall / 60:.1f}",
+                ]
+            )
+    columns = ["task", "arm", "seeds", *(f">{target}" for target in TARGETS)]
+    columns += [*(f">after {minutes} min" for minutes in TIMES), ">ms per agent step", ">CPU minutes", ">wall minutes"]
     note = (
-        "Median over seeds of the minutes of training until the return is reached, how many seeds reach it, and the "
-        f"median over that of {PUBLIC} (an upper bound where {PUBLIC} does not reach it). The last four columns: means "
-        "over seeds at their limits. Minutes well above CPU minutes tell of a busy machine."
+        "Median over seeds of the CPU minutes of training until the return is reached, how many seeds reach it, and the "
+        f"p value of a log-rank test against {OURS}. Then mean and deviation over seeds of the return after so many "
+        "minutes, and the times of training, means over seeds: of an agent step (warm-up included), and of all."
     )
-    by_seed = [[row["arm"], str(row["target"]), row["minutes"]] for row in summary]
-    details = [run.details for seeds in runs.values() for run in seeds.values()]
-    told = [f"{key}: {', '.join(sorted({str(each[key]) for each in details}))}" for key in CONDITIONS]
-    both = (
+    by_seed = [[row["task"], row["arm"], str(row["target"]), row["minutes"]] for row in summary]
+    details = [run.details for arms in runs.values() for seeds in arms.values() for run in seeds.values()]
+    conditions = [f"{key}: {', '.join(sorted({str(each[key]) for each in details}))}" for key in CONDITIONS]
+    parts = [
         Table("Minutes to a return", pd.DataFrame(by_arm, columns=columns), note),
-        Table("Each seed", pd.DataFrame(by_seed, columns=["arm", ">return", "minutes"]), "; ".join(told)),
-    )
+        Table(
+            "Trials",
+            pd.DataFrame(trials, columns=["arm", "seeds", ">mean return over time"]),
+            "The best of each peer's has its name above.",
+        ),
+        Table("Each seed", pd.DataFrame(by_seed, columns=["task", "arm", ">return", "minutes"]), "; ".join(conditions)),
+    ]
     head = "# Time to a return\n\n![Return over minutes of training](time_to_return.png)\n"
-    return "\n".join((head, *(each.markdown() for each in both)))
+    return "\n".join((head, *(each.markdown() for each in parts if len(each.rows))))
+
+
+def _seeds_text(seeds: Seeds) -> str:
+    return ", ".join(map(str, seeds))
+
+
+def _median_text(row: Row) -> str:
+    text = f"{row['median_minutes']} ({row['reached']} of {row['seeds']})"
+    return text if row["p_value"] == "" else f"{text}, p {row['p_value']:.2g}"
 
 
 @in_style
 def draw(path: Path, runs: Runs) -> None:
-    """Return over minutes of training: thin lines are seeds, thick ones their mean while all of them train.
+    """Draw the return over minutes of training: thin lines are seeds, thick ones their mean while all of them train.
 
     :param path: File to write
     :param runs: Result of ``read_runs``
     """
-    figure = Figure(figsize=(7.5, 4.8))
-    axes = figure.subplots()
-    colors = arm_colors(ARMS, PUBLIC)
-    for arm, seeds in runs.items():
-        curves = []
-        for run in seeds.values():
-            minutes = [row["training_seconds"] / 60 for row in run.rows]
-            curves.append((minutes, [row["return_mean"] for row in run.rows]))
-            axes.plot(*curves[-1], color=colors[arm], alpha=0.35, linewidth=0.7)
-        grid = np.linspace(max(minutes[0] for minutes, _ in curves), min(minutes[-1] for minutes, _ in curves), 400)
-        mean = np.mean([np.interp(grid, minutes, returns) for minutes, returns in curves], axis=0)
-        axes.plot(grid, mean, color=colors[arm], linewidth=2.4, label=f"{arm} ({len(seeds)})")
-    for target in TARGETS:
-        axes.axhline(target, color="#333333", linestyle="--", linewidth=0.9, alpha=0.7, zorder=1)
-    axes.set(xlabel="minutes of training", ylabel="return (deterministic actions)", xlim=(0, None), ylim=(0, None))
-    figure.legend(loc="outside upper center", ncols=3, title="cartpole-swingup from pixels, one thread: arm (seeds)")
+    figure = Figure(figsize=(1 + 5 * len(runs), 4.8))
+    shown = {task: {arm: seeds for arm, seeds in arms.items() if not is_trial(arm)} for task, arms in runs.items()}
+    colors = arm_colors(list(dict.fromkeys(arm for arms in shown.values() for arm in arms)), OURS)
+    handles = {}
+    for axes, (task, arms) in zip(figure.subplots(1, len(runs), squeeze=False).flat, shown.items(), strict=True):
+        for arm, seeds in arms.items():
+            for run in seeds.values():
+                axes.plot(run.minutes, run.returns, color=colors[arm], alpha=0.35, linewidth=0.7)
+            first, last = max(run.minutes[0] for run in seeds.values()), min(run.minutes[-1] for run in seeds.values())
+            grid = np.linspace(first, last, 400)
+            mean = np.mean([np.interp(grid, run.minutes, run.returns) for run in seeds.values()], axis=0)
+            (handles[arm],) = axes.plot(grid, mean, color=colors[arm], linewidth=2.4)
+        for target in TARGETS:
+            axes.axhline(target, color="#333333", linestyle="--", linewidth=0.9, alpha=0.7, zorder=1)
+        labels = {"xlabel": "CPU minutes of training", "ylabel": "return (deterministic actions)"}
+        axes.set(title=f"{task}, one thread", **labels, xlim=(0, None), ylim=(0, None))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, min(len(handles), 6)))
     save(figure, path, 120)
 
 
@@ -447,24 +619,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--public", type=checkout_folder, help="folder into which pytorch_sac_ae was cloned")
-    parser.add_argument("--out", type=Path, default=Path("time_to_return"), help="folder (default: time_to_return)")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="default: all")
-    parser.add_argument("--seeds", nargs="+", type=int, default=range(5), help="default: 0 1 2 3 4")
-    parser.add_argument("--steps", type=int, default=100_000, help="limit in environment steps (default: 100000)")
-    parser.add_argument("--minutes", type=float, default=30.0, help="limit in minutes of training (default: 30)")
-    parser.add_argument("--every", type=int, default=2000, help="agent steps between evaluations (default: 2000)")
+    parser.add_argument("--drqv2", type=PEERS["drqv2"].folder, help="folder into which drqv2 was cloned")
+    parser.add_argument("--curl", type=PEERS["public_curl"].folder, help="folder into which curl was cloned")
+    parser.add_argument("--out", type=Path, default=Path("results/by_the_clock"), help="default: results/by_the_clock")
+    parser.add_argument("--arms", nargs="+", default=[OURS], help=f"default: {OURS}")
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS[:1], help=f"default: {TASKS[0]}")
+    parser.add_argument("--seeds", nargs="+", type=int, default=range(20, 25), help="default: 20 21 22 23 24")
+    parser.add_argument("--minutes", type=float, default=30.0, help="limit in CPU minutes of training (default: 30)")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="limit in environment steps (default: 1000000)")
+    parser.add_argument("--every", type=int, default=1250, help="agent steps between evaluations (default: 1250)")
     parser.add_argument("--episodes", type=int, default=10, help="of an evaluation (default: 10)")
-    parser.add_argument("--jobs", type=int, default=2, help="cells at a time (default: 2)")
+    parser.add_argument("--jobs", type=int, default=1, help="cells at a time (default: 1)")
     parser.add_argument("--summarise-only", action="store_true", help="run nothing")
     options = parser.parse_args(arguments)
     failed = list[str]()
     if not options.summarise_only:
-        if PUBLIC in options.arms and options.public is None:
-            parser.error(f"--public is missing, which the arm {PUBLIC} needs")
-        evaluated = options.steps, options.every, options.episodes
-        cells = [make_cell(arm, seed, *evaluated) for seed in options.seeds for arm in options.arms]
+        clones = {PUBLIC: options.public, "drqv2": options.drqv2, "public_curl": options.curl}
+        for arm in options.arms:
+            if clones.get(peer_of(arm) or arm, Path()) is None:
+                parser.error(f"{arm} needs the folder of its clone: give --{(peer_of(arm) or arm).split('_')[-1]}")
+        limits = {"budget": options.steps, "eval_every": options.every, "eval_episodes": options.episodes}
         try:
-            failed = run_missing(options.out, cells, options.minutes, options.jobs, options.public)
+            cells = [
+                replace(make_cell(arm, task, seed, options.out), **limits)
+                for task in options.tasks
+                for seed in options.seeds
+                for arm in options.arms
+            ]
+            failed = run_missing(options.out, cells, options.minutes, options.jobs, clones)
         except GridError as error:
             parser.error(str(error))
     runs = read_runs(options.out)

@@ -394,7 +394,7 @@ def load_grid(
     arms = tuple(
         Cell(
             *(file.experiment, file.kind, task, arm, chosen[0], file.budget if method.train else 0),
-            *(file.evaluation.every, file.evaluation.episodes, *_settings(path, task, method)),
+            *(file.evaluation.every, file.evaluation.episodes, *arm_settings(path, task, method)),
             *(method.pretrain, method.algo, file.coverage),
         )
         for task in file.tasks
@@ -437,8 +437,15 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
     file.budget = budget
 
 
-def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
-    """``n_envs``, ``env_kwargs`` and arguments of an arm on a task: the zoo file's entry with the grid's overrides."""
+def arm_settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
+    """Read the settings of an arm on a task: the zoo file's entry with the grid's overrides.
+
+    :param path: The grid's file, to which the method's ``config`` may be relative
+    :param task: Gymnasium id
+    :param method: The arm
+    :return: ``n_envs``, ``env_kwargs`` and the algorithm's arguments
+    :raises GridError: if there is no such file or entry
+    """
     config = path.parent / _find(method.config, ZOO)
     entries, name = _read_yaml(config), task.rpartition(":")[2]
     found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
