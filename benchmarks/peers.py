@@ -58,7 +58,9 @@ class Peer:
 
 def _drqv2(lr: float, noise: dict[str, Any], sizes: tuple[int, int], warmup: int) -> dict[str, Any]:
     """Settings of DrQ-v2 (``cfgs/config.yaml``)."""
-    agent = dict(lr=lr, feature_dim=50, hidden_dim=sizes[1], critic_target_tau=0.01, num_expl_steps=warmup)
+    agent: dict[str, Any] = dict(
+        lr=lr, feature_dim=50, hidden_dim=sizes[1], critic_target_tau=0.01, num_expl_steps=warmup
+    )
     agent |= dict(update_every_steps=2, stddev_schedule="1.0", stddev_clip=0.3, use_tb=False)
     loader = dict(buffer_size=1_000_000, batch_size=256, num_workers=0, save_snapshot=False, nstep=3, discount=0.99)
     return {"agent": agent, "n_filters": sizes[0], "learning_starts": warmup, "loader": loader, **noise}
@@ -66,7 +68,9 @@ def _drqv2(lr: float, noise: dict[str, Any], sizes: tuple[int, int], warmup: int
 
 def _curl(lr: float, target_interval: int, sizes: tuple[int, int], warmup: int) -> dict[str, Any]:
     """Settings of CURL (``scripts/run.sh`` and the defaults of ``train.py``)."""
-    agent = dict(hidden_dim=sizes[1], num_filters=sizes[0], num_layers=4, discount=0.99, init_temperature=0.1)
+    agent: dict[str, Any] = dict(
+        hidden_dim=sizes[1], num_filters=sizes[0], num_layers=4, discount=0.99, init_temperature=0.1
+    )
     agent |= dict(critic_lr=lr, actor_lr=lr, encoder_lr=lr, alpha_lr=1e-4, alpha_beta=0.5)
     agent |= dict(critic_tau=0.01, encoder_tau=0.05, critic_target_update_freq=target_interval)
     return {"agent": agent, "learning_starts": warmup, "batch_size": 128, "buffer_size": 100_000}
@@ -102,6 +106,21 @@ PEERS = {
         _curl(1e-3, 2, _THEIRS, 1000),
     ),
 }
+
+
+def peer_of(arm: str) -> str | None:
+    """Name the peer that an arm belongs to, if any."""
+    return next((name for name in PEERS if arm == name or arm.startswith(f"{name}_")), None)
+
+
+def trial_arms(peer: str) -> list[str]:
+    """Name the arms that are a peer's trials."""
+    return [f"{peer}_{trial}" for trial in PEERS[peer].trials]
+
+
+def is_trial(arm: str) -> bool:
+    """Whether an arm is one of a peer's trials."""
+    return any(arm in trial_arms(peer) for peer in PEERS)
 
 
 class CurlTraining(PublicTraining):
@@ -142,12 +161,13 @@ class DrQv2Training(PublicTraining):
         super().__init__(checkout, cell)
 
     def _set_up(self, checkout: Path, utils: Any, shape: tuple[int, ...], action_shape: tuple[int, ...]) -> None:
-        public, replay = (import_public(checkout, name) for name in ("drqv2", "replay_buffer"))
+        public: Any = import_public(checkout, "drqv2")
+        replay = import_public(checkout, "replay_buffer")
         public.Encoder = resized(public.Encoder, self.settings["n_filters"], utils.weight_init)
         self.agent = public.DrQV2Agent(shape, action_shape, th.device("cpu"), **self.settings["agent"])
         self.agent.aug.pad = round(self.agent.aug.pad * shape[1] / 84)
         self.utils, self.time_step = utils, import_public(checkout, "dmc").ExtendedTimeStep
-        self.folder = TemporaryDirectory()
+        self.folder, self.no_action = TemporaryDirectory(), np.zeros(action_shape, np.float32)
         fields = (
             specs.Array(shape, np.uint8, "observation"),
             specs.Array(action_shape, np.float32, "action"),
@@ -191,8 +211,7 @@ class DrQv2Training(PublicTraining):
 
     def _begin_episode(self, seed: int | None) -> np.ndarray:
         observation, _ = self.env.reset(seed=seed)
-        no_action = np.zeros(self.env.action_space.shape, np.float32)  # type: ignore[arg-type]
-        self.storage.add(self.time_step(StepType.FIRST, 0.0, 1.0, observation, no_action))
+        self.storage.add(self.time_step(StepType.FIRST, 0.0, 1.0, observation, self.no_action))
         return observation
 
     def _set_noise(self, step: int) -> None:
@@ -213,10 +232,12 @@ def resized(encoder: Any, filters: int, weight_init: Callable[[nn.Module], None]
     """
 
     class Encoder(encoder):
+        convnet: nn.Sequential
+
         def __init__(self, obs_shape: tuple[int, ...]):
             super().__init__(obs_shape)
             layers, channels = list[nn.Module](), obs_shape[0]
-            for layer in self.convnet:
+            for layer in self.convnet.children():
                 if isinstance(layer, nn.Conv2d):
                     layer = nn.Conv2d(channels, filters, layer.kernel_size, layer.stride)  # type: ignore[arg-type]
                     channels = filters

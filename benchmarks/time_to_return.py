@@ -8,10 +8,10 @@ Arms:
 
 - names of files in ``zoo_configs/fast/`` (``best``, ``curl``, ``sac_ae`` ...): ours;
 - ``public``: the authors' SAC-AE (as in ``public_returns.py``) with the profile's sizes of networks;
-- ``drqv2`` and ``public_curl``: the authors' code (``peers.py``) in the best of four trials, which have the profile's
-  sizes of networks and warm-up, two learning rates and two schedules. The trials are ``drqv2_{3e-4,1e-3}_{easy,medium}``
-  and ``public_curl_{1e-3,2e-3}_{slow,quick}`` on cartpole-swingup with seeds 0, 1, 2; the best one has the highest mean
-  return over the minutes of training. ``drqv2_own`` and ``public_curl_own``: in their own settings and sizes;
+- ``drqv2`` and ``public_curl``: the authors' code (``peers.py``) in the best of four trials. Trials have the profile's
+  sizes of networks and warm-up, and two learning rates by two schedules: ``drqv2_{3e-4,1e-3}_{easy,medium}`` and
+  ``public_curl_{1e-3,2e-3}_{slow,quick}``, on cartpole-swingup, seeds 0, 1, 2. The best one has the highest mean return
+  over the minutes of training. ``drqv2_own`` and ``public_curl_own``: in their own settings and sizes;
 - ``sb3_sac``: SB3's ``SAC("CnnPolicy")`` with its defaults; ``sb3_sac_our_sizes``: with our hidden layers, batch size,
   learning rate and warm-up.
 
@@ -33,7 +33,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from multiprocessing import get_context
 from pathlib import Path
@@ -41,29 +41,24 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import pandas as pd
 import torch as th
-from matplotlib.figure import Figure
-from scipy import stats
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks import public_returns
-from benchmarks.peers import PEERS, CurlTraining, DrQv2Training
+from benchmarks.peers import PEERS, CurlTraining, DrQv2Training, peer_of, trial_arms
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
+from benchmarks.time_summary import COLUMNS, OURS, best_trial, read_runs, write_summary
 from sb3_cure import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
-from sb3_cure.evaluation.plots import arm_colors, in_style, save
 from sb3_cure.evaluation.result_files import (
     Row,
     checkout_commit,
     describe_run,
-    read_rows,
     write_csv,
     write_json,
-    write_text,
 )
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
 from sb3_cure.experiments.grid import (
@@ -73,31 +68,17 @@ from sb3_cure.experiments.grid import (
     arm_settings,
     constructor_defaults,
     load_grid,
-    read_kept,
     short_name,
 )
-from sb3_cure.experiments.statistics import area_under_curve
-from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.networks.allocator import tune_allocator
 
 PUBLIC = public_returns.ARM
 SB3 = ("sb3_sac", "sb3_sac_our_sizes")
-#: The arm that the others are compared with
-OURS = "best"
 TASKS = ("cartpole-swingup", "reacher-easy", "finger-spin")
-TRIAL_TASK, TRIAL_SEEDS = "cartpole-swingup", (0, 1, 2)
-TARGETS = (300, 500, 700)
-#: Minutes after which returns are shown
-TIMES = (10, 30)
 #: More than half an hour's steps
 SB3_BUFFER_SIZE = 100_000
-COLUMNS = ("agent_steps", "environment_steps", "training_seconds", "return_mean", "return_std", "episodes", "limit")
-SUMMARY_COLUMNS = ("task", "arm", "target", "seeds", "reached", "median_minutes", "p_value", "minutes")
 #: One thread for each library that may start more
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
-#: Of the JSON files: conditions that the table names
-CONDITIONS = ("minutes", "budget", "eval_every", "eval_episodes", "machine", "commit")
-
 
 # Cells
 
@@ -130,16 +111,6 @@ def make_cell(arm: str, task: str, seed: int, out: Path) -> Cell:
     return cell
 
 
-def peer_of(arm: str) -> str | None:
-    """Name the peer that an arm belongs to, if any."""
-    return next((name for name in PEERS if arm == name or arm.startswith(f"{name}_")), None)
-
-
-def trial_arms(peer: str) -> list[str]:
-    """Name the arms that are a peer's trials."""
-    return [f"{peer}_{trial}" for trial in PEERS[peer].trials]
-
-
 def _peer_cell(cell: Cell, name: str, out: Path) -> Cell:
     peer, arm = PEERS[name], best_trial(out, name) if cell.method == name else cell.method
     known = {f"{name}_own": peer.own, **dict(zip(trial_arms(name), peer.trials.values(), strict=True))}
@@ -151,24 +122,6 @@ def _peer_cell(cell: Cell, name: str, out: Path) -> Cell:
     size = cell.env_kwargs["image_size"]
     larger = {**cell.env_kwargs, "image_size": 100 * size // 84}
     return replace(cell, arguments={**arguments, "image_size": size}, env_kwargs=larger)
-
-
-def best_trial(out: Path, peer: str) -> str:
-    """Choose a peer's settings.
-
-    :param out: Folder of all results
-    :param peer: A key of ``PEERS``
-    :return: The trial with the highest mean return over the minutes of training
-    :raises GridError: if a trial is missing
-    """
-    runs = read_runs(out).get(TRIAL_TASK, {})
-    trials = {arm: [runs.get(arm, {}).get(seed) for seed in TRIAL_SEEDS] for arm in trial_arms(peer)}
-    if missing := [arm for arm, seeds in trials.items() if None in seeds]:
-        raise GridError(
-            f"{peer} is the best of its trials, of which {', '.join(missing)} are missing: run these first on "
-            f"{TRIAL_TASK} with seeds {' '.join(map(str, TRIAL_SEEDS))}."
-        )
-    return max(trials, key=lambda arm: np.mean([run.mean_over_time for run in trials[arm] if run]))
 
 
 def settings_of(cell: Cell, minutes: float) -> dict[str, Any]:
@@ -378,239 +331,6 @@ def run_missing(out: Path, cells: Sequence[Cell], minutes: float, jobs: int, clo
     return [f"{cell.method}, seed {cell.seed}" for cell, well in zip(missing, done, strict=True) if not well]
 
 
-# Summary
-
-
-@dataclass(frozen=True)
-class Run:
-    """One finished cell.
-
-    :param rows: Of its CSV file
-    :param details: Its JSON file
-    """
-
-    rows: list[Row]
-    details: dict[str, Any]
-
-    @property
-    def limit(self) -> float:
-        """Limit in minutes of training."""
-        return self.details["minutes"]
-
-    @property
-    def minutes(self) -> np.ndarray:
-        """Minutes of training at each evaluation; the last one may come a step after the limit."""
-        return np.minimum([row["training_seconds"] / 60 for row in self.rows], self.limit)
-
-    @property
-    def returns(self) -> np.ndarray:
-        """Mean return of each evaluation."""
-        return np.array([row["return_mean"] for row in self.rows])
-
-    @property
-    def mean_over_time(self) -> float:
-        """Mean return over the minutes from 0 to the limit; the last evaluation holds where steps ended it before."""
-        minutes, returns = [0, *self.minutes, self.limit], [self.returns[0], *self.returns, self.returns[-1]]
-        return area_under_curve(np.array(minutes), np.array(returns))
-
-    def minutes_to(self, target: float) -> float | None:
-        """Find when a return is reached.
-
-        :param target: A return
-        :return: Minutes of training until the first evaluation that reaches it; None: not within the limits
-        """
-        reached = self.minutes[self.returns >= target]
-        return float(reached[0]) if len(reached) else None
-
-    def return_after(self, minutes: float) -> float:
-        """Find the return of the last evaluation until then.
-
-        :param minutes: Minutes of training
-        :return: Its mean; nan beyond the limit
-        """
-        return float(self.returns[self.minutes <= minutes][-1]) if minutes <= self.limit else float("nan")
-
-    def time_text(self, target: float) -> str:
-        """Format the minutes until a return is reached, or else the limit that ended training."""
-        minutes = self.minutes_to(target)
-        return f">{self.minutes[-1]:.1f} ({self.details['stopped_by']})" if minutes is None else f"{minutes:.1f}"
-
-
-#: Runs by seed, those by arm, and those by task
-Seeds = dict[int, Run]
-Runs = dict[str, dict[str, Seeds]]
-
-
-def read_runs(out: Path) -> Runs:
-    """Read the finished cells.
-
-    :param out: Folder of all results
-    :return: Runs by task, arm and seed
-    """
-    runs: Runs = {}
-    for path in sorted(out.glob("*/*/seed*.json")):
-        details, (task, arm) = read_kept(path), path.parts[-3:-1]
-        run = Run(read_rows(path.with_suffix(".csv"), COLUMNS), details)
-        runs.setdefault(task, {}).setdefault(arm, {})[details["seed"]] = run
-    return runs
-
-
-def times_to(seeds: Seeds, target: float) -> stats.CensoredData:
-    """Collect the minutes until a return is reached.
-
-    :param seeds: Runs of an arm
-    :param target: A return
-    :return: Times by seed, censored at the limit of minutes where it is not reached
-    """
-    minutes = [run.minutes_to(target) for run in seeds.values()]
-    times = [run.limit if each is None else each for run, each in zip(seeds.values(), minutes, strict=True)]
-    return stats.CensoredData.right_censored(times, [each is None for each in minutes])
-
-
-def median_time(data: stats.CensoredData) -> float | None:
-    """Estimate when half of the seeds have reached a return, by Kaplan and Meier's curve.
-
-    :param data: From ``times_to``
-    :return: Minutes; None if fewer than half reach it
-    """
-    curve = stats.ecdf(data).sf
-    reached = curve.quantiles[curve.probabilities <= 0.5 + 1e-9]
-    return float(reached[0]) if len(reached) else None
-
-
-def compare(ours: stats.CensoredData, theirs: stats.CensoredData) -> float:
-    """Test whether two arms differ in the times until they reach a return.
-
-    :param ours: From ``times_to``
-    :param theirs: Those of another arm
-    :return: p value of a log-rank test; 1 if no seed of either reaches it
-    """
-    if ours.num_censored() == len(ours) and theirs.num_censored() == len(theirs):
-        return 1.0
-    return float(stats.logrank(ours, theirs).pvalue)
-
-
-def summarise(runs: Runs) -> list[Row]:
-    """Summarise each arm on each task.
-
-    :param runs: Result of ``read_runs``
-    :return: Rows of ``summary.csv``
-    """
-    rows = []
-    for task, arms in runs.items():
-        for arm, seeds in arms.items():
-            for target in TARGETS:
-                data = times_to(seeds, target)
-                median, compares = median_time(data), OURS in arms and arm != OURS
-                values = (
-                    *(task, arm, target, len(data), len(data) - data.num_censored()),
-                    "not reached" if median is None else round(median, 2),
-                    round(compare(times_to(arms[OURS], target), data), 4) if compares else "",
-                    "; ".join(f"seed {seed}: {run.time_text(target)}" for seed, run in seeds.items()),
-                )
-                rows.append(dict(zip(SUMMARY_COLUMNS, values, strict=True)))
-    return rows
-
-
-def is_trial(arm: str) -> bool:
-    """Whether an arm is one of a peer's trials."""
-    return any(arm in trial_arms(peer) for peer in PEERS)
-
-
-def tables(runs: Runs) -> str:
-    """Write the tables.
-
-    :param runs: Result of ``read_runs``
-    :return: Medians and returns by arm, minutes of each seed, trials, and conditions, in Markdown
-    """
-    summary = summarise(runs)
-    found = {(row["task"], row["arm"], row["target"]): row for row in summary}
-    by_arm, trials = [], []
-    for task, arms in runs.items():
-        for arm, seeds in arms.items():
-            if is_trial(arm):
-                score = np.mean([run.mean_over_time for run in seeds.values()])
-                trials.append([arm, _seeds_text(seeds), f"{score:.1f}"])
-                continue
-            texts = [_median_text(found[task, arm, target]) for target in TARGETS]
-            for minutes in TIMES:
-                returns = np.array([run.return_after(minutes) for run in seeds.values()])
-                texts.append(NONE if np.isnan(returns).any() else f"{returns.mean():.0f} ± {returns.std():.0f}")
-            steps = np.mean([run.rows[-1]["agent_steps"] for run in seeds.values()])
-            cpu, wall = (
-                np.mean([run.details[f"training_{clock}"] for run in seeds.values()])
-                for clock in ("seconds", "wall_seconds")
-            )
-            by_arm.append(
-                [
-                    task,
-                    arm,
-                    _seeds_text(seeds),
-                    *texts,
-                    f"{1e3 * cpu / steps:.0f}",
-                    f"{cpu / 60:.1f}",
-                    f"{wall / 60:.1f}",
-                ]
-            )
-    columns = ["task", "arm", "seeds", *(f">{target}" for target in TARGETS)]
-    columns += [*(f">after {minutes} min" for minutes in TIMES), ">ms per agent step", ">CPU minutes", ">wall minutes"]
-    note = (
-        "Median over seeds of the CPU minutes of training until the return is reached, how many seeds reach it, and the "
-        f"p value of a log-rank test against {OURS}. Then mean and deviation over seeds of the return after so many "
-        "minutes, and the times of training, means over seeds: of an agent step (warm-up included), and of all."
-    )
-    by_seed = [[row["task"], row["arm"], str(row["target"]), row["minutes"]] for row in summary]
-    details = [run.details for arms in runs.values() for seeds in arms.values() for run in seeds.values()]
-    conditions = [f"{key}: {', '.join(sorted({str(each[key]) for each in details}))}" for key in CONDITIONS]
-    parts = [
-        Table("Minutes to a return", pd.DataFrame(by_arm, columns=columns), note),
-        Table(
-            "Trials",
-            pd.DataFrame(trials, columns=["arm", "seeds", ">mean return over time"]),
-            "The best of each peer's has its name above.",
-        ),
-        Table("Each seed", pd.DataFrame(by_seed, columns=["task", "arm", ">return", "minutes"]), "; ".join(conditions)),
-    ]
-    head = "# Time to a return\n\n![Return over minutes of training](time_to_return.png)\n"
-    return "\n".join((head, *(each.markdown() for each in parts if len(each.rows))))
-
-
-def _seeds_text(seeds: Seeds) -> str:
-    return ", ".join(map(str, seeds))
-
-
-def _median_text(row: Row) -> str:
-    text = f"{row['median_minutes']} ({row['reached']} of {row['seeds']})"
-    return text if row["p_value"] == "" else f"{text}, p {row['p_value']:.2g}"
-
-
-@in_style
-def draw(path: Path, runs: Runs) -> None:
-    """Draw the return over minutes of training: thin lines are seeds, thick ones their mean while all of them train.
-
-    :param path: File to write
-    :param runs: Result of ``read_runs``
-    """
-    figure = Figure(figsize=(1 + 5 * len(runs), 4.8))
-    shown = {task: {arm: seeds for arm, seeds in arms.items() if not is_trial(arm)} for task, arms in runs.items()}
-    colors = arm_colors(list(dict.fromkeys(arm for arms in shown.values() for arm in arms)), OURS)
-    handles = {}
-    for axes, (task, arms) in zip(figure.subplots(1, len(runs), squeeze=False).flat, shown.items(), strict=True):
-        for arm, seeds in arms.items():
-            for run in seeds.values():
-                axes.plot(run.minutes, run.returns, color=colors[arm], alpha=0.35, linewidth=0.7)
-            first, last = max(run.minutes[0] for run in seeds.values()), min(run.minutes[-1] for run in seeds.values())
-            grid = np.linspace(first, last, 400)
-            mean = np.mean([np.interp(grid, run.minutes, run.returns) for run in seeds.values()], axis=0)
-            (handles[arm],) = axes.plot(grid, mean, color=colors[arm], linewidth=2.4)
-        for target in TARGETS:
-            axes.axhline(target, color="#333333", linestyle="--", linewidth=0.9, alpha=0.7, zorder=1)
-        labels = {"xlabel": "CPU minutes of training", "ylabel": "return (deterministic actions)"}
-        axes.set(title=f"{task}, one thread", **labels, xlim=(0, None), ylim=(0, None))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, min(len(handles), 6)))
-    save(figure, path, 120)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the cells that are missing, then summarise all.
 
@@ -632,29 +352,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time (default: 1)")
     parser.add_argument("--summarise-only", action="store_true", help="run nothing")
     options = parser.parse_args(arguments)
-    failed = list[str]()
-    if not options.summarise_only:
-        clones = {PUBLIC: options.public, "drqv2": options.drqv2, "public_curl": options.curl}
-        for arm in options.arms:
-            if clones.get(peer_of(arm) or arm, Path()) is None:
-                parser.error(f"{arm} needs the folder of its clone: give --{(peer_of(arm) or arm).split('_')[-1]}")
-        limits = {"budget": options.steps, "eval_every": options.every, "eval_episodes": options.episodes}
-        try:
-            cells = [
-                replace(make_cell(arm, task, seed, options.out), **limits)
-                for task in options.tasks
-                for seed in options.seeds
-                for arm in options.arms
-            ]
-            failed = run_missing(options.out, cells, options.minutes, options.jobs, clones)
-        except GridError as error:
-            parser.error(str(error))
-    runs = read_runs(options.out)
+    arms = [] if options.summarise_only else options.arms
+    clones = {PUBLIC: options.public, "drqv2": options.drqv2, "public_curl": options.curl}
+    for arm in arms:
+        name = peer_of(arm) or arm
+        if name in clones and clones[name] is None:
+            parser.error(f"{arm} needs the folder of its clone: give --{name.removeprefix('public_')}")
+    limits = {"budget": options.steps, "eval_every": options.every, "eval_episodes": options.episodes}
+    try:
+        cells = [
+            replace(make_cell(arm, task, seed, options.out), **limits)
+            for task in options.tasks
+            for seed in options.seeds
+            for arm in arms
+        ]
+        failed = run_missing(options.out, cells, options.minutes, options.jobs, clones)
+        runs = read_runs(options.out)
+    except GridError as error:
+        parser.error(str(error))
     if runs:
-        write_csv(options.out / "summary.csv", SUMMARY_COLUMNS, summarise(runs))
-        write_text(options.out / "table.md", tables(runs))
-        draw(options.out / "time_to_return.png", runs)
-        print((options.out / "table.md").read_text())
+        print(write_summary(options.out, runs))
     for name in failed:
         print(f"{name} failed: run this again, and it begins anew")
     return int(bool(failed))
