@@ -22,7 +22,7 @@ from PIL import Image
 
 import sb3_cure
 from sb3_cure.evaluation import plots
-from sb3_cure.experiments import published, statistics, tables
+from sb3_cure.experiments import statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
 from sb3_cure.experiments.tables import (
     NONE,
@@ -37,8 +37,6 @@ from sb3_cure.experiments.tables import (
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
 
 THRESHOLDS = (250.0, 500.0, 750.0)
-#: With more arms than these, each is compared with the baseline only
-PAIRS_UP_TO = 5
 #: Optional files of a cell
 MEDIA = ("task_policy.mp4", "curious_policy.mp4", "reconstructions.png", "uncomfortable.png", "curiosity_map.png")
 
@@ -189,9 +187,6 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
             for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
                 if means := [row.mean for row in errors if (row.task, row.head) == (task, other)]:
                     values[label] = float(np.mean(means))
-            theirs = published.SRL_ERROR.get(published.task_key(task))
-            if theirs and experiment.sees_published_pixels:
-                values["paper's cure"] = theirs["curious"].mean
         if bars:
             caption = render_text("visitation_bars", head, {label for values in lines.values() for label in values})
             parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
@@ -253,19 +248,7 @@ def _comparison(
         headlines.append(render_text("nothing_shared", experiment.baseline))
     else:
         headlines.append(render_text("one_arm"))
-    if pairs := list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []:
-        note = "As above, over all tasks."
-        parts.append(tables.difference_table(experiment, pairs, note=note, compared="between any two arms"))
-    try:
-        found = statistics.aggregate(experiment)
-    except ResultsError as error:
-        return headlines, [*parts, f"No aggregates: {error}"]
-    if found is None:
-        return headlines, [*parts, render_text("no_aggregates")]
-    iqm = {method: (each.value, each.low or 0.0, each.high or 0.0) for method, each in found.iqm.items()}
-    caption, drawn = render_text("aggregate_scores"), (iqm, found.taus, found.profiles)
-    parts.append(_figure("aggregates", caption, plots.aggregate_scores, *drawn, colors))
-    return headlines, [*parts, tables.aggregate_table(experiment, found)]
+    return headlines, parts
 
 
 def _difference_parts(
@@ -286,14 +269,6 @@ def _difference_parts(
     yield tables.difference_table(experiment, differences)
     finals = statistics.paired_differences(experiment, "finals")
     yield tables.difference_table(experiment, finals, "final return", "As above.")
-
-
-def _all_pairs(experiment: Experiment) -> Iterator[statistics.PairedDifference]:
-    """Any two arms, the later minus the earlier, over all tasks that both have."""
-    for index, other in enumerate(experiment.methods):
-        rows = statistics.paired_differences(experiment, baseline=other)
-        for method in experiment.methods[index + 1 :]:
-            yield from [row for row in rows if row.method == method][:1]
 
 
 def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, list[Part]]]:
@@ -326,11 +301,8 @@ def write_report(
     :return: The files that were written
     :raises ResultsError: with one sentence that names the file and what is wrong
     """
-    experiments = read_results(results)
-    sections = [describe(experiment, thresholds, media) for experiment in experiments]
-    compared = published.compare_with_published(experiments)
-    table = tables.published_table(compared) if compared else None
-    facts = {"title": results.resolve().name, "sections": sections, "comparisons": table, "media": media}
+    sections = [describe(experiment, thresholds, media) for experiment in read_results(results)]
+    facts = {"title": results.resolve().name, "sections": sections, "media": media}
     facts |= {"version": sb3_cure.__version__, "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
     texts = {
         out: tables.render("report.html.j2", **facts),
