@@ -43,7 +43,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from benchmarks import public_returns
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
-from sb3_cure import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.plots import arm_colors, in_style, save
@@ -57,7 +56,7 @@ from sb3_cure.evaluation.result_files import (
     write_text,
 )
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
-from sb3_cure.experiments.grid import Cell, GridError, constructor_defaults, load_grid, read_kept
+from sb3_cure.experiments.grid import Cell, GridError, load_grid, read_kept
 from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.networks.allocator import tune_allocator
 
@@ -97,7 +96,7 @@ def make_cell(arm: str, seed: int, steps: int, every: int, episodes: int) -> Cel
     if arm in SB3:
         arguments = {"policy": "CnnPolicy", "buffer_size": SB3_BUFFER_SIZE}
         if arm == "sb3_sac_our_sizes":
-            known = {**constructor_defaults(CuReSAC), **cell.arguments}
+            known = {"learning_rate": 1e-3, "batch_size": 128, **cell.arguments}  # the former by default
             arguments |= {name: known[name] for name in ("learning_rate", "learning_starts", "batch_size")}
             arguments["policy_kwargs"] = {"net_arch": known["policy_kwargs"]["net_arch"]}
         cell = replace(cell, arguments=arguments)

@@ -267,7 +267,7 @@ class PolicyVideoCallback(RolloutCallback):
             (episode,) = self.run(actor, render=True)
             path = self._path(self.folder, f"{actor}_policy_{steps}_steps.mp4")
             title = f"{actor} policy, {self._actions}, after {steps:,} agent steps"
-            video.write_video(path, episode, self.fps, repeat, title)
+            video.write_video(path, {title: episode}, self.fps, repeat)
 
 
 class ReconstructionCallback(PeriodicCallback):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import IO, Literal, TypeAlias
 
 import numpy as np
+import torch as th
 from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -15,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from PIL import Image
 
+from sb3_cure.cure.reconstructions import newest_frames
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
 from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 
@@ -178,40 +180,6 @@ def paired_differences(
     # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
     reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
     axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
-    save(figure, path)
-
-
-@in_style
-def aggregate_scores(
-    path: PathOrFile,
-    iqm: Mapping[str, tuple[float, float, float]],
-    taus: np.ndarray,
-    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
-    colors: Mapping[str, str],
-) -> None:
-    """
-    Interquartile means (left) and performance profiles (right) with their intervals.
-
-    :param path: File to write
-    :param iqm: By arm: value, low, high
-    :param taus: Scores at which the profiles are read, [n]
-    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
-    :param colors: By arm
-    """
-    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))))
-    left, right = figure.subplots(1, 2)
-    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
-        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
-        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
-    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
-    left.invert_yaxis()
-    ends = [end for _, *ends in iqm.values() for end in ends]
-    pad = 0.06 * (max(ends) - min(ends)) or 0.05
-    left.set(xlabel="interquartile mean of the final score", title="IQM", xlim=(min(ends) - pad, max(ends) + pad))
-    for arm, (share, lower, upper) in profiles.items():
-        right.step(taus, share, where="post", color=colors[arm], label=_plain(arm))
-        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
-    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
     save(figure, path)
 
 
@@ -392,13 +360,9 @@ def highest_error_frames(
     :param frame_stack: Frames per observation, of which the newest is shown
     :param title: Title of the figure
     :param drawn: Their reconstructions, shown on the right of each, uint8 like ``found.observations``, or None
-    :raises ValueError: if ``frame_stack`` does not divide the channels into frames, grey or in colour
     """
-    n_channels = found.observations.shape[1]
-    channels, left_over = divmod(n_channels, frame_stack)
-    if left_over or channels not in (1, 3, 4):
-        raise ValueError(f"frame_stack={frame_stack} does not divide {n_channels} channels into frames of 1 or 3.")
-    pairs = [found.observations] if drawn is None else [found.observations, drawn]
+    shown = [found.observations] if drawn is None else [found.observations, drawn]
+    pairs = [newest_frames(th.as_tensor(images), frame_stack).numpy() for images in shown]
     columns = min(len(found.errors), 8 if drawn is None else 4)
     n_rows = -(-len(found.errors) // columns)
     figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5))
@@ -408,8 +372,7 @@ def highest_error_frames(
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
         # A white column on the right of each frame
         _show(
-            grid[index],
-            [np.pad(images[index, -channels:], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs],
+            grid[index], [np.pad(images[index], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs]
         )
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"

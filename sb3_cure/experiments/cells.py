@@ -23,7 +23,7 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import ALGOS, DONE, SETTINGS, Cell, GridError, constructor_defaults, read_kept
+from sb3_cure.experiments.grid import ALGOS, DONE, SETTINGS, Cell, GridError, read_kept
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -324,15 +324,13 @@ class _Record(BaseCallback):
         """Conditions under which the results were obtained.
 
         :param model: The cell's model
-        :return: Versions, machine, arguments as the model has them, times, attempts
+        :return: Versions, machine, times, attempts
         """
         self._begin_attempt(model)
-        names = constructor_defaults(type(model))
         return {
             **describe_run(),
             "device": str(model.device),
             "precision": getattr(model, "_computed_precision", "fp32"),
-            "arguments": {name: getattr(model, name) for name in names if hasattr(model, name)},
             "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),

@@ -3,7 +3,6 @@
 import contextlib
 import copy
 import importlib
-import inspect
 import json
 import pkgutil
 import re
@@ -161,6 +160,9 @@ class GridFile(_Part):
         self.baseline = self.baseline or next(iter(self.methods))
         if len({short_name(task) for task in self.tasks}) < len(self.tasks):
             raise ValueError("two tasks would share a folder: write a grid for each, named differently")
+        for name, method in self.methods.items():
+            if method.pretrain is None and not (method.train and self.budget):
+                raise ValueError(f"method {name!r} neither trains nor pretrains: add pretrain, or train it")
         for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
             if name not in self.methods:
                 raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
@@ -314,24 +316,6 @@ def _changes_rewards(wrapper: Any) -> bool:
     return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper | gym.wrappers.NormalizeReward)
 
 
-def constructor_defaults(algorithm: type) -> dict[str, Any]:
-    """Default values of a constructor's arguments, but for the seed.
-
-    :param algorithm: Class of an algorithm that passes unknown arguments on to its bases
-    :return: Values by name
-    """
-    defaults: dict[str, Any] = {}
-    for cls in inspect.getmro(algorithm):
-        parameters = inspect.signature(vars(cls)["__init__"]).parameters if "__init__" in vars(cls) else {}
-        for name, parameter in parameters.items():
-            if parameter.default is not parameter.empty and not name.startswith("_"):
-                defaults.setdefault(name, parameter.default)
-        if parameters and all(each.kind is not each.VAR_KEYWORD for each in parameters.values()):
-            break
-    defaults.pop("seed", None)
-    return defaults
-
-
 def read_kept(path: Path) -> dict[str, Any]:
     """Read a JSON file in the folder of results.
 
@@ -400,7 +384,8 @@ def load_grid(
         for task in file.tasks
         for arm, method in file.methods.items()
     )
-    _check_arms_together(arms, path)
+    if file.kind == "visitation":
+        _check_pixels(arms, path)
     of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
     cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
     description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump()}
@@ -457,15 +442,11 @@ def _merged(mapping: Any, overrides: Any) -> Any:
     return {**mapping, **{key: _merged(mapping.get(key), value) for key, value in overrides.items()}}
 
 
-def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
-    """Refuse arms that train nothing, or that end in an error after everything is trained."""
-    seen: dict[str, dict[str, Any]] = {}
+def _check_pixels(arms: Sequence[Cell], path: Path) -> None:
+    """Refuse arms that see other pixels than those by which common heads judge them."""
+    first: dict[str, dict[str, Any]] = {}
     for cell in arms:
-        if cell.budget == 0 and cell.pretrain is None:
-            raise GridError(
-                f"method {cell.method!r} in {path} neither trains nor pretrains: add pretrain, or train it."
-            )
-        if cell.kind == "visitation" and seen.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
+        if first.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
             raise GridError(
                 f"methods in {path} differ in env_kwargs on {cell.task}, but common heads judge all alike: give them "
                 "the same, or write a grid for each."
@@ -512,7 +493,6 @@ def check_arms(cells: Iterable[Cell]) -> None:
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
         try:
             with contextlib.closing(cell.make_env()) as env, untouched_randomness(th.device("cpu")):
-                _warn_of_endless_episodes(env, cell.task)
                 if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
                     raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
                 cell.make_model(env, device="cpu", buffer_size=1)
@@ -521,9 +501,3 @@ def check_arms(cells: Iterable[Cell]) -> None:
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise GridError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error
-
-
-def _warn_of_endless_episodes(env: gym.Env, task: str) -> None:
-    limits = ("_max_episode_steps", "max_episode_steps", "physics")  # episodes of dm_control end by themselves
-    if not any(map(env.has_wrapper_attr, limits)):
-        print(f"{task} has no time limit: an evaluation never ends if its episodes do not end by themselves.")

@@ -66,7 +66,7 @@ class Figure:
             return image.size
 
 
-Part: TypeAlias = Table | Figure | str
+Part: TypeAlias = Table | Figure
 
 
 @dataclass(frozen=True)

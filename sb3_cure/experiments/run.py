@@ -34,7 +34,7 @@ def run_grid(
     pictures: bool = True,
     address: str | None = None,
     cpus_per_cell: float = 1,
-    gpus_per_cell: float | None = None,
+    gpus_per_cell: float = 0,
     retries: int = 3,
 ) -> list[Unit]:
     """Run the cells that are not done; after an interruption, the same call continues.
@@ -48,8 +48,7 @@ def run_grid(
     :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
-    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
-        only where no machine has a GPU: Ray would start a cell per core, all on the first card
+    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU
     :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, if the grid cannot be run
@@ -162,9 +161,8 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
         reason = " ".join(str(error).split())
         raise GridError(f"Ray does not connect to --address {address!r} ({reason}).") from None
     try:
-        _check_resources(ray.nodes(), resources)
         # One process per unit, so that nothing of a unit burdens the next.
-        remote = ray.remote(max_calls=1, **{**resources, "num_gpus": resources["num_gpus"] or 0})(_run_on_worker)
+        remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
 
         def run_all(units: Sequence[Unit], settings: Settings) -> list[Unit]:
             pending = {remote.remote(unit, settings, bool(resources["num_gpus"])): unit for unit in units}
@@ -188,17 +186,6 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
         yield run_all
     finally:
         ray.shutdown()
-
-
-def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
-    """Refuse cells that fit on no machine, which would wait for ever, and GPUs that Ray would not share out."""
-    for kind, amount in {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"]}.items():
-        flag = f"--{kind.lower()}s-per-cell"
-        largest = max((node["Resources"].get(kind, 0) for node in nodes if node["Alive"]), default=0)
-        if amount is None and largest > 0:
-            raise GridError(f"The cluster has GPUs: give {flag}, the share of one per cell (0: compute on the CPU).")
-        if amount is not None and amount > largest:
-            raise GridError(f"{flag} is {amount:g}, but no machine of the cluster has more than {largest:g}.")
 
 
 # ---------------------------------------------------------------- progress
@@ -264,7 +251,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
     add("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
-    add("--gpus-per-cell", type=float, help="Ray: share of a GPU per cell, such as 0.25; 0: compute on the CPU")
+    add("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell (default: 0, compute on the CPU)")
     add("--retries", type=int, default=3, help="Ray: new starts of a cell after its worker died")
     add("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     add("--no-pictures", dest="pictures", action="store_false", help="neither draw nor film")
@@ -282,14 +269,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = vars(parser.parse_args(arguments))
     if "" not in sys.path:
         sys.path.append("")  # a grid may name a class of a module in the working directory
-    ray_only = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
-    given = [name for name in ray_only if options[name] != parser.get_default(name)]
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
     try:
         grid = load_grid(path, **choice)
-        if options["engine"] == "local" and given:
-            raise GridError(f"--{given[0].replace('_', '-')} needs --engine ray.")
         if dry_run:
             check_grid(grid, out)
             print("\n".join(status_lines([*grid.cells, *common_heads(grid, out, grid.cells)], out)), flush=True)
