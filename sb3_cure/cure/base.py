@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -320,10 +320,10 @@ class CuReBase(OffPolicyAlgorithm):
         queue: list[Any] = [initialised]
         for each in queue:
             queue += [*getattr(each, "callbacks", []), *filter(None, [getattr(each, "callback", None)])]
-            if isinstance(each, EvalCallback) and share_environment(each.eval_env, self.env):
+            if share_environment(getattr(each, "eval_env", None), self.env):
                 raise ValueError(
-                    "EvalCallback evaluates in the training environment, so that transitions are stored that never "
-                    "happened: give it an eval_env of its own."
+                    f"{type(each).__name__} evaluates in the training environment, so that transitions are stored that "
+                    "never happened: give it an eval_env of its own."
                 )
         return initialised
 

@@ -3,7 +3,7 @@
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Literal, TypeAlias
+from typing import IO, TypeAlias
 
 import numpy as np
 import torch as th
@@ -24,8 +24,6 @@ from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 STYLE = Path(__file__).with_name("plots.mplstyle")
 #: Colour of each policy
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
-#: Line style of each policy, if colours stand for arms
-LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
 _ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
 
@@ -90,6 +88,7 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
 
 
+@in_style
 def learning_curves(
     path: PathOrFile,
     curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
@@ -106,36 +105,13 @@ def learning_curves(
     :param ylabel: What the values are
     :param logarithmic: Whether the values have a logarithmic axis
     """
-    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
-    policy_curves(path, of_task, colors, ylabel, logarithmic)
-
-
-@in_style
-def policy_curves(
-    path: PathOrFile,
-    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-    logarithmic: bool,
-    actors: Sequence[str] = (),
-) -> None:
-    """
-    As ``learning_curves``, with arms by colour and policies by line style.
-
-    :param path: File to write
-    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
-    :param colors: By arm
-    :param ylabel: What the values are
-    :param logarithmic: Whether the values have a logarithmic axis
-    :param actors: Policies that the legend names
-    """
     figure, panels = _panels(len(curves), height=2.9)
     seeds: dict[str, set[int]] = {}
     for axes, (task, lines) in zip(panels, curves.items(), strict=True):
-        for (arm, actor), (steps, values) in lines.items():
+        for arm, (steps, values) in lines.items():
             seeds.setdefault(arm, set()).add(len(values))
             mean = values.mean(axis=0)
-            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor])
+            axes.plot(steps, mean, color=colors[arm])
             if len(values) > 1:
                 std = values.std(axis=0, ddof=1)
                 low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
@@ -147,7 +123,6 @@ def policy_curves(
     for arm, counts in seeds.items():
         n = " to ".join(map(str, sorted({min(counts), max(counts)})))
         handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], color=colors[arm])
-    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
     _legend(figure, handles)
     save(figure, path)
 
@@ -371,9 +346,7 @@ def highest_error_frames(
         axes.set_axis_off()
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
         # A white column on the right of each frame
-        _show(
-            grid[index], [np.pad(images[index], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs]
-        )
+        _show(grid[index], [np.pad(images[index], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs])
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
     note += f", and its multiple of the buffer's mean of {found.mean_error:.3g}; ages in agent steps"

@@ -17,13 +17,14 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import ALGOS, DONE, SETTINGS, Cell, GridError, read_kept
+from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, GridError, read_kept
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -157,7 +158,7 @@ class _CellRun:
         if not ExactCheckpoint.exists(path):
             return None
         try:
-            return ALGOS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
+            return ALGORITHMS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
         except ValueError as error:
             aside = path.with_name(f"unusable-{time.time_ns()}")
             print(f"{self.folder} starts anew, its checkpoints are kept in {aside.name}: {error}")

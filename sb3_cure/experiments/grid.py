@@ -17,16 +17,14 @@ import torch as th
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
-from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
+from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, zoo_file
+from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.counting import CellInfo
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
 #: Empty file of a finished cell
 DONE = "DONE"
-#: Algorithms by the name of rl-zoo's ``--algo``
-ALGOS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
 #: Keys of ``config.json`` that decide what is trained, and are compared before results are mixed
 SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
 #: Arguments that may name a class of the user's, as ``"my_module.MyClass"``
@@ -117,7 +115,7 @@ class Method(_Part):
 
     :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
     :param overrides: Changes of the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
-    :param algo: A key of ``ALGOS``
+    :param algo: A key of ``ALGORITHMS``
     :param pretrain: The phase before training, if any
     :param train: Whether the task is learned at all
     :param baseline: Another method, from which its difference is taken instead of from the grid's baseline
@@ -190,7 +188,7 @@ class Cell:
     :param env_kwargs: Arguments of ``gymnasium.make``
     :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
-    :param algo: A key of ``ALGOS``
+    :param algo: A key of ``ALGORITHMS``
     :param coverage: Cells of the true state to count, if any
     """
 
@@ -271,7 +269,7 @@ class Cell:
         :param changes: Arguments instead of its own
         :return: The model before training
         """
-        return ALGOS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
+        return ALGORITHMS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
 
     def is_done(self, results: Path) -> bool:
         """Whether it has been run.

@@ -13,12 +13,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 
+from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_progress
-from sb3_cure.experiments.grid import ALGOS, Cell, Grid, read_kept, short_name
+from sb3_cure.experiments.grid import Cell, Grid, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
 #: Updates of a common head
@@ -49,11 +50,10 @@ class CommonHeads:
         """Their folder below the folder of results."""
         return Path(self.grid.experiment, short_name(self.task), "common_heads")
 
-    def seeds(self, results: Path, coming: Sequence[Cell] = ()) -> dict[int, list[Cell]]:
+    def seeds(self, results: Path) -> dict[int, list[Cell]]:
         """All arms by seed, of the seeds of which all arms are finished and have kept their model.
 
         :param results: Folder of all results
-        :param coming: Cells to regard as finished
         :return: Cells by seed
         """
         arms: dict[int, list[Cell]] = {}
@@ -62,7 +62,7 @@ class CommonHeads:
                 arms.setdefault(cell.seed, []).append(cell)
 
         def is_ready(cell: Cell) -> bool:
-            return cell in coming or (cell.is_done(results) and (results / cell.folder / "model.zip").exists())
+            return cell.is_done(results) and (results / cell.folder / "model.zip").exists()
 
         return {seed: cells for seed, cells in arms.items() if all(map(is_ready, cells))}
 
@@ -87,17 +87,16 @@ class CommonHeads:
 Unit: TypeAlias = Cell | CommonHeads
 
 
-def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list[CommonHeads]:
+def common_heads(grid: Grid, results: Path) -> list[CommonHeads]:
     """Common heads of the chosen tasks that have two seeds to fit them to.
 
     :param grid: A grid
     :param results: Folder of all results
-    :param coming: Cells to regard as finished
     :return: One for each such task; none in grids of another kind than ``"visitation"``
     """
     tasks = dict.fromkeys(cell.task for cell in grid.cells if grid.kind == "visitation")
     every = [CommonHeads(grid, task, COMMON_UPDATES, COMMON_SHARE) for task in tasks]
-    return [heads for heads in every if len(heads.seeds(results, coming)) > 1]
+    return [heads for heads in every if len(heads.seeds(results)) > 1]
 
 
 def run_heads(heads: CommonHeads, results: Path) -> None:
@@ -139,7 +138,7 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
     """The episodes of ``measure_visits`` again by policy, without the known policies."""
     path = results / cell.folder / "model.zip"
-    model = ALGOS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
+    model = ALGORITHMS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
     env = cell.make_eval_env()
     for actor in visiting_actors(model, cell):
         if actor not in known:
@@ -165,7 +164,7 @@ def _judge(cell: Cell) -> CuReSAC:
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
     env = cell.make_eval_env()
-    model: CuReSAC = ALGOS[cell.algo](
+    model: CuReSAC = ALGORITHMS[cell.algo](
         arguments["policy"],
         env,
         srl="rae",

@@ -147,20 +147,12 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
     for column, name, label, logarithmic in (
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
         ("srl_loss", "srl_loss", "SRL loss", True),
+        ("task_srl_error", "task_srl_error", "SRL error\n(deterministic actions)", True),
+        ("curious_srl_error", "curious_srl_error", "SRL error\n(deterministic actions)", True),
     ):
         if curves := _stacked(experiment, column):
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
-    errors: dict[str, dict[tuple[str, str], Curves]] = {}
-    for actor in ("task", "curious"):
-        for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
-            errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
-    if errors:
-        found = {actor for lines in errors.values() for _, actor in lines}
-        actors = [actor for actor in plots.LINE_STYLES if actor in found]
-        label = "SRL error\n(deterministic actions)"
-        caption = render_text("srl_error", list(errors), actors)
-        yield _figure("srl_error", caption, plots.policy_curves, errors, colors, label, True, actors)
 
 
 def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str, dict[str, Curves]]:

@@ -103,14 +103,7 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 
 
 def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
-    left, failed = list(units), []
-    while left:
-        # Units of other processes come last: common heads wait for them.
-        left.sort(key=lambda unit: is_held(settings[0] / unit.folder))
-        unit = left.pop(0)
-        if not _run_unit(unit, *settings):
-            failed.append(unit)
-    return failed
+    return [unit for unit in units if not _run_unit(unit, *settings)]
 
 
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
@@ -275,7 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         grid = load_grid(path, **choice)
         if dry_run:
             check_grid(grid, out)
-            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out, grid.cells)], out)), flush=True)
+            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out)], out)), flush=True)
             return 0
         failed = run_grid(grid, out, **options)
     except GridError as error:
