@@ -217,20 +217,10 @@ def open_files(pid: int) -> set[Path]:
     return {link.resolve() for link in Path(f"/proc/{pid}/fd").iterdir()}
 
 
-def test_cluster_that_does_not_fit_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused before anything is written: too few cores, and cards that nobody asks for."""
-    pytest.importorskip("ray")
-    grid, out = load_grid(write_grid(tmp_path)), tmp_path / "out"
-    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 2, "CPU": 2}')
-    for wanted, sentence in (
-        (dict(cpus_per_cell=999), "--cpus-per-cell is 999, but no machine of the cluster has more than 2"),
-        (dict(), "The cluster has GPUs: give --gpus-per-cell"),
-    ):
-        with pytest.raises(GridError, match=sentence):
-            run.run_grid(grid, out, engine="ray", **wanted)
+def test_unknown_engine_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GridError, match="engine must be one of local, ray"):
-        run.run_grid(grid, out, engine="rya")
-    assert not out.exists()
+        run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="rya")
+    assert not (tmp_path / "out").exists()
 
 
 def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
