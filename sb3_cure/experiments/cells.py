@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import platform
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -33,8 +32,6 @@ from sb3_cure.persistence import ExactCheckpoint
 EVAL_SEED = 10_000
 #: File with the traceback of a failed cell, until it is started again
 ERROR = "error.txt"
-#: Seconds between two writes of ``progress.json``, and between two printed lines
-PROGRESS_SECONDS, PRINT_SECONDS = 2.0, 120.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
     "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
@@ -144,7 +141,6 @@ class _CellRun:
             except Exception as error:  # the results are complete without them
                 print(f"{self.folder} lacks some of its pictures: {type(error).__name__}: {error}")
         record.write_tables()
-        record.report(self.model, force=True)
         write_json(self.folder / "run.json", record.conditions(self.model))
         write_text(self.folder / DONE, "")
 
@@ -157,13 +153,7 @@ class _CellRun:
         cell, path = self.cell, self.checkpoints.path
         if not ExactCheckpoint.exists(path):
             return None
-        try:
-            return ALGORITHMS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
-        except ValueError as error:
-            aside = path.with_name(f"unusable-{time.time_ns()}")
-            print(f"{self.folder} starts anew, its checkpoints are kept in {aside.name}: {error}")
-            path.rename(aside)
-            return None
+        return ALGORITHMS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
 
 
 class _TimedCheckpoint(ExactCheckpoint):
@@ -174,7 +164,7 @@ class _TimedCheckpoint(ExactCheckpoint):
     """
 
     def __init__(self, path: Path, minutes: float):
-        super().__init__(save_freq=1, path=path, keep=2)
+        super().__init__(save_freq=1, path=path, keep=2, verbose=1)
         self.seconds = 60 * minutes
         self._due_at = np.inf
 
@@ -190,7 +180,7 @@ class _TimedCheckpoint(ExactCheckpoint):
 
 
 class _Record(BaseCallback):
-    """Evaluate between two agent steps, when all updates are made, and report progress.
+    """Evaluate between two agent steps, when all updates are made.
 
     Its records are plain attributes, which checkpoints keep.
 
@@ -214,8 +204,7 @@ class _Record(BaseCallback):
         self.loss_sum, self.n_losses = th.zeros(()), 0
         #: Sum of the rewards of all transitions that training has collected
         self.rewards_met = 0.0
-        self._now = self._printed_at = time.monotonic()
-        self._reported_at = -np.inf
+        self._now = time.monotonic()
         self._has_begun = False
 
     def state_dict(self) -> dict[str, Any]:
@@ -254,7 +243,6 @@ class _Record(BaseCallback):
         if self.evaluates:
             self.rewards_met += float(np.sum(self.locals["rewards"]))
         self._tick()
-        self.report(self.model)  # type: ignore[arg-type]
         return True
 
     def _on_rollout_start(self) -> None:
@@ -305,21 +293,11 @@ class _Record(BaseCallback):
             row["rewards_met"] = round(self.rewards_met, 3)
         self.evaluations.append(row)
         self.write_tables()
+        print(f"{self.folder}: {row['environment_steps']:,} of {self.cell.budget:,} environment steps", flush=True)
 
     def write_tables(self) -> None:
         write_csv(self.folder / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(self.folder / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
-
-    def report(self, model: CuReSAC, force: bool = False) -> None:
-        """Write ``progress.json``, unless that was done a moment ago, and print it now and then."""
-        now = time.monotonic()
-        if force or now - self._reported_at >= PROGRESS_SECONDS:
-            cell, self._reported_at = self.cell, now
-            done = model.num_timesteps * self.action_repeat + (cell.pretraining_steps if self.evaluates else 0)
-            total = cell.pretraining_steps + cell.budget
-            prints = now - self._printed_at >= PRINT_SECONDS
-            self._printed_at = now if prints else self._printed_at
-            write_progress(self.folder, done, total, self.seconds, prints)
 
     def conditions(self, model: CuReSAC) -> dict[str, Any]:
         """Conditions under which the results were obtained.
@@ -392,23 +370,6 @@ def is_held(folder: Path) -> bool:
     except OSError:
         return False
     return False
-
-
-def write_progress(folder: Path, done: int, total: int, seconds: float, prints: bool = False) -> None:
-    """Write ``progress.json`` for displays, which may be other processes or machines; errors are ignored.
-
-    :param folder: Folder of the cell
-    :param done: Steps or updates so far
-    :param total: All of them
-    :param seconds: Seconds so far
-    :param prints: Whether to print it, too
-    """
-    left = f", about {(total - done) * seconds / done / 60:.0f} min left" if done else ""
-    text = f"{done:,} of {total:,}{left}"
-    with contextlib.suppress(OSError):
-        write_json(folder / "progress.json", {"text": text, "time": time.time(), "machine": platform.node()})
-    if prints:
-        print(f"{folder}: {text}", flush=True)
 
 
 def _now() -> str:

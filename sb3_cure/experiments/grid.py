@@ -212,11 +212,6 @@ class Cell:
         """Its folder below the folder of results."""
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
 
-    @property
-    def pretraining_steps(self) -> int:
-        """Environment steps before training."""
-        return self.pretrain.budget if self.pretrain else 0
-
     def build_arguments(self) -> dict[str, Any]:
         """Copy ``arguments``, as SB3 writes into some, and import the classes that they name."""
         arguments = copy.deepcopy(self.arguments)

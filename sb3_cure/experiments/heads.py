@@ -4,7 +4,6 @@ The common head of a seed is an autoencoder that is fitted to an even mix of the
 curious policies of the task's *other* seeds. The heads of a task are a unit of work like a cell, with their own folder.
 """
 
-import time
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, srl_errors
-from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_progress
+from sb3_cure.experiments.cells import ERROR, alone_in
 from sb3_cure.experiments.grid import Cell, Grid, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
@@ -117,14 +116,12 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
         fingerprint, seeds = heads.fingerprint(results), heads.seeds(results)
         mixes = {seed: _mix(cells, heads.share, results) for seed, cells in seeds.items()}
         tables: dict[Path, list[Row]] = {}
-        begun, reported, total = time.monotonic(), -np.inf, heads.updates * len(seeds)
-        for index, (seed, cells) in enumerate(seeds.items()):
+        for seed, cells in seeds.items():
             judge = _judge(cells[0])
             others = np.concatenate([mixes[other] for other in mixes if other != seed])
-            for number in fit_head(judge, others, heads.updates):
-                if (now := time.monotonic()) - reported > PROGRESS_SECONDS:
-                    reported = now
-                    write_progress(folder, heads.updates * index + number, total, now - begun)
+            for _ in fit_head(judge, others, heads.updates):
+                pass
+            print(f"{heads.folder}: the head of seed {seed} is fitted", flush=True)
             for cell in cells:
                 path = results / cell.folder / "visitation.csv"
                 kept = [row for row in read_rows(path) if row["head"] != "common"]
@@ -132,7 +129,6 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
         for path, rows in tables.items():
             write_csv(path, COLUMNS, rows)
         write_json(folder / RECORD, {**fingerprint, **describe_run()})
-        (folder / "progress.json").unlink(missing_ok=True)
 
 
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:

@@ -307,11 +307,8 @@ def write_report(
         files[folder / "table.md"] = text.encode()
         files |= {folder / part.name: part.content for part in section.parts if isinstance(part, Figure)}
     for path, content in files.items():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        except OSError as error:
-            raise ResultsError(f"{path} cannot be written ({error.strerror}).") from None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
     return list(files)
 
 
@@ -319,7 +316,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure report``.
 
     :param argv: Command line, ``sys.argv`` by default
-    :return: 0, or 1 if the results cannot be read or the report cannot be written
+    :return: 0, or 1 if the results cannot be read
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

@@ -2,17 +2,15 @@
 
 import argparse
 import os
-import platform
 import re
 import sys
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sb3_cure.evaluation.result_files import write_json, write_text
+from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import Grid, GridError, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
@@ -148,11 +146,7 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     except ImportError:
         raise GridError('engine="ray" needs Ray, which is not installed: pip install "sb3-cure[cluster]".') from None
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
-    try:
-        ray.init(address=address or "local", **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:  # also where RAY_AUTH_TOKEN is missing
-        reason = " ".join(str(error).split())
-        raise GridError(f"Ray does not connect to --address {address!r} ({reason}).") from None
+    ray.init(address=address or "local", **own)
     try:
         # One process per unit, so that nothing of a unit burdens the next.
         remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
@@ -185,7 +179,9 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
 
 
 def status_lines(units: Sequence[Unit], results: Path) -> list[str]:
-    """State of each unit, and of those that have begun how far they are.
+    """State of each unit, and of cells that have begun their last evaluation.
+
+    Locks of other machines may be invisible: their cells read "interrupted" then.
 
     :param units: Cells and common heads
     :param results: Folder of all results
@@ -198,14 +194,16 @@ def _status(unit: Unit, results: Path) -> str:
     folder = results / unit.folder
     if unit.is_done(results):
         return "done"
-    if not (folder / "progress.json").exists():
-        return "running" if is_held(folder) else "failed" if (folder / ERROR).exists() else "waiting"
-    progress = read_kept(folder / "progress.json")
-    # Locks of other machines may be invisible; evaluations and bursts of updates report nothing for a while.
-    reports = progress["machine"] != platform.node() and time.time() - progress["time"] < 600
-    is_running = is_held(folder) or reports
-    state = "running" if is_running else "failed" if (folder / ERROR).exists() else "interrupted"
-    return f"{state}, {progress['text']}"
+    if is_held(folder):
+        state = "running"
+    elif (folder / ERROR).exists():
+        state = "failed"
+    else:
+        state = "interrupted" if (folder / "config.json").exists() else "waiting"
+    if not (folder / "eval.csv").exists():
+        return state
+    steps = read_rows(folder / "eval.csv")[-1]["environment_steps"]
+    return f"{state}, evaluated at {steps:,} environment steps"
 
 
 # ---------------------------------------------------------------- command line

@@ -304,17 +304,7 @@ def test_vectors_beside_drawn_images_are_normalised(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ environments that do not fit
 
 
-class Robot:
-    """An adapter that is no Gymnasium wrapper."""
-
-    def __init__(self, env: gym.Env):
-        self.hardware = env
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.hardware, name)
-
-
-@pytest.mark.parametrize("share", [lambda env: env, Filmed, lambda env: Filmed(TimeLimit(env, 9)), Robot])
+@pytest.mark.parametrize("share", [lambda env: env, Filmed, lambda env: Filmed(TimeLimit(env, 9))])
 @pytest.mark.parametrize("wrap", [lambda env: env, lambda env: VecNormalize(DummyVecEnv([lambda: Monitor(env)]))])
 def test_training_environment_is_refused_for_evaluation(share: Any, wrap: Any) -> None:
     """Also within wrappers: it would store transitions that never happened."""

@@ -283,23 +283,6 @@ def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest
     assert read_rows(folder / "episodes.csv") == before and steps_of(folder) == [0, 160]
 
 
-def test_damaged_checkpoint_is_put_aside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """The cell starts anew instead of failing for ever, and says why."""
-    cell = only_cell(tmp_path, budget=120)
-    with monkeypatch.context() as full:
-        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            run_cell(cell, tmp_path, 0, pictures=False)
-    for path in (tmp_path / cell.folder / "checkpoint").rglob("model.zip"):
-        path.write_bytes(path.read_bytes()[:1000])
-    folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "its checkpoints are kept in unusable-" in capsys.readouterr().out
-    assert list(folder.glob("unusable-*/**/model.zip"))
-    assert steps_of(folder) == [0, 120] and cell.is_done(tmp_path)
-
-
 def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second one is refused while the first runs."""
     cell = only_cell(tmp_path, budget=40)

@@ -59,7 +59,8 @@ def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int,
     }
     path = write_grid(tmp_path, budget=own, methods=methods)
     grid = load_grid(path, budget=asked)
-    assert [(cell.budget, cell.pretraining_steps) for cell in grid.cells] == [(asked, 0), expected, (0, expected[1])]
+    budgets = [(cell.budget, cell.pretrain.budget if cell.pretrain else 0) for cell in grid.cells]
+    assert budgets == [(asked, 0), expected, (0, expected[1])]
     described = grid.description["methods"]
     assert "pretrain" not in described["none"] and grid.description["budget"] == asked
     assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}

@@ -84,20 +84,26 @@ def test_other_settings_in_the_folder_are_refused(tmp_path: Path) -> None:
     assert described["seeds"] == [0, 7, 8] and described["methods"].keys() == {"cure", "further"}
 
 
-def test_progress_of_other_machines_is_trusted(tmp_path: Path) -> None:
-    """Their locks may be invisible here; of this machine only a held lock counts."""
+def test_states_of_cells(tmp_path: Path) -> None:
+    """Of a cell that has begun also how far it is."""
     (cell,) = load_grid(write_grid(tmp_path)).cells
     folder = tmp_path / cell.folder
     folder.mkdir(parents=True)
-    assert run.status_lines([cell], tmp_path) == [f"{cell.folder}: waiting"]
-    cells.write_progress(folder, 8, 400, 2.0)
-    here = json.loads((folder / "progress.json").read_text())
-    states = []
-    for change in ({}, {"machine": "another"}, {"machine": "another", "time": here["time"] - 3600}):
-        (folder / "progress.json").write_text(json.dumps({**here, **change}))
-        states.append(run.status_lines([cell], tmp_path)[0].partition(": ")[2])
-    progress = "8 of 400, about 2 min left"
-    assert states == [f"interrupted, {progress}", f"running, {progress}", f"interrupted, {progress}"]
+
+    def state() -> str:
+        return run.status_lines([cell], tmp_path)[0].partition(": ")[2]
+
+    assert state() == "waiting"
+    (folder / "config.json").touch()
+    assert state() == "interrupted"
+    (folder / "eval.csv").write_text("environment_steps\n0\n1600\n")
+    assert state() == "interrupted, evaluated at 1,600 environment steps"
+    with cells.alone_in(folder):
+        assert state() == "running, evaluated at 1,600 environment steps"
+    (folder / "error.txt").touch()
+    assert state().startswith("failed")
+    (folder / "DONE").touch()
+    assert state() == "done"
 
 
 # ------------------------------------------------------------------- processes
