@@ -152,10 +152,9 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 
 def register() -> None:
-    """Register ``cure_sac`` and ``cure_tqc`` with rl-zoo3's programs, experiment manager and samplers."""
+    """Register ``cure_sac`` and ``cure_tqc`` with rl-zoo3's programs, and this experiment manager."""
     ALGOS.update(ALGORITHMS)
     for name in ALGORITHMS:
-        HYPERPARAMS_SAMPLER[name] = partial(sample_params, quantiles=name == "cure_tqc")
         HYPERPARAMS_CONVERTER[name] = convert_params
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc, attr-defined]
 
@@ -167,7 +166,6 @@ def train(arguments: Sequence[str]) -> None:
         ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
-    _find_modules_here()
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
@@ -277,7 +275,6 @@ def _load(
     parser: argparse.ArgumentParser, args: argparse.Namespace, render_mode: str | None
 ) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
     """The model with the smallest replay buffer, its run's environment, and its path."""
-    _find_modules_here()
     module, _, task = args.env.rpartition(":")
     for package in [*args.gym_packages, *([module] if module else [])]:
         importlib.import_module(package)
@@ -328,9 +325,3 @@ def _play(model: OffPolicyAlgorithm, env: VecEnv, args: argparse.Namespace) -> l
                 print(f"Episode Reward: {episode['r']:.2f}, Episode Length: {episode['l']}")
                 episodes.append(episode)
     return episodes
-
-
-def _find_modules_here() -> None:
-    """Let the user name classes and environments of the working directory."""
-    if "" not in sys.path:
-        sys.path.append("")

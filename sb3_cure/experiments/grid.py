@@ -281,7 +281,6 @@ class Grid:
 
     :param experiment: Its name, the folder of its results
     :param kind: Decides what the report shows
-    :param baseline: The arm that others are compared with, unless they name a ``baseline`` of their own
     :param cells: The chosen cells, seed by seed, so that whole comparisons are finished early
     :param arms: A cell of each method on each task of the file
     :param description: The whole file, whatever was chosen of it: the content of ``grid.json``
@@ -289,7 +288,6 @@ class Grid:
 
     experiment: str
     kind: str
-    baseline: str
     cells: tuple[Cell, ...]
     arms: tuple[Cell, ...]
     description: dict[str, Any]
@@ -366,23 +364,17 @@ def load_grid(
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
     file.seeds = sorted({*file.seeds, *chosen})
-    of_tasks = _choose(tasks, {**{short_name(task): task for task in file.tasks}, **{t: t for t in file.tasks}}, path)
-    of_arms = _choose(methods, {name: name for name in file.methods}, path)
-    arms = tuple(
-        Cell(
-            *(file.experiment, file.kind, task, arm, chosen[0], file.budget if method.train else 0),
-            *(file.evaluation.every, file.evaluation.episodes, *_settings(path, task, method)),
-            *(method.pretrain, method.algo, file.coverage),
-        )
-        for task in file.tasks
-        for arm, method in file.methods.items()
+    of_tasks = _choose(
+        tasks, {short_name(task): task for task in file.tasks} | {task: task for task in file.tasks}, path
     )
+    of_arms = _choose(methods, {name: name for name in file.methods}, path)
+    arms = tuple(_arm(file, path, task, name) for task in file.tasks for name in file.methods)
     if file.kind == "visitation":
         _check_pixels(arms, path)
     of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
     cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
     description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump()}
-    return Grid(file.experiment, file.kind, file.baseline, cells, arms, description)
+    return Grid(file.experiment, file.kind, cells, arms, description)
 
 
 def _find(name: str | Path, folder: Path) -> Path:
@@ -415,18 +407,34 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
     file.budget = budget
 
 
-def _settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
-    """``n_envs``, ``env_kwargs`` and arguments of an arm on a task: the zoo file's entry with the grid's overrides."""
+def _arm(file: GridFile, path: Path, task: str, name: str) -> Cell:
+    """Cell of an arm on a task, with the zoo file's entry and the grid's overrides; its seed is the file's first."""
+    method = file.methods[name]
     config = path.parent / _find(method.config, ZOO)
-    entries, name = _read_yaml(config), task.rpartition(":")[2]
-    found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
+    entries, own = _read_yaml(config), task.rpartition(":")[2]
+    found = [key for key in (task, own, own.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
     if not found:
         raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
     entry = {"policy": "CnnPolicy", **entries[found[0]]}
     for key, value in method.overrides.items():
         entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
-    return entry.pop("n_envs", 1), entry.pop("env_kwargs", {}), entry
+    return Cell(
+        experiment=file.experiment,
+        kind=file.kind,
+        task=task,
+        method=name,
+        seed=file.seeds[0],
+        budget=file.budget if method.train else 0,
+        eval_every=file.evaluation.every,
+        eval_episodes=file.evaluation.episodes,
+        n_envs=entry.pop("n_envs", 1),
+        env_kwargs=entry.pop("env_kwargs", {}),
+        arguments=entry,
+        pretrain=method.pretrain,
+        algo=method.algo,
+        coverage=file.coverage,
+    )
 
 
 def _merged(mapping: Any, overrides: Any) -> Any:

@@ -258,8 +258,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = vars(parser.parse_args(arguments))
-    if "" not in sys.path:
-        sys.path.append("")  # a grid may name a class of a module in the working directory
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
     try:
