@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -150,29 +151,31 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     try:
         # One process per unit, so that nothing of a unit burdens the next.
         remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
-
-        def run_all(units: Sequence[Unit], settings: Settings) -> list[Unit]:
-            pending = {remote.remote(unit, settings, bool(resources["num_gpus"])): unit for unit in units}
-            failed = []
-            while pending:
-                for reference in ray.wait(list(pending), timeout=5)[0]:
-                    unit = pending.pop(reference)
-                    error = ""
-                    try:
-                        succeeded = ray.get(reference)
-                    except ray.exceptions.RayError as died:  # more often than `retries`
-                        succeeded, error = False, f"{died}\n"
-                    if succeeded and not (settings[0] / unit.folder).exists():
-                        error = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
-                    if error:
-                        _write_error(unit, settings[0], error)
-                    if error or not succeeded:
-                        failed.append(unit)
-            return failed
-
-        yield run_all
+        yield partial(_run_remotely, remote, bool(resources["num_gpus"]))
     finally:
         ray.shutdown()
+
+
+def _run_remotely(remote: Any, has_gpu: bool, units: Sequence[Unit], settings: Settings) -> list[Unit]:
+    import ray
+
+    results, failed = settings[0], []
+    pending = {remote.remote(unit, settings, has_gpu): unit for unit in units}
+    while pending:
+        for reference in ray.wait(list(pending), timeout=5)[0]:
+            unit = pending.pop(reference)
+            try:
+                succeeded = ray.get(reference)
+            except ray.exceptions.RayError as died:  # more often than `retries`
+                succeeded = False
+                _write_error(unit, results, f"{died}\n")
+            if succeeded and not (results / unit.folder).exists():
+                succeeded = False
+                error = f"{results} on the worker's machine is another folder than here: share one (--out)"
+                _write_error(unit, results, error)
+            if not succeeded:
+                failed.append(unit)
+    return failed
 
 
 # ---------------------------------------------------------------- progress
@@ -200,10 +203,10 @@ def _status(unit: Unit, results: Path) -> str:
         state = "failed"
     else:
         state = "interrupted" if (folder / "config.json").exists() else "waiting"
-    if not (folder / "eval.csv").exists():
+    evaluations = read_rows(folder / "eval.csv") if (folder / "eval.csv").exists() else []
+    if not evaluations:
         return state
-    steps = read_rows(folder / "eval.csv")[-1]["environment_steps"]
-    return f"{state}, evaluated at {steps:,} environment steps"
+    return f"{state}, evaluated at {evaluations[-1]['environment_steps']:,} environment steps"
 
 
 # ---------------------------------------------------------------- command line
