@@ -122,29 +122,29 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
     if len(updates) and not updates.any():
         headlines.insert(0, render_text("untrained"))
+    parts += curve_figures(experiment, colors)
     if explored := _stacked(experiment, "cells", at_least=1):
-        if grown := _stacked(experiment, "cells"):
-            label, caption = "cells of the true state\nreached in training", render_text("cells_reached", list(grown))
-            parts.append(_figure("cells_reached", caption, plots.learning_curves, grown, colors, label))
         parts.append(tables.cells_reached_table(experiment, explored))
         headlines += _exploration_headlines(experiment, list(explored))
-    parts += curve_figures(experiment, colors)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
         headlines += compared
-        parts = [tables.pretraining_table(experiment)] * (experiment.kind == "pretraining") + parts + more
+        if experiment.kind == "pretraining":
+            parts.insert(0, tables.pretraining_table(experiment))
+        parts += more
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
 
 
 def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
-    """Draw return, SRL loss and SRL error of the policies over training.
+    """Draw cells reached, return, SRL loss and SRL error of the policies over training.
 
     :param experiment: An experiment
     :param colors: By arm
     :return: Figures of those that were recorded
     """
     for column, name, label, logarithmic in (
+        ("cells", "cells_reached", "cells of the true state\nreached in training", False),
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
         ("srl_loss", "srl_loss", "SRL loss", True),
         ("task_srl_error", "task_srl_error", "SRL error\n(deterministic actions)", True),
@@ -226,7 +226,8 @@ def _comparison(
     differences = statistics.paired_differences(experiment)
     parts: list[Part] = [tables.curves_table(experiment, thresholds)]
     met = tables.rewards_met_table(experiment)
-    parts += [met] * (len(met.rows) > 0)
+    if len(met.rows):
+        parts.append(met)
     several = {row.method for row in differences if row.task is None}
     headlines = []
     for row in differences:
