@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_cure.envs import make_dmc_env, make_pixel_env
 from sb3_cure.persistence import ResumableEnv, read_state, write_state
-from sb3_cure.persistence.env_state import load_vec_env_state, restore_error, vec_env_state
+from sb3_cure.persistence.env_state import load_vec_env_state, saved_error, vec_env_state
 
 #: Tasks that change terrain, targets, gains, weights, sizes and obstacles at reset
 TASKS = [
@@ -85,7 +85,7 @@ def follow(venv: VecEnv, steps: list[np.ndarray]) -> list[Any]:
 
 def saved(venv: VecEnv) -> bytes:
     """File of the state, which must be whole."""
-    assert restore_error(venv) is None
+    assert saved_error(vec_env_state(venv)) is None
     write_state(file := io.BytesIO(), vec_env_state(venv))
     return file.getvalue()
 
@@ -267,7 +267,7 @@ def test_worker_processes_continue_with_their_random_streams() -> None:
 def test_unreachable_layers_in_workers_are_reported(make: Callable[[], gym.Env]) -> None:
     """Without a wrapper of ours, and with one that has others around it."""
     venv = SubprocVecEnv([make], start_method="fork")
-    assert "need sb3_cure.persistence.ResumableEnv as their outermost wrapper" in str(restore_error(venv))
+    assert "need sb3_cure.persistence.ResumableEnv as their outermost wrapper" in str(saved_error(vec_env_state(venv)))
     venv.close()
 
 
@@ -334,7 +334,7 @@ def test_shared_objects_of_two_layers_are_reported() -> None:
 
     venv = DummyVecEnv([lambda: Remembers(Dot())])
     venv.reset()
-    assert "under two names" in str(restore_error(venv))
+    assert "under two names" in str(saved_error(vec_env_state(venv)))
 
 
 def test_own_dm_control_task_is_reported() -> None:
@@ -345,7 +345,7 @@ def test_own_dm_control_task_is_reported() -> None:
 
     venv = dmc("cartpole", "balance", 0)
     venv.envs[0].unwrapped._env._task = OwnTask(False, False)  # type: ignore[attr-defined]
-    assert restore_error(venv) == "the task OwnTask is not one of dm_control.suite"
+    assert saved_error(vec_env_state(venv)) == "the task OwnTask is not one of dm_control.suite"
 
 
 def test_state_of_other_environments_is_refused() -> None:

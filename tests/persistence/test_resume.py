@@ -452,7 +452,7 @@ def test_frames_are_written_once(tmp_path: Path) -> None:
     ring = model.replay_buffer.rings[""]
     frame_bytes = int(np.prod(ring.frame_shape))
     segments = read_state(kept.folder(numbers[-1]) / "state.safetensors")["segments"][""]
-    for name, first, last in segments:
+    for name, first, last, _ in segments:
         assert kept.segments.joinpath(name).stat().st_size == (last - first) * frame_bytes
     assert all(one[2] == other[1] for one, other in itertools.pairwise(segments))
     # No more is kept than the ring holds and what the older generations and the oldest segment need.
@@ -474,10 +474,10 @@ def test_frames_of_each_image_are_written_once(tmp_path: Path) -> None:
     assert state["segments"].keys() == buffer.rings.keys() == {"front", "wrist"}
     for key, ring in buffer.rings.items():
         spans = state["segments"][key]
-        assert [first for _, first, _ in spans][1:] == [last for *_, last in spans[:-1]]
+        assert [first for _, first, *_ in spans][1:] == [last for *_, last, _ in spans[:-1]]
         assert spans[-1][2] == buffer.counts[key] and len(spans) >= 5
         frame = int(np.prod(ring.frame_shape))
-        assert all(sizes[name] == (last - first) * frame for name, first, last in spans)
+        assert all(sizes[name] == (last - first) * frame for name, first, last, _ in spans)
     resumed: Any = CuReSAC.resume(tmp_path, env(), device="cpu")
     rows, env_inds, _ = stored_places(buffer)
     found: Any
