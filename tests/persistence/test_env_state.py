@@ -306,7 +306,7 @@ NOT_KEPT: dict[str, Callable[[], gym.Env]] = {
     "Dot keeps one object or memory under two names": holding(first=ARRAY, view=ARRAY[1:]),
     "keeps one object or memory under two names": holding(first=LIST, inside={"second": LIST}),
     "in the memory of another object": holding(mapped=np.frombuffer(bytearray(8), np.uint8)),
-    "order in memory": holding(turned=np.ones((2, 3)).T),
+    "not in C's order": holding(turned=np.ones((2, 3)).T),
     r"Dot\.bound is the function .*Simulator\.run": holding(bound=Simulator().run),
     "Broken.*'missing'": Broken,
 }
