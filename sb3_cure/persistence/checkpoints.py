@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -16,7 +15,7 @@ from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
 from sb3_cure.persistence.files import flush_to_disk
 from sb3_cure.persistence.generations import CheckpointError, Generations
-from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state, can_be_kept
+from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
 from sb3_cure.persistence.resume import Run, training_state
 
 MODEL, STATE = "model.zip", "state.safetensors"
@@ -57,14 +56,13 @@ class CheckpointWriter:
         segments: dict[str, list[_Segment]] = {}
         with self.generations.writing(keep) as draft:
             model.save(draft.folder / MODEL)
-            rings = _rings_of(buffer)
-            for place, (key, ring) in enumerate(rings.items()):
+            for place, (key, ring) in enumerate(buffer.rings.items()):
                 segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{draft.number:06d}")
                 draft.sums.update({f"../segments/{each.name}": each.digest for each in segments[key]})
             state["buffer"] = buffer_state(buffer, frames=False)
             state["segments"] = {key: [list(each) for each in own] for key, own in segments.items()}
             write_state(draft.folder / STATE, state)
-        self.rings, self.segments = rings, segments
+        self.rings, self.segments = buffer.rings, segments
         return state
 
     def _write_frames(self, ring: FrameRing, last: int, key: str, suffix: str) -> list[_Segment]:
@@ -92,14 +90,14 @@ class CheckpointWriter:
         :return: Training state
         :raises CheckpointError: if it is of another number of environments
         """
-        state = read_state(folder / STATE, copy=False)
+        state = read_state(folder / STATE)
         if model.n_envs != state["n_envs"]:
             raise CheckpointError(
                 f"resume got {model.n_envs} environments, but {folder} was written with {state['n_envs']}: give as "
                 "many."
             )
         buffer = model.replay_buffer = buffer_from_state(model, state.pop("buffer"), str(folder))
-        self.rings = _rings_of(buffer)
+        self.rings = buffer.rings
         self.segments = {key: [_Segment(*each) for each in own] for key, own in state.pop("segments").items()}
         for key, ring in self.rings.items():
             for segment in self.segments[key]:
@@ -109,11 +107,6 @@ class CheckpointWriter:
                     for piece in ring.pieces(first, segment.last):
                         file.readinto(piece)
         return state
-
-
-def _rings_of(buffer: ReplayBuffer) -> dict[str, FrameRing]:
-    """List the rings of frames by the key of their image; of observations that are no dictionary, under ``""``."""
-    return buffer.rings if isinstance(buffer, FrameStackReplayBuffer) else {}
 
 
 class ExactCheckpoint(BaseCallback):
@@ -182,9 +175,11 @@ class ExactCheckpoint(BaseCallback):
         name = type(self.model).__name__
         if not isinstance(getattr(self.model, "_run", None), Run):
             raise ValueError(f"ExactCheckpoint needs an algorithm that can resume, not {name}: use CheckpointCallback.")
-        buffer = type(self.model.replay_buffer)  # type: ignore[attr-defined]
-        if not can_be_kept(buffer):
-            raise ValueError(f"ExactCheckpoint cannot save a {buffer.__name__} without pickle: use another buffer.")
+        if type(self.model.replay_buffer) is not FrameStackReplayBuffer:  # type: ignore[attr-defined]
+            raise ValueError(
+                f"ExactCheckpoint saves a FrameStackReplayBuffer alone: give {name} "
+                "replay_buffer_class=FrameStackReplayBuffer, replay_buffer_kwargs=dict(frame_stack=1)."
+            )
         path = self.path.resolve()
         if path not in self._run.writers and self.exists(path):
             raise CheckpointError(

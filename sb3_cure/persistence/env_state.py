@@ -7,8 +7,8 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
 2. DeepMind Control tasks of the suite: MuJoCo's integration state, what the task changed in the model, its random
    stream, the step count.
 3. Plain attributes: numbers, strings, arrays, NumPy's generators, and containers of these. Functions, classes and
-   spaces must be the same in an environment that is built in the same way. State in class attributes, in module
-   variables or on the side of a library is not seen.
+   spaces are those of the new environment. State in class attributes, in module variables or on the side of a library
+   is not seen.
 
 A layer with any other attribute, or with one object under two names (which would be two after loading), makes its
 environment begin a new episode; what the other layers keep, such as running statistics, is restored all the same.
@@ -165,7 +165,7 @@ def _call_each(venv: VecEnv, method: str, arguments: list[Any] | None = None) ->
     given = [()] * venv.num_envs if arguments is None else [(each,) for each in arguments]
     if isinstance(base, DummyVecEnv):
         return [getattr(ResumableEnv(env), method)(*own) for env, own in zip(base.envs, given, strict=False)]
-    if not isinstance(base, SubprocVecEnv):
+    if not isinstance(base, SubprocVecEnv) or not given:
         return []
     if not all(text.startswith(f"<{ResumableEnv.__name__}<") for text in base.env_method("__str__")):
         raise NotKept(
@@ -223,13 +223,10 @@ def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, An
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
-    functions, values = {}, {}
+    values = {}
     for key, value in attributes.items():
-        if key in no_state or isinstance(value, EnvSpec | gym.Space) or any(value is other for other in layers):
-            continue
-        if function := _stateless_name(value):
-            functions[key] = function
-        else:
+        is_built = isinstance(value, EnvSpec | gym.Space) or _is_stateless(value)
+        if key not in no_state and not is_built and not any(value is other for other in layers):
             encode(value, f"{name}.{key}", {})
             values[key] = value
     if own is None and not type(layer).__module__.startswith(_KNOWN):
@@ -238,7 +235,7 @@ def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, An
     encode(own, f"{name}.state_dict()", {})
     drawn = {key: [part._np_random for part in _parts(space)] for key, space in _spaces(layer).items()}
     # A copy, as the environment may write into its own
-    return copy.deepcopy({"own": own, "attributes": values, "functions": functions, "spaces": drawn})
+    return copy.deepcopy({"own": own, "attributes": values, "spaces": drawn})
 
 
 def _load_layers(layers: list[Any], states: list[dict[str, Any]]) -> str | None:
@@ -254,9 +251,6 @@ def _load_layers(layers: list[Any], states: list[dict[str, Any]]) -> str | None:
 
 
 def _load_layer(layer: Any, state: dict[str, Any]) -> None:
-    for key, function in state["functions"].items():
-        if _stateless_name(vars(layer).get(key)) != function:
-            raise NotKept(f"{key} was {function}")
     for key, generators in state["spaces"].items():
         for space, generator in zip(_parts(getattr(layer, key)), generators, strict=True):
             space._np_random = generator
@@ -296,16 +290,15 @@ def _inside(value: Any) -> Iterable[Any]:
     return value if isinstance(value, list | tuple | set | deque) else ()
 
 
-def _stateless_name(value: Any) -> str:
-    """Name of a function or class that keeps nothing; empty for all else."""
+def _is_stateless(value: Any) -> bool:
+    """Check that a value is a function or class that keeps nothing."""
     if isinstance(value, np.ufunc | np.dtype) or inspect.isclass(value):
-        return str(value)
-    module = getattr(value, "__module__", None) or ""
+        return True
     owner = getattr(value, "__self__", None)
     is_free = getattr(value, "__closure__", None) is None and (owner is None or inspect.ismodule(owner))
     # Functions that Gymnasium's wrappers make hold their constructor's arguments alone.
-    is_stateless = inspect.isroutine(value) and (is_free or module.startswith("gymnasium."))
-    return f"{module}.{value.__qualname__}" if is_stateless else ""
+    is_gymnasium = (getattr(value, "__module__", None) or "").startswith("gymnasium.")
+    return inspect.isroutine(value) and (is_free or is_gymnasium)
 
 
 def _check_sharing(values: Iterable[Any], name: str) -> None:
@@ -325,11 +318,11 @@ def _check_sharing(values: Iterable[Any], name: str) -> None:
             if value.dtype.kind not in "biu" and not value.flags.c_contiguous:
                 raise NotKept(f"{name} has an array that is not in C's order, on which sums over it depend")
             while isinstance(value.base, np.ndarray):
-                value = value.base  # noqa: PLW2901
+                value = value.base
             if value.base is not None and value.flags.writeable:
                 raise NotKept(f"{name} has an array in the memory of another object")
         if isinstance(value, th.Tensor):
-            value = value.untyped_storage()  # noqa: PLW2901
+            value = value.untyped_storage()
         identity = value.data_ptr() if isinstance(value, th.UntypedStorage) else id(value)
         if identity in met and not isinstance(value, tuple):
             raise NotKept(f"{name} keeps one object or memory under two names")

@@ -62,8 +62,8 @@ class FiniteCheck(VecEnvWrapper):
         """
         self.n_steps += self.num_envs
         with self._checking_originals():
-            observations, *rest = self._step_wait(self.venv, self._normalizer is not None)
-        return copy.deepcopy(observations), *rest
+            observations, rewards, dones, infos = self._step_wait(self.venv, self._normalizer is not None)
+        return copy.deepcopy(observations), rewards, dones, infos
 
     @contextlib.contextmanager
     def _checking_originals(self) -> Iterator[None]:

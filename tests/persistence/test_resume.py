@@ -38,7 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from benchmarks import faults
 from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.data.buffers import FrameRing, stored_places, transitions
+from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer, stored_places, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -324,6 +324,9 @@ class SafeTD3(Persistence, TD3):
 def test_other_algorithms_continue_bit_for_bit(tmp_path: Path) -> None:
     """The mixin needs nothing of CuReSAC."""
     arguments: Any = dict(learning_starts=5, buffer_size=60, seed=0, device="cpu", policy_kwargs=dict(net_arch=[4]))
+    with pytest.raises(ValueError, match="replay_buffer_class=FrameStackReplayBuffer"):
+        SafeTD3("MlpPolicy", vectors(), **arguments).learn(40, callback=ExactCheckpoint(8, tmp_path))
+    arguments |= dict(replay_buffer_class=FrameStackReplayBuffer, replay_buffer_kwargs=dict(frame_stack=1))
     results = []
     for name in ("whole", "killed"):
         model = SafeTD3("MlpPolicy", vectors(), **arguments)
