@@ -63,7 +63,7 @@ TESTS = {
 #: Operators that replace each other; "Delete" removes a sign or a negation
 ALIKE = ("Add Sub Mul Div FloorDiv Mod Pow", "BitOr BitAnd BitXor", "Eq NotEq Lt LtE Gt GtE", "Is IsNot", "UAdd USub")
 #: CPU seconds of a mutant, so that other work on the machine changes nothing; twenty times as long if it just waits
-LIMIT = 120
+LIMIT = 600
 _FIELDS = ("file", "function", "operator", "code", "id", "line", "place", "kind", "occurrence")
 COLUMNS = ("id", "file", "line", "function", "operator", "code", "mutant", "outcome", "test", "cpu_seconds", "reason")
 

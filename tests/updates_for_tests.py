@@ -27,6 +27,7 @@ def filled_model(algorithm: str = "sac", pixels: bool = False, **kwargs: Any) ->
     if algorithm == "tqc":
         policy_kwargs = {"n_quantiles": 5, **policy_kwargs}
     defaults = dict(learning_starts=40, learning_rate=0.1, tau=0.0, encoder_tau=0.0, curiosity_prob=0.0)
+    defaults |= dict(intrinsic="srl_error")
     policy, env = ("CnnPolicy", PixelBox()) if pixels else ("MlpPolicy", VectorBox())
     arguments = {**defaults, **kwargs, "policy_kwargs": policy_kwargs}
     return tiny_model(policy, env, ALGORITHMS[algorithm], **arguments).learn(40)

@@ -63,7 +63,6 @@ class SRLError(IntrinsicReward):
         :return: None, and the error, [B]
         """
         if not self.per_pixel:
-            assert inputs.srl_error is not None
             return None, inputs.srl_error
         batch = inputs.batch
         target = self._target(batch.next_observations if self.is_about_next else batch.observations)
