@@ -184,6 +184,8 @@ class StraightLine:
             if isinstance(module, RunningStandardize):
                 module.mean.copy_(observations.mean(dim=0))
                 module.variance.copy_(observations.var(dim=0, correction=0))
+        numbers = observations.float()
+        self.mean, self.deviation = numbers.mean(dim=0), numbers.std(dim=0, correction=0)
 
     def srl(self, batch: Samples, *latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Loss of the head, and the error of each sample."""
@@ -323,8 +325,9 @@ def rae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th
 
 
 def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor) -> th.Tensor:
-    goal = line.scaled(batch.observations)
-    if batch.observations.dtype == th.uint8:
+    if batch.observations.dtype != th.uint8:
+        goal = (batch.observations - line.mean) / line.deviation
+    else:
         goal = from_cells(line.head.target(to_cells(batch.observations), dither=True))
     return ((line.head.decoder(latents) - goal) ** 2).flatten(1).mean(dim=1)
 
