@@ -50,7 +50,6 @@ from benchmarks.peers import PEERS, CurlTraining, DrQv2Training, peer_of, trial_
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
 from benchmarks.time_summary import COLUMNS, OURS, best_trial, read_runs, write_summary
-from sb3_cure import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import (
@@ -61,15 +60,7 @@ from sb3_cure.evaluation.result_files import (
     write_json,
 )
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
-from sb3_cure.experiments.grid import (
-    Cell,
-    GridError,
-    Method,
-    arm_settings,
-    constructor_defaults,
-    load_grid,
-    short_name,
-)
+from sb3_cure.experiments.grid import Cell, GridError, GridFile, Method, arm_cell, load_grid, short_name
 from sb3_cure.networks.allocator import tune_allocator
 
 PUBLIC = public_returns.ARM
@@ -95,8 +86,9 @@ def make_cell(arm: str, task: str, seed: int, out: Path) -> Cell:
     """
     peer = peer_of(arm)
     zoo = "sac_ae" if peer or arm in (PUBLIC, *SB3) else arm
-    settings = arm_settings(Path(__file__), f"dmc_pixels/{task}-v0", Method(config=f"fast/{zoo}"))
-    cell = Cell("time_to_return", "curves", f"dmc_pixels/{task}-v0", arm, seed, 0, 0, 0, *settings)
+    name, methods = f"dmc_pixels/{task}-v0", {arm: Method(config=f"fast/{zoo}")}
+    grid = GridFile(experiment="time_to_return", kind="curves", budget=1, tasks=[name], methods=methods, seeds=[seed])
+    cell = arm_cell(grid, Path(__file__), name, arm)
     if peer:
         return _peer_cell(cell, peer, out)
     if arm == PUBLIC:
@@ -104,7 +96,7 @@ def make_cell(arm: str, task: str, seed: int, out: Path) -> Cell:
     if arm in SB3:
         arguments = {"policy": "CnnPolicy", "buffer_size": SB3_BUFFER_SIZE}
         if arm == "sb3_sac_our_sizes":
-            known = {**constructor_defaults(CuReSAC), **cell.arguments}
+            known = {"learning_rate": 1e-3, "batch_size": 128, **cell.arguments}  # the former by default
             arguments |= {name: known[name] for name in ("learning_rate", "learning_starts", "batch_size")}
             arguments["policy_kwargs"] = {"net_arch": known["policy_kwargs"]["net_arch"]}
         return replace(cell, arguments=arguments)

@@ -11,8 +11,6 @@ from stable_baselines3 import SAC
 
 from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
-from sb3_cure import CuReSAC
-from sb3_cure.experiments.grid import constructor_defaults
 
 YARDSTICK, SB3_SAC = "plain SAC-AE, fp32", "SB3 SAC (NatureCNN, 1024)"
 
@@ -38,7 +36,7 @@ def measure(repeats: int = 7, precisions: tuple[str, ...] = PRECISIONS) -> dict[
         YARDSTICK: _yardstick_call(),
         SB3_SAC: _train_call(make_model(SAC, policy_kwargs=dict(net_arch=[1024, 1024]))),
     }
-    default = constructor_defaults(CuReSAC)["update"]
+    default = "joint"
     arms: list[tuple[str, str, str, str | None]] = [
         (head, mode, precision, "separate")
         for head in ("rae", "curl")

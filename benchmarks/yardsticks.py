@@ -23,7 +23,7 @@ from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write
 from sb3_cure.evaluation.rollouts import run_episodes, srl_errors
 from sb3_cure.experiments.grid import short_name
 from sb3_cure.experiments.heads import fit_head, observation_batch
-from sb3_cure.experiments.published import SRL_ERROR, task_key
+from sb3_cure.experiments.published import SRL_ERROR
 from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.experiments.visitation import constant_errors, mean_target
 
@@ -81,7 +81,7 @@ def table(errors: pd.DataFrame, elsewhere: pd.DataFrame) -> Table:
     :return: These beside the paper's numbers
     """
     tasks = [task for task in TASKS if task in set(errors.task)]
-    papers = {task: SRL_ERROR[task_key(task)] for task in tasks}
+    papers = {task: SRL_ERROR[task.replace("-", "_")] for task in tasks}
     rows = {f"paper: {name}": [_text(*papers[task][actor]) for task in tasks] for name, actor in _PAPER.items()}
     for (mujoco, predictor), own in elsewhere.groupby(["mujoco", "predictor"], sort=False):
         means = own.groupby("task").error_mean.mean()

@@ -27,6 +27,7 @@ def filled_model(algorithm: str = "sac", pixels: bool = False, **kwargs: Any) ->
     if algorithm == "tqc":
         policy_kwargs = {"n_quantiles": 5, **policy_kwargs}
     defaults = dict(learning_starts=40, learning_rate=0.1, tau=0.0, encoder_tau=0.0, curiosity_prob=0.0)
+    defaults |= dict(intrinsic="srl_error")
     policy, env = ("CnnPolicy", PixelBox()) if pixels else ("MlpPolicy", VectorBox())
     arguments = {**defaults, **kwargs, "policy_kwargs": policy_kwargs}
     return tiny_model(policy, env, ALGORITHMS[algorithm], **arguments).learn(40)
@@ -183,6 +184,8 @@ class StraightLine:
             if isinstance(module, RunningStandardize):
                 module.mean.copy_(observations.mean(dim=0))
                 module.variance.copy_(observations.var(dim=0, correction=0))
+        numbers = observations.float()
+        self.mean, self.deviation = numbers.mean(dim=0), numbers.std(dim=0, correction=0)
 
     def srl(self, batch: Samples, *latents: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Loss of the head, and the error of each sample."""
@@ -322,8 +325,9 @@ def rae_loss(line: StraightLine, batch: Samples, latents: th.Tensor) -> tuple[th
 
 
 def reconstruction_errors(line: StraightLine, batch: Samples, latents: th.Tensor) -> th.Tensor:
-    goal = line.scaled(batch.observations)
-    if batch.observations.dtype == th.uint8:
+    if batch.observations.dtype != th.uint8:
+        goal = (batch.observations - line.mean) / line.deviation
+    else:
         goal = from_cells(line.head.target(to_cells(batch.observations), dither=True))
     return ((line.head.decoder(latents) - goal) ** 2).flatten(1).mean(dim=1)
 

@@ -65,6 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sb3-cure {name} needs {error.name}, which is not installed: {install}", file=sys.stderr)
         return 2
     tune_allocator()
+    if "" not in sys.path:
+        sys.path.append("")  # the user may name classes and environments of the working directory
     return program(arguments) or 0
 
 

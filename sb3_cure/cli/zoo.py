@@ -20,20 +20,17 @@ import rl_zoo3.train
 import yaml
 from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_class_by_name
+from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_class_by_name, get_model_path
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
-import sb3_cure
-from sb3_cure.cli.zoo_files import zoo_file
+from sb3_cure.cli.zoo_files import ALGORITHMS, zoo_file
 from sb3_cure.envs.rendering import is_headless
 
 DEFAULT_ALGORITHM = "cure_sac"
 #: The file of settings where ``--conf-file`` is not given
 DEFAULT_SETTINGS = "cure_sac_ae"
-#: Algorithms by their name for ``--algo``
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"cure_sac": sb3_cure.CuReSAC, "cure_tqc": sb3_cure.CuReTQC}
 #: Arguments of the algorithms that take a class of the user's, which settings name as ``my_module.MyClass``
 OWN = ("srl", "intrinsic")
 #: Settings of a run that make a replay import and call code, or unpickle files
@@ -155,10 +152,9 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
 
 def register() -> None:
-    """Register ``cure_sac`` and ``cure_tqc`` with rl-zoo3's programs, experiment manager and samplers."""
+    """Register ``cure_sac`` and ``cure_tqc`` with rl-zoo3's programs, and this experiment manager."""
     ALGOS.update(ALGORITHMS)
     for name in ALGORITHMS:
-        HYPERPARAMS_SAMPLER[name] = partial(sample_params, quantiles=name == "cure_tqc")
         HYPERPARAMS_CONVERTER[name] = convert_params
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc, attr-defined]
 
@@ -170,7 +166,6 @@ def train(arguments: Sequence[str]) -> None:
         ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
-    _find_modules_here()
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
@@ -257,7 +252,7 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--env", required=True, help="Gymnasium's id of the environment, or my_module:My-v0")
     parser.add_argument("--algo", default=DEFAULT_ALGORITHM, choices=ALGORITHMS, help="Default: %(default)s")
     parser.add_argument("-f", "--folder", default="logs", help="Where it was trained into (default: %(default)s)")
-    parser.add_argument("--exp-id", type=int, default=0, help="Number of the run (default: the latest with a model)")
+    parser.add_argument("--exp-id", type=int, default=0, help="Number of the run (default: the latest)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="The model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", help="The checkpoint of this number of agent steps")
@@ -280,20 +275,25 @@ def _load(
     parser: argparse.ArgumentParser, args: argparse.Namespace, render_mode: str | None
 ) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
     """The model with the smallest replay buffer, its run's environment, and its path."""
-    _find_modules_here()
     module, _, task = args.env.rpartition(":")
     for package in [*args.gym_packages, *([module] if module else [])]:
         importlib.import_module(package)
-    path = _find_model(parser, args, task)
+    name = EnvironmentName(task)
+    flags = args.load_best, args.load_checkpoint, args.load_last_checkpoint
+    try:
+        _, found, _ = get_model_path(args.exp_id, args.folder, args.algo, name, *flags)
+    except (AssertionError, ValueError) as error:
+        parser.error(str(error))
+    path = Path(found)
     print(f"Loading {path}")
-    folder = path.parent / EnvironmentName(task)
-    settings, flags = _read_settings(folder / "config.yml"), _read_settings(folder / "args.yml")
+    folder = path.parent / name
+    settings, arguments = _read_settings(folder / "config.yml"), _read_settings(folder / "args.yml")
     if not args.trusted and (named := [name for name in TRUSTED_SETTINGS if settings.get(name)]):
         parser.error(
             f"{folder / 'config.yml'} has {' and '.join(named)}, which can run any code: if you know where it comes "
             "from, add --trusted."
         )
-    env_kwargs = {**(flags.get("env_kwargs") or settings.get("env_kwargs") or {}), **(args.env_kwargs or {})}
+    env_kwargs = {**(arguments.get("env_kwargs") or settings.get("env_kwargs") or {}), **(args.env_kwargs or {})}
     if render_mode == "rgb_array" or (render_mode and "render_mode" not in env_kwargs):
         env_kwargs["render_mode"] = render_mode
     settings.setdefault("normalize", False)
@@ -307,27 +307,6 @@ def _load(
     load: Any = ALGORITHMS[args.algo].load
     model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
     return model, model.get_env(), path
-
-
-def _find_model(parser: argparse.ArgumentParser, args: argparse.Namespace, task: str) -> Path:
-    """The model that the flags name, of their run or the latest one with a model."""
-    name = EnvironmentName(task)
-    runs = [run for run in Path(args.folder, args.algo).glob(f"{name}_[0-9]*") if any(run.glob("*.zip"))]
-    numbers = {run: int(run.name.removeprefix(f"{name}_").partition("_")[0]) for run in runs}  # --uuid adds to it
-    runs = [run for run in runs if args.exp_id in (0, numbers[run])]
-    if not runs:
-        wanted = f"run {args.exp_id}" if args.exp_id else "run"
-        parser.error(f"there is no {wanted} of {task} with a model in {Path(args.folder, args.algo)}.")
-    latest = max(runs, key=lambda run: (numbers[run], run.stat().st_mtime))
-    pattern = f"{name}.zip"
-    if args.load_best:
-        pattern = "best_model.zip"
-    elif args.load_checkpoint or args.load_last_checkpoint:
-        pattern = f"rl_model_{args.load_checkpoint or '*'}_steps.zip"
-    models = list(latest.glob(pattern))
-    if not models:
-        parser.error(f"{latest} has no {pattern}; it has {', '.join(sorted(f.name for f in latest.glob('*.zip')))}.")
-    return max(models, key=lambda model: model.stat().st_mtime)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
@@ -346,9 +325,3 @@ def _play(model: OffPolicyAlgorithm, env: VecEnv, args: argparse.Namespace) -> l
                 print(f"Episode Reward: {episode['r']:.2f}, Episode Length: {episode['l']}")
                 episodes.append(episode)
     return episodes
-
-
-def _find_modules_here() -> None:
-    """Let the user name classes and environments of the working directory."""
-    if "" not in sys.path:
-        sys.path.append("")

@@ -1,7 +1,12 @@
-"""Find the YAML files of the package by name, such as ``fast/cure_sac_ae``."""
+"""Algorithms and YAML files of the package by name, such as ``fast/cure_sac_ae``."""
 
 from pathlib import Path
+from typing import Any
 
+from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
+
+#: Algorithms by their name for ``--algo`` and in grids
+ALGORITHMS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
 #: Settings of methods, for ``sb3-cure train --conf-file`` and for grids
 ZOO = Path(__file__).parents[1] / "zoo_configs"
 #: Grids, for ``sb3-cure experiment``

@@ -30,6 +30,7 @@ class CuReArguments(BaseModel):
     srl_kwargs: dict[str, Any]
     srl_schedule: Literal["simultaneous", "alternating"]
     srl_period: Count
+    srl_interval: Count
     intrinsic: str | type[IntrinsicReward]
     intrinsic_kwargs: dict[str, Any]
     curiosity: Literal["separate", "bonus", "random"] | None
@@ -42,6 +43,7 @@ class CuReArguments(BaseModel):
     normalize_curiosity: StrictBool
     curiosity_target: Literal["observation", "next_observation"]
     curiosity_encoder_grad: StrictBool
+    curious_interval: Count
     task: StrictBool
     augmentation: Literal["auto", "shift", "crop"] | None
     augmentation_kwargs: dict[str, Any]

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -27,6 +27,10 @@ from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments, restarts_workers
 
 Self = TypeVar("Self", bound="CuReBase")
+
+#: Reward of ``intrinsic="auto"`` where the head's error does not tell novelty: of those that explored as far as the
+#: error of an autoencoder (docs/evidence.md) the cheapest
+AUTO_WITHOUT_NOVELTY = "rnd"
 
 
 class CuReBase(OffPolicyAlgorithm):
@@ -54,7 +58,9 @@ class CuReBase(OffPolicyAlgorithm):
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Gradient steps per phase when alternating
-    :param intrinsic: What the curious agent is rewarded for: ``"srl_error"`` (the paper), ``"reconstruction"`` (what
+    :param srl_interval: Updates between two of head and encoder by the SRL loss; in the burst each of them
+    :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
+        novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
         ``"particle"``, ``"shuffled"`` (another one without its information, as a control), or a subclass of
         ``IntrinsicReward``
@@ -72,6 +78,7 @@ class CuReBase(OffPolicyAlgorithm):
     :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
+    :param curious_interval: Updates between two of the curious agent and its reward; in the burst each of them
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
@@ -118,7 +125,8 @@ class CuReBase(OffPolicyAlgorithm):
         srl_kwargs: dict[str, Any] | None = None,
         srl_schedule: str = "simultaneous",
         srl_period: int = 100,
-        intrinsic: str | type[IntrinsicReward] = "srl_error",
+        srl_interval: int = 1,
+        intrinsic: str | type[IntrinsicReward] = "auto",
         intrinsic_kwargs: dict[str, Any] | None = None,
         curiosity: str | None = "separate",
         curiosity_prob: float | Schedule = 0.2,
@@ -130,6 +138,7 @@ class CuReBase(OffPolicyAlgorithm):
         normalize_curiosity: bool = True,
         curiosity_target: str = "observation",
         curiosity_encoder_grad: bool = True,
+        curious_interval: int = 1,
         task: bool = True,
         augmentation: str | None = "auto",
         augmentation_kwargs: dict[str, Any] | None = None,
@@ -167,6 +176,7 @@ class CuReBase(OffPolicyAlgorithm):
         self.srl_kwargs = srl_kwargs or {}
         self.srl_schedule = srl_schedule
         self.srl_period = srl_period
+        self.srl_interval = srl_interval
         self.intrinsic = intrinsic
         self.intrinsic_kwargs = intrinsic_kwargs or {}
         self.curiosity = curiosity
@@ -179,6 +189,7 @@ class CuReBase(OffPolicyAlgorithm):
         self.normalize_curiosity = normalize_curiosity
         self.curiosity_target = curiosity_target
         self.curiosity_encoder_grad = curiosity_encoder_grad
+        self.curious_interval = curious_interval
         self.task = task
         self.augmentation = augmentation
         self.augmentation_kwargs = augmentation_kwargs or {}
@@ -231,7 +242,7 @@ class CuReBase(OffPolicyAlgorithm):
             srl_kwargs=self.srl_kwargs,
             augmentation=self.augmentation,
             augmentation_kwargs=self.augmentation_kwargs,
-            intrinsic_class=get_intrinsic_class(self.intrinsic) if rewarded else None,
+            intrinsic_class=self._intrinsic_class() if rewarded else None,
             intrinsic_kwargs=self.intrinsic_kwargs,
             reward_settings={
                 "frame_stack": self.replay_buffer_kwargs.get("frame_stack", 1),
@@ -242,6 +253,16 @@ class CuReBase(OffPolicyAlgorithm):
             curiosity_encoder_grad=self.curiosity_encoder_grad,
             update=self.update,
         )
+
+    def _intrinsic_class(self) -> type[IntrinsicReward]:
+        """Class of the intrinsic reward; ``"auto"`` is resolved by the head."""
+        if self.intrinsic != "auto":
+            return get_intrinsic_class(self.intrinsic)
+        tells = self.srl is not None and get_srl_class(self.srl).error_tells_novelty
+        name = "srl_error" if tells else AUTO_WITHOUT_NOVELTY
+        if self.verbose >= 1:
+            print(f"The curious agent is rewarded by {name!r} (intrinsic='auto').")
+        return get_intrinsic_class(name)
 
     def _setup_temperatures(self) -> None:
         """Let the task's agent adopt SB3's temperature, and give the curious one its own."""
@@ -320,10 +341,10 @@ class CuReBase(OffPolicyAlgorithm):
         queue: list[Any] = [initialised]
         for each in queue:
             queue += [*getattr(each, "callbacks", []), *filter(None, [getattr(each, "callback", None)])]
-            if isinstance(each, EvalCallback) and share_environment(each.eval_env, self.env):
+            if share_environment(getattr(each, "eval_env", None), self.env):
                 raise ValueError(
-                    "EvalCallback evaluates in the training environment, so that transitions are stored that never "
-                    "happened: give it an eval_env of its own."
+                    f"{type(each).__name__} evaluates in the training environment, so that transitions are stored that "
+                    "never happened: give it an eval_env of its own."
                 )
         return initialised
 

@@ -5,6 +5,7 @@ Wherever a value is formed, [B, K] are K values of each sample: K = 1 for SAC, t
 
 from collections.abc import Iterable
 from itertools import chain, pairwise
+from typing import Any
 
 import torch as th
 from sb3_contrib.common.utils import quantile_huber_loss
@@ -112,23 +113,15 @@ class TwinCritic(LatentCritic):
 class QuantileCritic(LatentCritic):
     """TQC's critics: quantiles, of which the largest are dropped from the target (Kuznetsov et al., 2020).
 
+    :param args: As of ``LatentCritic``
     :param n_quantiles: Quantiles of each critic
     :param top_quantiles_to_drop_per_net: Quantiles to drop for each critic
+    :param kwargs: As of ``LatentCritic``
     """
 
-    def __init__(
-        self,
-        features_dim: int,
-        action_dim: int,
-        net_arch: list[int],
-        activation_fn: type[nn.Module],
-        n_critics: int = 2,
-        n_quantiles: int = 25,
-        top_quantiles_to_drop_per_net: int = 2,
-        critic_arch: str = "mlp",
-    ):
-        super().__init__(features_dim, action_dim, net_arch, activation_fn, n_critics, n_quantiles, critic_arch)
-        self.n_kept = (n_quantiles - top_quantiles_to_drop_per_net) * n_critics
+    def __init__(self, *args: Any, n_quantiles: int = 25, top_quantiles_to_drop_per_net: int = 2, **kwargs: Any):
+        super().__init__(*args, n_values=n_quantiles, **kwargs)  # type: ignore[misc]
+        self.n_kept = (n_quantiles - top_quantiles_to_drop_per_net) * self.n_critics
 
     def target_values(self, latents: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return self(latents, actions).flatten(1).sort().values[:, : self.n_kept]

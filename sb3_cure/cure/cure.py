@@ -7,6 +7,7 @@ how several losses step the encoder that they share.
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import RewardInputs
 from sb3_cure.networks.augmentations import Augmentation
 from sb3_cure.networks.precision import compute_in
-from sb3_cure.srl import SRLHead, get_srl_class
+from sb3_cure.srl import SRLOutput, get_srl_class
 
 
 class CuRe(CuReBase):
@@ -161,6 +162,7 @@ class CuRe(CuReBase):
     def _phase(self) -> tuple[bool, bool]:
         """Whether the next update trains the representation, and whether it trains actors and critics."""
         learns_srl = self.srl is not None and not self.policy.representation_frozen
+        learns_srl = learns_srl and (self._in_burst or self._n_updates % self.srl_interval == 0)
         if not (self.task or self._has_curious_agent):
             return learns_srl, False
         if not self._alternates:
@@ -180,27 +182,34 @@ class CuRe(CuReBase):
                 each.update_statistics(batch.views)
 
         metrics: Metrics = {}
-        inputs = self._reward_inputs(batch)
-        reward = policy.intrinsic if learns_rl else None
-        judges_head = reward is not None and reward.needs_srl
-        if policy.srl is not None and (learns_srl or judges_head):
-            srl_loss, srl_error = self._srl_loss(policy.srl, batch, learns_srl, metrics)
+        turns = self._turns() if learns_rl else {}
+        srl = self._srl_loss(batch, True, metrics) if learns_srl else None
+        reward = policy.intrinsic if "curious" in turns or (turns and self.curiosity == "bonus") else None
         curious_rewards = None
-        if judges_head:  # the reward is of the head before its step
-            inputs.srl_error = self._judged_error(policy.srl, batch, srl_error)
-            curious_rewards = self._curious_rewards(inputs, metrics)
-        if learns_srl:
-            self._update_srl(srl_loss)
-        if reward is not None and not judges_head:
-            curious_rewards = self._curious_rewards(inputs, metrics)
+        if reward is not None and reward.needs_srl:  # the reward is of the head before its step
+            curious_rewards = self._curious_rewards(self._reward_inputs(batch, srl, metrics), metrics)
+        if srl is not None:
+            self._update_srl(srl.loss)
+        if reward is not None and not reward.needs_srl:
+            curious_rewards = self._curious_rewards(self._reward_inputs(batch, srl, metrics), metrics)
         if learns_rl:
-            self._update_agents(batch, curious_rewards, metrics)
+            self._update_agents(batch, turns, curious_rewards, metrics)
         encoder.finish()
-        self._update_targets(learns_rl)
+        self._update_targets(turns)
         return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
 
-    def _srl_loss(self, srl: SRLHead, batch: Samples, learns: bool, metrics: Metrics) -> tuple[th.Tensor, th.Tensor]:
+    def _turns(self) -> dict[str, int]:
+        """Agents that learn from this batch, and how many batches each of them has learned from."""
+        turns, interval = {}, 1 if self._in_burst else self.curious_interval
+        if self.task:
+            turns["task"] = self._n_rl_batches
+        if self._has_curious_agent and self._n_rl_batches % interval == 0:
+            turns["curious"] = self._n_rl_batches // interval
+        return turns
+
+    def _srl_loss(self, batch: Samples, learns: bool, metrics: Metrics) -> SRLOutput:
         """Loss of the head, and the error of each sample, [B]."""
+        srl: Any = self.policy.srl
         source = "srl" if learns else "measured"
         names = ["observations", "next_observations"] if srl.needs_next_latents else ["observations"]
         latents = [self.policy.encoder_update.latents(source, name) for name in names]
@@ -213,17 +222,18 @@ class CuRe(CuReBase):
             )
         variance = latents[0].detach().var(dim=0, correction=0).mean()
         metrics |= {"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance}
-        return loss.float(), error.float()
+        return SRLOutput(loss.float(), error.float())
 
-    @th.no_grad()
-    def _judged_error(self, srl: Any, batch: Samples, error: th.Tensor) -> th.Tensor:
+    def _judged_error(self, batch: Samples, srl_output: SRLOutput | None, metrics: Metrics) -> th.Tensor:
         """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
+        srl: Any = self.policy.srl
         if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
-            return error
+            return (srl_output or self._srl_loss(batch, False, metrics)).error
         views = self.policy.augmentation(batch.next_observations)
-        latents = self.policy.encoder(views)
         # With nothing else, so that no head takes (s', a, s') for a transition.
-        return srl.loss(Samples(batch.next_observations, None, None, None, None, views=views), latents).error.float()  # type: ignore[arg-type]
+        alone = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
+        with th.no_grad():
+            return srl.loss(alone, self.policy.encoder(views)).error.float()  # type: ignore[no-any-return]
 
     def _update_srl(self, loss: th.Tensor) -> None:
         """UpdateSRL: train the head and, through the latents, the encoder."""
@@ -255,29 +265,34 @@ class CuRe(CuReBase):
         }
         return scaled
 
-    def _update_agents(self, batch: Samples, curious_rewards: th.Tensor | None, metrics: Metrics) -> None:
+    def _update_agents(
+        self, batch: Samples, turns: dict[str, int], curious_rewards: th.Tensor | None, metrics: Metrics
+    ) -> None:
         """UpdateTaskAC and UpdateCuriousAC, each with its rewards and discounts."""
         one_step = "next_observations"
         several = one_step if batch.n_step is None else "n_step"
-        views = {several} if not self._has_curious_agent else {several, one_step} if self.task else {one_step}
+        read = {"task": several, "curious": one_step}
         with th.no_grad():
             encoder_target, inputs = self.policy.encoder_target, self.policy.encoder_update.views
-            next_latents = {view: encoder_target(inputs[view]) for view in views}
-        if self.task:
+            next_latents = {view: encoder_target(inputs[view]) for view in dict.fromkeys(read[name] for name in turns)}
+        if "task" in turns:
             n_step = batch.n_step or batch
             bonus = curious_rewards if self.curiosity == "bonus" else None
             rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
             discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
-            self._update_actor_critic("task", batch, rewards, discounts, several, next_latents[several], metrics)
-        if self._has_curious_agent:
+            latents = next_latents[several]
+            self._update_actor_critic("task", turns["task"], batch, rewards, discounts, several, latents, metrics)
+        if "curious" in turns:
             assert curious_rewards is not None
             continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
             discounts, latents = continues * self.curiosity_gamma, next_latents[one_step]
-            self._update_actor_critic("curious", batch, curious_rewards, discounts, one_step, latents, metrics)
+            turn, rewards = turns["curious"], curious_rewards
+            self._update_actor_critic("curious", turn, batch, rewards, discounts, one_step, latents, metrics)
 
     def _update_actor_critic(
         self,
         name: str,
+        turn: int,
         batch: Samples,
         rewards: th.Tensor,
         discounts: th.Tensor,
@@ -288,6 +303,7 @@ class CuRe(CuReBase):
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
 
         :param name: ``"task"`` or ``"curious"``
+        :param turn: Number of batches that this agent has learned from before
         :param batch: Samples of the replay buffer
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return continues, else 0, [B, 1]
@@ -303,7 +319,7 @@ class CuRe(CuReBase):
         critic_loss = agent.critic.loss(encoder.latents(name), batch.actions, target)
         self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
         metrics |= {f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()}
-        if self._in_burst or self._n_rl_batches % self.actor_update_interval == 0:
+        if self._in_burst or turn % self.actor_update_interval == 0:
             self._update_actor(name, agent, metrics)
 
     def _update_actor(self, name: str, agent: ActorCritic, metrics: Metrics) -> None:
@@ -319,14 +335,14 @@ class CuRe(CuReBase):
             self._optimize(f"{name} temperature", ent_coef_loss, agent.ent_coef_optimizer)
             metrics[f"{prefix}ent_coef_loss"] = ent_coef_loss
 
-    def _update_targets(self, learns_rl: bool) -> None:
+    def _update_targets(self, turns: dict[str, int]) -> None:
         """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
         policy, interval = self.policy, 1 if self._in_burst else self.target_update_interval
         if self._n_batches % interval == 0:
             _polyak_step(policy.encoder, policy.encoder_target, self.encoder_tau)
-        if learns_rl and self._n_rl_batches % interval == 0:
-            for agent in policy.agents.values():
-                _polyak_step(agent.critic, agent.critic_target, self.tau)
+        for name, turn in turns.items():
+            if turn % interval == 0:
+                _polyak_step(policy.agents[name].critic, policy.agents[name].critic_target, self.tau)
 
     def _learn(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:
         """Step the loss's own parameters, and give the encoder its gradient at the latents."""
@@ -347,7 +363,7 @@ class CuRe(CuReBase):
         if optimizer is not None:
             optimizer.step()
 
-    def _reward_inputs(self, batch: Samples) -> RewardInputs:
+    def _reward_inputs(self, batch: Samples, srl: SRLOutput | None, metrics: Metrics) -> RewardInputs:
         """What an intrinsic reward may read of this batch, of the encoder and of the replay buffer."""
         policy, encoder = self.policy, self.policy.encoder_update
         # Without augmentation the centred views are those that everyone else sees.
@@ -368,7 +384,8 @@ class CuRe(CuReBase):
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]
             return policy.samples(sampled, random=False)
 
-        return RewardInputs(batch, None, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
+        judge = partial(self._judged_error, batch, srl, metrics) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
+        return RewardInputs(batch, judge, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
 
 
 @th.no_grad()

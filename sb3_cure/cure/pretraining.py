@@ -16,7 +16,6 @@ from stable_baselines3.common.utils import configure_logger
 
 from sb3_cure.cure.cure import CuRe
 from sb3_cure.data.datasets import episodes_of, fill
-from sb3_cure.intrinsic import get_intrinsic_class
 from sb3_cure.persistence.archive import archived_networks
 
 Self = TypeVar("Self", bound="Pretraining")
@@ -204,7 +203,7 @@ class Pretraining(CuRe):
         if not self._has_curious_agent:
             return
         if self.policy.curious is None:  # for this pretraining alone
-            self.policy.add_curious_agent(get_intrinsic_class(self.intrinsic), self.intrinsic_kwargs)
+            self.policy.add_curious_agent(self._intrinsic_class(), self.intrinsic_kwargs)
             self._setup_curious_temperature()
         self.policy.default_agent = "curious"
 

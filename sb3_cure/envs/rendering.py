@@ -103,10 +103,3 @@ def check_gl() -> str:
             physics.free()
     except Exception as error:
         raise _missing(error) from error
-
-
-if __name__ == "__main__":
-    try:
-        print(check_gl())
-    except GLUnavailableError as unavailable:
-        sys.exit(str(unavailable))

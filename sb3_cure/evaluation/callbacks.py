@@ -1,13 +1,13 @@
 """Callbacks for ``learn``: evaluation, videos, pictures and warnings.
 
-All work with any SB3 algorithm (``DiagnosticsCallback``: any off-policy one); without SRL head there are no SRL errors.
+All work with any SB3 algorithm (``DiagnosticsCallback``, ``ReconstructionCallback``: any off-policy one); without SRL
+head there are no SRL errors.
 """
 
 import contextlib
 import random
 import re
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
@@ -26,7 +27,6 @@ from sb3_cure.data.buffers import infer_frame_stack, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
-from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import decoding, diagnostics
 from sb3_cure.evaluation.encoding import encoder_of
@@ -54,8 +54,6 @@ __all__ = [
     "untouched_randomness",
 ]
 
-#: Observations that ``ReconstructionCallback`` keeps without a replay buffer: 64 MB of three frames of 84 x 84
-LATEST = 1000
 #: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
 PRINTED_NAME = 33
 
@@ -156,11 +154,6 @@ class RolloutCallback(PeriodicCallback):
             raise ValueError(
                 "eval_env must be one gymnasium.Env, not a VecEnv "
                 "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks frames as VecFrameStack does)."
-            )
-        if share_environment(self.eval_env, model.get_env()):
-            raise ValueError(
-                "eval_env must not share an environment with training, which would store transitions that never "
-                "happened: make another one."
             )
         # As SB3 wraps training environments: images channels first
         wrapped = model._wrap_env(self.eval_env, monitor_wrapper=False)
@@ -267,7 +260,7 @@ class PolicyVideoCallback(RolloutCallback):
             (episode,) = self.run(actor, render=True)
             path = self._path(self.folder, f"{actor}_policy_{steps}_steps.mp4")
             title = f"{actor} policy, {self._actions}, after {steps:,} agent steps"
-            video.write_video(path, episode, self.fps, repeat, title)
+            video.write_video(path, {title: episode}, self.fps, repeat)
 
 
 class ReconstructionCallback(PeriodicCallback):
@@ -275,22 +268,21 @@ class ReconstructionCallback(PeriodicCallback):
     Draw reconstructions of the same observations over training: ``reconstructions.png``, one row per time.
 
     Each image of dictionaries has a picture ``reconstructions_<key>.png``. If neither head nor intrinsic reward
-    reconstructs, and for SB3's own algorithms, a new decoder is fitted to the latents for each row, from which the
-    agent does not learn. It is fitted to the replay buffer, or without one (PPO, A2C) to the latest ``LATEST``
-    observations. The file is rewritten with each row.
+    reconstructs, and for SB3's own off-policy algorithms, a new decoder is fitted to latents of the replay buffer for
+    each row, from which the agent does not learn. The file is rewritten with each row.
 
     :param folder: Where to write
     :param every: Agent steps between two rows
     :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; the first row is
-        then that of the untrained model, if the head itself reconstructs. By default ``columns`` of those that the
-        decoder would be fitted to, spread over their time when the first row is drawn
+        then that of the untrained model, if the head itself reconstructs. By default ``columns`` of the replay buffer,
+        spread over their time when the first row is drawn
     :param columns: How many observations to take
     :param frame_stack: Frames per observation, of which the newest is shown; by default that of the environment
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
     :param max_rows: Most rows of the picture; further times are left out evenly
     :param verbose: 1 prints the file's name
     :param title: Added to the picture's title, such as the names of task and method
-    :raises ValueError: if the model does not learn from images with an encoder, or from other images
+    :raises ValueError: if the model has no replay buffer, does not learn from images with an encoder, or from others
     :raises ImportError: if matplotlib is not installed
     """
 
@@ -312,13 +304,14 @@ class ReconstructionCallback(PeriodicCallback):
         self.title = title
         #: Agent steps and the reconstructions then, their newest frames, uint8 [n, C, H, W], or such by key
         self.rows: list[tuple[int, Any]] = []
-        self._latest: deque[np.ndarray] = deque(maxlen=LATEST)
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _init_callback(self) -> None:
         space, given = self.model.observation_space, self.observations
         if encoder_of(self.model.policy) is None or not image_spaces(space):
             raise ValueError("ReconstructionCallback needs a policy with an encoder of uint8 images, which it draws.")
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            raise ValueError("ReconstructionCallback needs a replay buffer, to which decoders are fitted.")
         if given is None:
             return
         if isinstance(given, np.ndarray) and given.shape[1:] != space.shape:
@@ -331,12 +324,6 @@ class ReconstructionCallback(PeriodicCallback):
         if self.observations is not None and not self.rows and self.num_timesteps == 0:
             with untouched_randomness(self.model.device):
                 self.on_period()
-
-    def _on_step(self) -> bool:
-        if self._buffer is None and self.decoder_updates > 0:
-            # Not `new_obs` of the locals, which rollouts of third parties' algorithms may name otherwise
-            self._latest.extend(np.array(self.model._last_obs))
-        return super()._on_step()
 
     def on_period(self) -> None:
         """Add a row."""
@@ -384,7 +371,7 @@ class ReconstructionCallback(PeriodicCallback):
                 pair = model.policy.reconstruct(observed)
             if pair is not None:
                 return "What the agent sees, and what its latents hold of it", by_key(pair[0]), by_key(pair[1])
-        if self.decoder_updates == 0 or self._count == 0:
+        if self.decoder_updates == 0 or model.replay_buffer.size() == 0:
             return None
         seen, drawn = {}, {}
         for key in image_spaces(model.observation_space):
@@ -392,30 +379,19 @@ class ReconstructionCallback(PeriodicCallback):
             seen[key], drawn[key] = decoding.draw_latents(model, decoder, observed, key)
         return "What a decoder fitted afterwards draws from the latents", seen, drawn
 
-    @property
-    def _buffer(self) -> Any:
-        return getattr(self.model, "replay_buffer", None)
-
-    @property
-    def _count(self) -> int:
-        return len(self._latest) if self._buffer is None else len(stored_places(self._buffer)[0])
-
     def _sample(self, n: int) -> Any:
-        """Draw random observations that the model has seen, [n, *shape] or such by key, on its device."""
-        if self._buffer is not None:
-            return self._buffer.sample(n, env=self.model.get_vec_normalize_env()).observations
-        chosen = np.random.randint(len(self._latest), size=n)
-        return th.as_tensor(np.stack([self._latest[index] for index in chosen]), device=self.model.device)
+        """Draw random observations of the replay buffer, [n, *shape] or such by key, normalized."""
+        buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
+        return buffer.sample(n, env=self.model.get_vec_normalize_env()).observations
 
     def _spread(self) -> Any:
-        """Choose observations that the model has seen, evenly over their time, oldest first; None if there are none."""
-        if self._count == 0:
+        """Choose observations of the replay buffer, evenly over their time, oldest first; None if there are none."""
+        buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
+        rows, env_inds, _ = stored_places(buffer)
+        if len(rows) == 0:
             return None
-        chosen = np.linspace(0, self._count - 1, self.columns).round().astype(int)
-        if self._buffer is None:
-            return np.array(self._latest)[chosen]
-        rows, env_inds, _ = (part[::-1][chosen] for part in stored_places(self._buffer))
-        return as_arrays(transitions(self._buffer, rows, env_inds).observations)
+        chosen = np.linspace(len(rows) - 1, 0, self.columns).round().astype(int)
+        return as_arrays(transitions(buffer, rows[chosen], env_inds[chosen]).observations)
 
 
 def _true_state(
@@ -480,21 +456,16 @@ class CuriosityMapCallback(RolloutCallback):
             for actor in self.actors:
                 pairs = [(episode.states, episode.srl_errors) for episode in self.run(actor, states=self.state)]
                 states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-                finite = np.isfinite(states).all(axis=1)
-                if not finite.all():
-                    left_out = f"{np.count_nonzero(~finite)} of {len(states)} states of the {actor} policy"
-                    warnings.warn(f"CuriosityMapCallback leaves out {left_out}, which are not finite.", stacklevel=2)
-                self.visits[actor] = states[finite], errors[finite] if len(errors) else errors
-        if any(len(states) for states, _ in self.visits.values()):
-            plots.curiosity_map(
-                self._path(self.folder, f"curiosity_map_{self.num_timesteps}_steps.png"),
-                self.visits,
-                self.names,
-                f"Where policies go with {self._actions} after {self.num_timesteps:,} agent steps",
-                coordinates=self.coordinates,
-                units=self.units,
-                bins=self.bins,
-            )
+                self.visits[actor] = states, errors
+        plots.curiosity_map(
+            self._path(self.folder, f"curiosity_map_{self.num_timesteps}_steps.png"),
+            self.visits,
+            self.names,
+            f"Where policies go with {self._actions} after {self.num_timesteps:,} agent steps",
+            coordinates=self.coordinates,
+            units=self.units,
+            bins=self.bins,
+        )
 
 
 class StateProbeCallback(RolloutCallback):
@@ -574,7 +545,6 @@ class DiagnosticsCallback(PeriodicCallback):
     ``autoencoder``           Explains less than 1 % of the pixels' variance: no better than the mean image
     ``temperature``           Outside of its bounds, while the policy's entropy misses its target
     ``curious_reward``        Varies by less than 1 % of the entropy term
-    ``software_rendering``    The CPU draws the frames although there is a GPU
     ========================  ============================================================================
 
     Works with every off-policy algorithm of SB3; checks that do not apply are left out. Each number is logged as
@@ -605,14 +575,7 @@ class DiagnosticsCallback(PeriodicCallback):
         self._arguments = n_samples, min_updates, autoencoder_updates, (low, high)
         #: Names of the problems that were warned of
         self.warned: list[str] = []
-        self._rendering: list[diagnostics.Finding] = []
         self._reward_std: Any = None
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        rendering = diagnostics.software_rendering(self.training_env)
-        self._rendering = [] if rendering is None else [rendering]
-        self._report(self._rendering)
 
     def _on_step(self) -> bool:
         # At each step, as the logger forgets what it has written
@@ -620,19 +583,14 @@ class DiagnosticsCallback(PeriodicCallback):
         return super()._on_step()
 
     def on_period(self) -> None:
-        """Look, log and warn."""
-        findings = list(self._rendering)
-        for finding in filter(None, diagnostics.look(self.model, self._reward_std, *self._arguments)):
-            findings.append(finding)
-            if finding.problem is not None:
-                break
-        self._report(findings)
-        if self.verbose >= 1:
-            print(", ".join(f"{finding.name} {finding.value:.3g}" for finding in findings))
-
-    def _report(self, findings: Sequence[diagnostics.Finding]) -> None:
-        for name, value, problem in findings:
+        """Look, log and warn; after a problem nothing is looked at that it may explain."""
+        findings = diagnostics.look(self.model, self._reward_std, *self._arguments)
+        for name, value, problem in filter(None, findings):
             self.logger.record(f"diagnostics/{name}", float(value))
-            if problem is not None and name not in self.warned:
-                self.warned.append(name)
-                warnings.warn(f"After {self.num_timesteps} agent steps: {problem}", stacklevel=2)
+            if self.verbose >= 1:
+                print(f"{name} {value:.3g}")
+            if problem is not None:
+                if name not in self.warned:
+                    self.warned.append(name)
+                    warnings.warn(f"After {self.num_timesteps} agent steps: {problem}", stacklevel=2)
+                return

@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import transitions
 from sb3_cure.data.observations import image_spaces, images_of
-from sb3_cure.envs import render_check
 from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.evaluation.rollouts import stored_places
 from sb3_cure.networks.layers import Conv2dReLU
@@ -243,25 +241,6 @@ def curious_reward(deviation: float, temperatures: Sequence[Temperature]) -> Fin
         "policy is close to random: use normalize_curiosity=True, or a larger curiosity_beta."
     )
     return Finding("curious_reward", ratio, problem if ratio < CURIOUS_SHARE else None)
-
-
-def software_rendering(env: VecEnv) -> Finding | None:
-    """
-    Frames that the CPU renders on a machine with a GPU.
-
-    Value: 1 if so, else 0. A process of its own renders with OpenGL, which takes a few seconds, only on machines with a
-    GPU.
-
-    :param env: Training environments
-    :return: None without a GPU, without images, or if the environments do not render MuJoCo by OpenGL
-    """
-    gpus = render_check.find_gpus()
-    renders = env.has_attr("physics") or env.has_attr("mujoco_renderer")
-    if not gpus or not renders or not image_spaces(env.observation_space):
-        return None
-    renderer = render_check.try_rendering().get("renderer")
-    problem = None if renderer is None else render_check.judge_renderer(renderer, gpus)
-    return Finding("software_rendering", problem is not None, problem)
 
 
 # ------------------------------------------------------------------- measurements

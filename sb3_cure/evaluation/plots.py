@@ -3,9 +3,10 @@
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Literal, TypeAlias
+from typing import IO, TypeAlias
 
 import numpy as np
+import torch as th
 from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -15,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 from PIL import Image
 
+from sb3_cure.cure.reconstructions import newest_frames
 from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
 from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 
@@ -22,8 +24,6 @@ from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 STYLE = Path(__file__).with_name("plots.mplstyle")
 #: Colour of each policy
 COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
-#: Line style of each policy, if colours stand for arms
-LINE_STYLES: dict[str, Literal["-", "--"]] = {"task": "-", "curious": "--"}
 _ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
 
@@ -88,6 +88,7 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
 
 
+@in_style
 def learning_curves(
     path: PathOrFile,
     curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
@@ -104,36 +105,13 @@ def learning_curves(
     :param ylabel: What the values are
     :param logarithmic: Whether the values have a logarithmic axis
     """
-    of_task = {task: {(arm, "task"): curve for arm, curve in arms.items()} for task, arms in curves.items()}
-    policy_curves(path, of_task, colors, ylabel, logarithmic)
-
-
-@in_style
-def policy_curves(
-    path: PathOrFile,
-    curves: Mapping[str, Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]],
-    colors: Mapping[str, str],
-    ylabel: str,
-    logarithmic: bool,
-    actors: Sequence[str] = (),
-) -> None:
-    """
-    As ``learning_curves``, with arms by colour and policies by line style.
-
-    :param path: File to write
-    :param curves: By task, and arm and policy (``"task"`` or ``"curious"``): environment steps [n], values [seeds, n]
-    :param colors: By arm
-    :param ylabel: What the values are
-    :param logarithmic: Whether the values have a logarithmic axis
-    :param actors: Policies that the legend names
-    """
     figure, panels = _panels(len(curves), height=2.9)
     seeds: dict[str, set[int]] = {}
     for axes, (task, lines) in zip(panels, curves.items(), strict=True):
-        for (arm, actor), (steps, values) in lines.items():
+        for arm, (steps, values) in lines.items():
             seeds.setdefault(arm, set()).add(len(values))
             mean = values.mean(axis=0)
-            axes.plot(steps, mean, color=colors[arm], linestyle=LINE_STYLES[actor])
+            axes.plot(steps, mean, color=colors[arm])
             if len(values) > 1:
                 std = values.std(axis=0, ddof=1)
                 low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
@@ -145,7 +123,6 @@ def policy_curves(
     for arm, counts in seeds.items():
         n = " to ".join(map(str, sorted({min(counts), max(counts)})))
         handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], color=colors[arm])
-    handles |= {f"{actor} policy": Line2D([], [], color="#333333", linestyle=LINE_STYLES[actor]) for actor in actors}
     _legend(figure, handles)
     save(figure, path)
 
@@ -178,40 +155,6 @@ def paired_differences(
     # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
     reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
     axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
-    save(figure, path)
-
-
-@in_style
-def aggregate_scores(
-    path: PathOrFile,
-    iqm: Mapping[str, tuple[float, float, float]],
-    taus: np.ndarray,
-    profiles: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]],
-    colors: Mapping[str, str],
-) -> None:
-    """
-    Interquartile means (left) and performance profiles (right) with their intervals.
-
-    :param path: File to write
-    :param iqm: By arm: value, low, high
-    :param taus: Scores at which the profiles are read, [n]
-    :param profiles: By arm: share of runs above each score, its low and high end, [n] each
-    :param colors: By arm
-    """
-    figure = Figure(figsize=(9.5, max(2.9, 1.2 + 0.35 * len(iqm))))
-    left, right = figure.subplots(1, 2)
-    for place, (arm, (value, low, high)) in enumerate(iqm.items()):
-        left.barh(place, high - low, 0.55, left=low, color=colors[arm], alpha=0.45)
-        left.plot([value, value], [place - 0.275, place + 0.275], color=colors[arm], linewidth=2.5)
-    left.set_yticks(range(len(iqm)), [_plain(arm) for arm in iqm])
-    left.invert_yaxis()
-    ends = [end for _, *ends in iqm.values() for end in ends]
-    pad = 0.06 * (max(ends) - min(ends)) or 0.05
-    left.set(xlabel="interquartile mean of the final score", title="IQM", xlim=(min(ends) - pad, max(ends) + pad))
-    for arm, (share, lower, upper) in profiles.items():
-        right.step(taus, share, where="post", color=colors[arm], label=_plain(arm))
-        right.fill_between(taus, lower, upper, step="post", color=colors[arm], alpha=0.15, linewidth=0)
-    right.set(xlabel="score τ", ylabel="share of runs with score > τ", title="performance profile", ylim=(0, 1.02))
     save(figure, path)
 
 
@@ -392,13 +335,9 @@ def highest_error_frames(
     :param frame_stack: Frames per observation, of which the newest is shown
     :param title: Title of the figure
     :param drawn: Their reconstructions, shown on the right of each, uint8 like ``found.observations``, or None
-    :raises ValueError: if ``frame_stack`` does not divide the channels into frames, grey or in colour
     """
-    n_channels = found.observations.shape[1]
-    channels, left_over = divmod(n_channels, frame_stack)
-    if left_over or channels not in (1, 3, 4):
-        raise ValueError(f"frame_stack={frame_stack} does not divide {n_channels} channels into frames of 1 or 3.")
-    pairs = [found.observations] if drawn is None else [found.observations, drawn]
+    shown = [found.observations] if drawn is None else [found.observations, drawn]
+    pairs = [newest_frames(th.as_tensor(images), frame_stack).numpy() for images in shown]
     columns = min(len(found.errors), 8 if drawn is None else 4)
     n_rows = -(-len(found.errors) // columns)
     figure = Figure(figsize=(1.5 * columns * len(pairs) + 0.2, 1.9 * n_rows + 0.5))
@@ -407,10 +346,7 @@ def highest_error_frames(
         axes.set_axis_off()
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
         # A white column on the right of each frame
-        _show(
-            grid[index],
-            [np.pad(images[index, -channels:], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs],
-        )
+        _show(grid[index], [np.pad(images[index], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs])
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
     note += f", and its multiple of the buffer's mean of {found.mean_error:.3g}; ages in agent steps"

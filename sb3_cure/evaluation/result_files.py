@@ -7,7 +7,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -68,16 +68,9 @@ def code_commit() -> str | None:
     Find the commit of the running code.
 
     :return: ``SB3_CURE_COMMIT`` (set in images without a checkout), else the commit of the package's checkout, marked
-        if it has changes, else that of the repository that pip installed it from; None if unknown
+        if it has changes; None if unknown
     """
-    commit = os.environ.get("SB3_CURE_COMMIT") or checkout_commit(Path(sb3_cure.__file__).parent.parent)
-    if commit:
-        return commit
-    try:
-        origin = json.loads(distribution("sb3-cure").read_text("direct_url.json") or "{}")
-    except PackageNotFoundError:
-        return None
-    return origin.get("vcs_info", {}).get("commit_id", "")[:12] or None
+    return os.environ.get("SB3_CURE_COMMIT") or checkout_commit(Path(sb3_cure.__file__).parent.parent)
 
 
 def checkout_commit(folder: Path) -> str | None:

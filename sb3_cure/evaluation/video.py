@@ -13,36 +13,24 @@ from PIL import Image, ImageDraw, ImageFont
 from sb3_cure.evaluation.rollouts import Episode
 
 MIN_WIDTH = 256
+#: Characters of a line of the title; text grows with the picture, so that it holds as many at any width
+LINE = 36
 RED, GREY = "#d62728", "#bbbbbb"
 
 
-def write_video(path: Path, episode: Episode, fps: int, action_repeat: int = 1, title: str = "") -> None:
+def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
     """
-    Write one episode as MP4: the camera's picture above, the SRL error so far below.
+    Write episodes side by side as MP4: above the camera's pictures, below the SRL errors so far, with one scale.
 
     :param path: File to write, ``*.mp4``
-    :param episode: Episode with ``frames`` (rendered with ``render=True``); without ``srl_errors`` none are drawn
-    :param fps: Pictures per second, one per agent step
-    :param action_repeat: Environment steps per agent step, for the caption
-    :param title: Put before the caption; wrapped if it is wider than the picture
-    """
-    # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
-    with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
-        for picture in annotated_frames(episode, action_repeat, title):
-            writer.append_data(picture)  # type: ignore[attr-defined]
-
-
-def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
-    """
-    Write several policies side by side, as ``write_video``, with one scale of the errors.
-
-    :param path: File to write, ``*.mp4``
-    :param episodes: Episodes with ``frames``, by title; all end with the shortest
+    :param episodes: Episodes with ``frames`` (rendered with ``render=True``) by title; all end with the shortest.
+        Without ``srl_errors`` none are drawn
     :param fps: Pictures per second, one per agent step
     :param action_repeat: Environment steps per agent step, for the captions
     """
     top = max(float(episode.srl_errors.max(initial=0)) for episode in episodes.values())
     columns = [annotated_frames(episode, action_repeat, title, top) for title, episode in episodes.items()]
+    # Codecs want even sizes, which the pictures have; by default imageio rescales to multiples of 16.
     with imageio.get_writer(path, fps=fps, macro_block_size=2) as writer:
         for pictures in zip(*columns, strict=False):
             height = max(len(picture) for picture in pictures)
@@ -50,21 +38,17 @@ def write_video_side_by_side(path: Path, episodes: Mapping[str, Episode], fps: i
             writer.append_data(np.concatenate(padded, axis=1))  # type: ignore[attr-defined]
 
 
-def annotated_frames(
-    episode: Episode, action_repeat: int = 1, title: str = "", top: float | None = None
-) -> Iterator[np.ndarray]:
+def annotated_frames(episode: Episode, action_repeat: int, title: str, top: float) -> Iterator[np.ndarray]:
     """
     Draw the pictures of ``write_video``.
 
     :param episode: Episode with ``frames``
     :param action_repeat: Environment steps per agent step
-    :param title: Put before the caption
-    :param top: Error at the upper end of the curve; None: the episode's highest
+    :param title: Put before the caption; wrapped if it is long
+    :param top: Error at the upper end of the curve
     :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
     returns = episode.rewards.cumsum()
-    if top is None:
-        top = float(episode.srl_errors.max(initial=0))
     for step, frame in enumerate(episode.frames):
         caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
         errors = episode.srl_errors[: step + 1]
@@ -79,7 +63,7 @@ def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray,
     unit = width // 64  # sizes follow the picture's
     line_height, curve_height = 4 * unit, 10 * unit if len(errors) else 0
     # Only the title may be wrapped, as it is constant: all pictures must have the same number of lines
-    lines = [*_wrapped(title, 3 * unit, width - 2 * unit), caption]
+    lines = [*textwrap.wrap(title, LINE, break_on_hyphens=False), caption]
     if len(errors):
         lines.append(f"SRL error {errors[-1]:.5f} (highest {top:.5f})")
     size = (width + width % 2, height + line_height * len(lines) + curve_height + 2 * unit)
@@ -110,16 +94,6 @@ _font = functools.cache(ImageFont.load_default)
 def _width(line: str, size: int) -> float:
     """Width of a line in pixels, with glyphs such as ``_`` that extend below the next one."""
     return _font(size).getbbox(line)[2]
-
-
-@functools.cache
-def _wrapped(text: str, size: int, width: int) -> list[str]:
-    """Wrap text into as few lines as fit into a width; only words that are wider are broken."""
-    for length in range(len(text), 1, -1):
-        lines = textwrap.wrap(text, length, break_on_hyphens=False)
-        if all(_width(line, size) <= width for line in lines):
-            return lines
-    return [text] if text else []
 
 
 def _fitting_size(line: str, size: int, width: int) -> int:

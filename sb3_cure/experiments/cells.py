@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import platform
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -17,13 +16,14 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import ALGOS, DONE, SETTINGS, Cell, GridError, constructor_defaults, read_kept
+from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, GridError, read_kept
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -32,8 +32,6 @@ from sb3_cure.persistence import ExactCheckpoint
 EVAL_SEED = 10_000
 #: File with the traceback of a failed cell, until it is started again
 ERROR = "error.txt"
-#: Seconds between two writes of ``progress.json``, and between two printed lines
-PROGRESS_SECONDS, PRINT_SECONDS = 2.0, 120.0
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
     "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
@@ -143,7 +141,6 @@ class _CellRun:
             except Exception as error:  # the results are complete without them
                 print(f"{self.folder} lacks some of its pictures: {type(error).__name__}: {error}")
         record.write_tables()
-        record.report(self.model, force=True)
         write_json(self.folder / "run.json", record.conditions(self.model))
         write_text(self.folder / DONE, "")
 
@@ -156,13 +153,7 @@ class _CellRun:
         cell, path = self.cell, self.checkpoints.path
         if not ExactCheckpoint.exists(path):
             return None
-        try:
-            return ALGOS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
-        except ValueError as error:
-            aside = path.with_name(f"unusable-{time.time_ns()}")
-            print(f"{self.folder} starts anew, its checkpoints are kept in {aside.name}: {error}")
-            path.rename(aside)
-            return None
+        return ALGORITHMS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
 
 
 class _TimedCheckpoint(ExactCheckpoint):
@@ -173,7 +164,7 @@ class _TimedCheckpoint(ExactCheckpoint):
     """
 
     def __init__(self, path: Path, minutes: float):
-        super().__init__(save_freq=1, path=path, keep=2)
+        super().__init__(save_freq=1, path=path, keep=2, verbose=1)
         self.seconds = 60 * minutes
         self._due_at = np.inf
 
@@ -189,7 +180,7 @@ class _TimedCheckpoint(ExactCheckpoint):
 
 
 class _Record(BaseCallback):
-    """Evaluate between two agent steps, when all updates are made, and report progress.
+    """Evaluate between two agent steps, when all updates are made.
 
     Its records are plain attributes, which checkpoints keep.
 
@@ -213,8 +204,7 @@ class _Record(BaseCallback):
         self.loss_sum, self.n_losses = th.zeros(()), 0
         #: Sum of the rewards of all transitions that training has collected
         self.rewards_met = 0.0
-        self._now = self._printed_at = time.monotonic()
-        self._reported_at = -np.inf
+        self._now = time.monotonic()
         self._has_begun = False
 
     def state_dict(self) -> dict[str, Any]:
@@ -253,7 +243,6 @@ class _Record(BaseCallback):
         if self.evaluates:
             self.rewards_met += float(np.sum(self.locals["rewards"]))
         self._tick()
-        self.report(self.model)  # type: ignore[arg-type]
         return True
 
     def _on_rollout_start(self) -> None:
@@ -304,35 +293,23 @@ class _Record(BaseCallback):
             row["rewards_met"] = round(self.rewards_met, 3)
         self.evaluations.append(row)
         self.write_tables()
+        print(f"{self.folder}: {row['environment_steps']:,} of {self.cell.budget:,} environment steps", flush=True)
 
     def write_tables(self) -> None:
         write_csv(self.folder / "eval.csv", _EVAL_COLUMNS, self.evaluations)
         write_csv(self.folder / "episodes.csv", _EPISODE_COLUMNS, self.episodes)
 
-    def report(self, model: CuReSAC, force: bool = False) -> None:
-        """Write ``progress.json``, unless that was done a moment ago, and print it now and then."""
-        now = time.monotonic()
-        if force or now - self._reported_at >= PROGRESS_SECONDS:
-            cell, self._reported_at = self.cell, now
-            done = model.num_timesteps * self.action_repeat + (cell.pretraining_steps if self.evaluates else 0)
-            total = cell.pretraining_steps + cell.budget
-            prints = now - self._printed_at >= PRINT_SECONDS
-            self._printed_at = now if prints else self._printed_at
-            write_progress(self.folder, done, total, self.seconds, prints)
-
     def conditions(self, model: CuReSAC) -> dict[str, Any]:
         """Conditions under which the results were obtained.
 
         :param model: The cell's model
-        :return: Versions, machine, arguments as the model has them, times, attempts
+        :return: Versions, machine, times, attempts
         """
         self._begin_attempt(model)
-        names = constructor_defaults(type(model))
         return {
             **describe_run(),
             "device": str(model.device),
             "precision": getattr(model, "_computed_precision", "fp32"),
-            "arguments": {name: getattr(model, name) for name in names if hasattr(model, name)},
             "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
@@ -393,23 +370,6 @@ def is_held(folder: Path) -> bool:
     except OSError:
         return False
     return False
-
-
-def write_progress(folder: Path, done: int, total: int, seconds: float, prints: bool = False) -> None:
-    """Write ``progress.json`` for displays, which may be other processes or machines; errors are ignored.
-
-    :param folder: Folder of the cell
-    :param done: Steps or updates so far
-    :param total: All of them
-    :param seconds: Seconds so far
-    :param prints: Whether to print it, too
-    """
-    left = f", about {(total - done) * seconds / done / 60:.0f} min left" if done else ""
-    text = f"{done:,} of {total:,}{left}"
-    with contextlib.suppress(OSError):
-        write_json(folder / "progress.json", {"text": text, "time": time.time(), "machine": platform.node()})
-    if prints:
-        print(f"{folder}: {text}", flush=True)
 
 
 def _now() -> str:

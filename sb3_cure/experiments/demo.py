@@ -22,7 +22,7 @@ from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
 from sb3_cure.evaluation.result_files import describe_run, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, run_episodes
-from sb3_cure.evaluation.video import write_video_side_by_side
+from sb3_cure.evaluation.video import write_video
 from sb3_cure.networks.allocator import tune_allocator
 
 DOMAIN, TASK = "cartpole", "swingup"
@@ -190,7 +190,7 @@ def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float
         options = dict(deterministic=False, seed=40_000, render=True)
         (films[f"{actor} policy"],) = run_episodes(model, eval_env, 1, actor, **options)
     fps, repeat = round(eval_env.metadata["render_fps"]), eval_env.get_wrapper_attr("action_repeat")
-    write_video_side_by_side(out / "policies.mp4", films, fps, repeat)
+    write_video(out / "policies.mp4", films, fps, repeat)
     return {actor: round(float(errors.mean()), 5) for actor, (_, errors) in visits.items()}
 
 

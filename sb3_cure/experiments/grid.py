@@ -3,7 +3,6 @@
 import contextlib
 import copy
 import importlib
-import inspect
 import json
 import pkgutil
 import re
@@ -18,16 +17,14 @@ import torch as th
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
-from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
+from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, zoo_file
+from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.counting import CellInfo
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
 #: Empty file of a finished cell
 DONE = "DONE"
-#: Algorithms by the name of rl-zoo's ``--algo``
-ALGOS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
 #: Keys of ``config.json`` that decide what is trained, and are compared before results are mixed
 SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
 #: Arguments that may name a class of the user's, as ``"my_module.MyClass"``
@@ -118,7 +115,7 @@ class Method(_Part):
 
     :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
     :param overrides: Changes of the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
-    :param algo: A key of ``ALGOS``
+    :param algo: A key of ``ALGORITHMS``
     :param pretrain: The phase before training, if any
     :param train: Whether the task is learned at all
     :param baseline: Another method, from which its difference is taken instead of from the grid's baseline
@@ -161,6 +158,9 @@ class GridFile(_Part):
         self.baseline = self.baseline or next(iter(self.methods))
         if len({short_name(task) for task in self.tasks}) < len(self.tasks):
             raise ValueError("two tasks would share a folder: write a grid for each, named differently")
+        for name, method in self.methods.items():
+            if method.pretrain is None and not (method.train and self.budget):
+                raise ValueError(f"method {name!r} neither trains nor pretrains: add pretrain, or train it")
         for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
             if name not in self.methods:
                 raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
@@ -188,7 +188,7 @@ class Cell:
     :param env_kwargs: Arguments of ``gymnasium.make``
     :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
-    :param algo: A key of ``ALGOS``
+    :param algo: A key of ``ALGORITHMS``
     :param coverage: Cells of the true state to count, if any
     """
 
@@ -211,11 +211,6 @@ class Cell:
     def folder(self) -> Path:
         """Its folder below the folder of results."""
         return Path(self.experiment, short_name(self.task), self.method, f"seed{self.seed}")
-
-    @property
-    def pretraining_steps(self) -> int:
-        """Environment steps before training."""
-        return self.pretrain.budget if self.pretrain else 0
 
     def build_arguments(self) -> dict[str, Any]:
         """Copy ``arguments``, as SB3 writes into some, and import the classes that they name."""
@@ -269,7 +264,7 @@ class Cell:
         :param changes: Arguments instead of its own
         :return: The model before training
         """
-        return ALGOS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
+        return ALGORITHMS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
 
     def is_done(self, results: Path) -> bool:
         """Whether it has been run.
@@ -286,7 +281,6 @@ class Grid:
 
     :param experiment: Its name, the folder of its results
     :param kind: Decides what the report shows
-    :param baseline: The arm that others are compared with, unless they name a ``baseline`` of their own
     :param cells: The chosen cells, seed by seed, so that whole comparisons are finished early
     :param arms: A cell of each method on each task of the file
     :param description: The whole file, whatever was chosen of it: the content of ``grid.json``
@@ -294,7 +288,6 @@ class Grid:
 
     experiment: str
     kind: str
-    baseline: str
     cells: tuple[Cell, ...]
     arms: tuple[Cell, ...]
     description: dict[str, Any]
@@ -312,24 +305,6 @@ class Grid:
 
 def _changes_rewards(wrapper: Any) -> bool:
     return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper | gym.wrappers.NormalizeReward)
-
-
-def constructor_defaults(algorithm: type) -> dict[str, Any]:
-    """Default values of a constructor's arguments, but for the seed.
-
-    :param algorithm: Class of an algorithm that passes unknown arguments on to its bases
-    :return: Values by name
-    """
-    defaults: dict[str, Any] = {}
-    for cls in inspect.getmro(algorithm):
-        parameters = inspect.signature(vars(cls)["__init__"]).parameters if "__init__" in vars(cls) else {}
-        for name, parameter in parameters.items():
-            if parameter.default is not parameter.empty and not name.startswith("_"):
-                defaults.setdefault(name, parameter.default)
-        if parameters and all(each.kind is not each.VAR_KEYWORD for each in parameters.values()):
-            break
-    defaults.pop("seed", None)
-    return defaults
 
 
 def read_kept(path: Path) -> dict[str, Any]:
@@ -389,22 +364,17 @@ def load_grid(
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
     file.seeds = sorted({*file.seeds, *chosen})
-    of_tasks = _choose(tasks, {**{short_name(task): task for task in file.tasks}, **{t: t for t in file.tasks}}, path)
-    of_arms = _choose(methods, {name: name for name in file.methods}, path)
-    arms = tuple(
-        Cell(
-            *(file.experiment, file.kind, task, arm, chosen[0], file.budget if method.train else 0),
-            *(file.evaluation.every, file.evaluation.episodes, *arm_settings(path, task, method)),
-            *(method.pretrain, method.algo, file.coverage),
-        )
-        for task in file.tasks
-        for arm, method in file.methods.items()
+    of_tasks = _choose(
+        tasks, {short_name(task): task for task in file.tasks} | {task: task for task in file.tasks}, path
     )
-    _check_arms_together(arms, path)
+    of_arms = _choose(methods, {name: name for name in file.methods}, path)
+    arms = tuple(arm_cell(file, path, task, name) for task in file.tasks for name in file.methods)
+    if file.kind == "visitation":
+        _check_pixels(arms, path)
     of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
     cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
     description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump()}
-    return Grid(file.experiment, file.kind, file.baseline, cells, arms, description)
+    return Grid(file.experiment, file.kind, cells, arms, description)
 
 
 def _find(name: str | Path, folder: Path) -> Path:
@@ -437,25 +407,42 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
     file.budget = budget
 
 
-def arm_settings(path: Path, task: str, method: Method) -> tuple[int, dict[str, Any], dict[str, Any]]:
-    """Read the settings of an arm on a task: the zoo file's entry with the grid's overrides.
+def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
+    """Make the cell of an arm on a task, with the zoo file's entry and the grid's overrides.
 
-    :param path: The grid's file, to which the method's ``config`` may be relative
+    :param file: The grid
+    :param path: Its file, to which a method's ``config`` may be relative
     :param task: Gymnasium id
-    :param method: The arm
-    :return: ``n_envs``, ``env_kwargs`` and the algorithm's arguments
-    :raises GridError: if there is no such file or entry
+    :param name: Name of the method
+    :return: The cell, with the file's first seed
+    :raises GridError: if there is no such zoo file or entry
     """
+    method = file.methods[name]
     config = path.parent / _find(method.config, ZOO)
-    entries, name = _read_yaml(config), task.rpartition(":")[2]
-    found = [key for key in (task, name, name.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
+    entries, own = _read_yaml(config), task.rpartition(":")[2]
+    found = [key for key in (task, own, own.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
     if not found:
         raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
     entry = {"policy": "CnnPolicy", **entries[found[0]]}
     for key, value in method.overrides.items():
         entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
-    return entry.pop("n_envs", 1), entry.pop("env_kwargs", {}), entry
+    return Cell(
+        experiment=file.experiment,
+        kind=file.kind,
+        task=task,
+        method=name,
+        seed=file.seeds[0],
+        budget=file.budget if method.train else 0,
+        eval_every=file.evaluation.every,
+        eval_episodes=file.evaluation.episodes,
+        n_envs=entry.pop("n_envs", 1),
+        env_kwargs=entry.pop("env_kwargs", {}),
+        arguments=entry,
+        pretrain=method.pretrain,
+        algo=method.algo,
+        coverage=file.coverage,
+    )
 
 
 def _merged(mapping: Any, overrides: Any) -> Any:
@@ -464,15 +451,11 @@ def _merged(mapping: Any, overrides: Any) -> Any:
     return {**mapping, **{key: _merged(mapping.get(key), value) for key, value in overrides.items()}}
 
 
-def _check_arms_together(arms: Sequence[Cell], path: Path) -> None:
-    """Refuse arms that train nothing, or that end in an error after everything is trained."""
-    seen: dict[str, dict[str, Any]] = {}
+def _check_pixels(arms: Sequence[Cell], path: Path) -> None:
+    """Refuse arms that see other pixels than those by which common heads judge them."""
+    first: dict[str, dict[str, Any]] = {}
     for cell in arms:
-        if cell.budget == 0 and cell.pretrain is None:
-            raise GridError(
-                f"method {cell.method!r} in {path} neither trains nor pretrains: add pretrain, or train it."
-            )
-        if cell.kind == "visitation" and seen.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
+        if first.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
             raise GridError(
                 f"methods in {path} differ in env_kwargs on {cell.task}, but common heads judge all alike: give them "
                 "the same, or write a grid for each."
@@ -519,7 +502,6 @@ def check_arms(cells: Iterable[Cell]) -> None:
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
         try:
             with contextlib.closing(cell.make_env()) as env, untouched_randomness(th.device("cpu")):
-                _warn_of_endless_episodes(env, cell.task)
                 if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
                     raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
                 cell.make_model(env, device="cpu", buffer_size=1)
@@ -528,9 +510,3 @@ def check_arms(cells: Iterable[Cell]) -> None:
         except Exception as error:
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise GridError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error
-
-
-def _warn_of_endless_episodes(env: gym.Env, task: str) -> None:
-    limits = ("_max_episode_steps", "max_episode_steps", "physics")  # episodes of dm_control end by themselves
-    if not any(map(env.has_wrapper_attr, limits)):
-        print(f"{task} has no time limit: an evaluation never ends if its episodes do not end by themselves.")

@@ -4,7 +4,6 @@ The common head of a seed is an autoencoder that is fitted to an even mix of the
 curious policies of the task's *other* seeds. The heads of a task are a unit of work like a cell, with their own folder.
 """
 
-import time
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch as th
 
+from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, srl_errors
-from sb3_cure.experiments.cells import ERROR, PROGRESS_SECONDS, alone_in, write_progress
-from sb3_cure.experiments.grid import ALGOS, Cell, Grid, read_kept, short_name
+from sb3_cure.experiments.cells import ERROR, alone_in
+from sb3_cure.experiments.grid import Cell, Grid, read_kept, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
 #: Updates of a common head
@@ -49,11 +49,10 @@ class CommonHeads:
         """Their folder below the folder of results."""
         return Path(self.grid.experiment, short_name(self.task), "common_heads")
 
-    def seeds(self, results: Path, coming: Sequence[Cell] = ()) -> dict[int, list[Cell]]:
+    def seeds(self, results: Path) -> dict[int, list[Cell]]:
         """All arms by seed, of the seeds of which all arms are finished and have kept their model.
 
         :param results: Folder of all results
-        :param coming: Cells to regard as finished
         :return: Cells by seed
         """
         arms: dict[int, list[Cell]] = {}
@@ -62,7 +61,7 @@ class CommonHeads:
                 arms.setdefault(cell.seed, []).append(cell)
 
         def is_ready(cell: Cell) -> bool:
-            return cell in coming or (cell.is_done(results) and (results / cell.folder / "model.zip").exists())
+            return cell.is_done(results) and (results / cell.folder / "model.zip").exists()
 
         return {seed: cells for seed, cells in arms.items() if all(map(is_ready, cells))}
 
@@ -87,17 +86,16 @@ class CommonHeads:
 Unit: TypeAlias = Cell | CommonHeads
 
 
-def common_heads(grid: Grid, results: Path, coming: Sequence[Cell] = ()) -> list[CommonHeads]:
+def common_heads(grid: Grid, results: Path) -> list[CommonHeads]:
     """Common heads of the chosen tasks that have two seeds to fit them to.
 
     :param grid: A grid
     :param results: Folder of all results
-    :param coming: Cells to regard as finished
     :return: One for each such task; none in grids of another kind than ``"visitation"``
     """
     tasks = dict.fromkeys(cell.task for cell in grid.cells if grid.kind == "visitation")
     every = [CommonHeads(grid, task, COMMON_UPDATES, COMMON_SHARE) for task in tasks]
-    return [heads for heads in every if len(heads.seeds(results, coming)) > 1]
+    return [heads for heads in every if len(heads.seeds(results)) > 1]
 
 
 def run_heads(heads: CommonHeads, results: Path) -> None:
@@ -118,14 +116,12 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
         fingerprint, seeds = heads.fingerprint(results), heads.seeds(results)
         mixes = {seed: _mix(cells, heads.share, results) for seed, cells in seeds.items()}
         tables: dict[Path, list[Row]] = {}
-        begun, reported, total = time.monotonic(), -np.inf, heads.updates * len(seeds)
-        for index, (seed, cells) in enumerate(seeds.items()):
+        for seed, cells in seeds.items():
             judge = _judge(cells[0])
             others = np.concatenate([mixes[other] for other in mixes if other != seed])
-            for number in fit_head(judge, others, heads.updates):
-                if (now := time.monotonic()) - reported > PROGRESS_SECONDS:
-                    reported = now
-                    write_progress(folder, heads.updates * index + number, total, now - begun)
+            for _ in fit_head(judge, others, heads.updates):
+                pass
+            print(f"{heads.folder}: the head of seed {seed} is fitted", flush=True)
             for cell in cells:
                 path = results / cell.folder / "visitation.csv"
                 kept = [row for row in read_rows(path) if row["head"] != "common"]
@@ -133,13 +129,12 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
         for path, rows in tables.items():
             write_csv(path, COLUMNS, rows)
         write_json(folder / RECORD, {**fingerprint, **describe_run()})
-        (folder / "progress.json").unlink(missing_ok=True)
 
 
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
     """The episodes of ``measure_visits`` again by policy, without the known policies."""
     path = results / cell.folder / "model.zip"
-    model = ALGOS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
+    model = ALGORITHMS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
     env = cell.make_eval_env()
     for actor in visiting_actors(model, cell):
         if actor not in known:
@@ -165,7 +160,7 @@ def _judge(cell: Cell) -> CuReSAC:
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
     env = cell.make_eval_env()
-    model: CuReSAC = ALGOS[cell.algo](
+    model: CuReSAC = ALGORITHMS[cell.algo](
         arguments["policy"],
         env,
         srl="rae",

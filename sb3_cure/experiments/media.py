@@ -90,7 +90,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
             for actor in trained_actors(model):
                 (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
                 title = f"{actor} policy, deterministic actions: {_title(cell)}"
-                write_video(folder / f"{actor}_policy.mp4", episode, fps, repeat, title)
+                write_video(folder / f"{actor}_policy.mp4", {title: episode}, fps, repeat)
     if getattr(model.policy, "measures_errors", False) and is_image_space(model.observation_space):
         _draw_replay_buffer(model, cell, repeat, folder)
 
@@ -105,7 +105,5 @@ def _draw_replay_buffer(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -
     with th.no_grad():
         pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))
     title, drawn = f"Highest SRL errors: {_title(cell)}", None if pair is None else pair[1].cpu().numpy()
-    # Each channel counts as a frame, unless they are the frames' grey or colour channels.
-    n_frames, (channels, *_) = infer_frame_stack(model.env), model.observation_space.shape  # type: ignore[arg-type, misc]
-    n_frames = n_frames if channels in (n_frames, 3 * n_frames) else channels
+    n_frames = infer_frame_stack(model.env)  # type: ignore[arg-type]
     plots.highest_error_frames(folder / "uncomfortable.png", found, n_frames, title, drawn)

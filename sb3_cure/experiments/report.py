@@ -22,7 +22,7 @@ from PIL import Image
 
 import sb3_cure
 from sb3_cure.evaluation import plots
-from sb3_cure.experiments import published, statistics, tables
+from sb3_cure.experiments import statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
 from sb3_cure.experiments.tables import (
     NONE,
@@ -37,8 +37,6 @@ from sb3_cure.experiments.tables import (
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
 
 THRESHOLDS = (250.0, 500.0, 750.0)
-#: With more arms than these, each is compared with the baseline only
-PAIRS_UP_TO = 5
 #: Optional files of a cell
 MEDIA = ("task_policy.mp4", "curious_policy.mp4", "reconstructions.png", "uncomfortable.png", "curiosity_map.png")
 
@@ -68,7 +66,7 @@ class Figure:
             return image.size
 
 
-Part: TypeAlias = Table | Figure | str
+Part: TypeAlias = Table | Figure
 
 
 @dataclass(frozen=True)
@@ -124,45 +122,37 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
     if len(updates) and not updates.any():
         headlines.insert(0, render_text("untrained"))
+    parts += curve_figures(experiment, colors)
     if explored := _stacked(experiment, "cells", at_least=1):
-        if grown := _stacked(experiment, "cells"):
-            label, caption = "cells of the true state\nreached in training", render_text("cells_reached", list(grown))
-            parts.append(_figure("cells_reached", caption, plots.learning_curves, grown, colors, label))
         parts.append(tables.cells_reached_table(experiment, explored))
         headlines += _exploration_headlines(experiment, list(explored))
-    parts += curve_figures(experiment, colors)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
         headlines += compared
-        parts = [tables.pretraining_table(experiment)] * (experiment.kind == "pretraining") + parts + more
+        if experiment.kind == "pretraining":
+            parts.insert(0, tables.pretraining_table(experiment))
+        parts += more
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
 
 
 def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
-    """Draw return, SRL loss and SRL error of the policies over training.
+    """Draw cells reached, return, SRL loss and SRL error of the policies over training.
 
     :param experiment: An experiment
     :param colors: By arm
     :return: Figures of those that were recorded
     """
     for column, name, label, logarithmic in (
+        ("cells", "cells_reached", "cells of the true state\nreached in training", False),
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
         ("srl_loss", "srl_loss", "SRL loss", True),
+        ("task_srl_error", "task_srl_error", "SRL error\n(deterministic actions)", True),
+        ("curious_srl_error", "curious_srl_error", "SRL error\n(deterministic actions)", True),
     ):
         if curves := _stacked(experiment, column):
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
-    errors: dict[str, dict[tuple[str, str], Curves]] = {}
-    for actor in ("task", "curious"):
-        for task, arms in _stacked(experiment, f"{actor}_srl_error").items():
-            errors.setdefault(task, {}).update({(arm, actor): lines for arm, lines in arms.items()})
-    if errors:
-        found = {actor for lines in errors.values() for _, actor in lines}
-        actors = [actor for actor in plots.LINE_STYLES if actor in found]
-        label = "SRL error\n(deterministic actions)"
-        caption = render_text("srl_error", list(errors), actors)
-        yield _figure("srl_error", caption, plots.policy_curves, errors, colors, label, True, actors)
 
 
 def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str, dict[str, Curves]]:
@@ -189,9 +179,6 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
             for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
                 if means := [row.mean for row in errors if (row.task, row.head) == (task, other)]:
                     values[label] = float(np.mean(means))
-            theirs = published.SRL_ERROR.get(published.task_key(task))
-            if theirs and experiment.sees_published_pixels:
-                values["paper's cure"] = theirs["curious"].mean
         if bars:
             caption = render_text("visitation_bars", head, {label for values in lines.values() for label in values})
             parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
@@ -239,7 +226,8 @@ def _comparison(
     differences = statistics.paired_differences(experiment)
     parts: list[Part] = [tables.curves_table(experiment, thresholds)]
     met = tables.rewards_met_table(experiment)
-    parts += [met] * (len(met.rows) > 0)
+    if len(met.rows):
+        parts.append(met)
     several = {row.method for row in differences if row.task is None}
     headlines = []
     for row in differences:
@@ -253,19 +241,7 @@ def _comparison(
         headlines.append(render_text("nothing_shared", experiment.baseline))
     else:
         headlines.append(render_text("one_arm"))
-    if pairs := list(_all_pairs(experiment)) if 2 < len(experiment.methods) <= PAIRS_UP_TO else []:
-        note = "As above, over all tasks."
-        parts.append(tables.difference_table(experiment, pairs, note=note, compared="between any two arms"))
-    try:
-        found = statistics.aggregate(experiment)
-    except ResultsError as error:
-        return headlines, [*parts, f"No aggregates: {error}"]
-    if found is None:
-        return headlines, [*parts, render_text("no_aggregates")]
-    iqm = {method: (each.value, each.low or 0.0, each.high or 0.0) for method, each in found.iqm.items()}
-    caption, drawn = render_text("aggregate_scores"), (iqm, found.taus, found.profiles)
-    parts.append(_figure("aggregates", caption, plots.aggregate_scores, *drawn, colors))
-    return headlines, [*parts, tables.aggregate_table(experiment, found)]
+    return headlines, parts
 
 
 def _difference_parts(
@@ -286,14 +262,6 @@ def _difference_parts(
     yield tables.difference_table(experiment, differences)
     finals = statistics.paired_differences(experiment, "finals")
     yield tables.difference_table(experiment, finals, "final return", "As above.")
-
-
-def _all_pairs(experiment: Experiment) -> Iterator[statistics.PairedDifference]:
-    """Any two arms, the later minus the earlier, over all tasks that both have."""
-    for index, other in enumerate(experiment.methods):
-        rows = statistics.paired_differences(experiment, baseline=other)
-        for method in experiment.methods[index + 1 :]:
-            yield from [row for row in rows if row.method == method][:1]
 
 
 def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, list[Part]]]:
@@ -326,11 +294,8 @@ def write_report(
     :return: The files that were written
     :raises ResultsError: with one sentence that names the file and what is wrong
     """
-    experiments = read_results(results)
-    sections = [describe(experiment, thresholds, media) for experiment in experiments]
-    compared = published.compare_with_published(experiments)
-    table = tables.published_table(compared) if compared else None
-    facts = {"title": results.resolve().name, "sections": sections, "comparisons": table, "media": media}
+    sections = [describe(experiment, thresholds, media) for experiment in read_results(results)]
+    facts = {"title": results.resolve().name, "sections": sections, "media": media}
     facts |= {"version": sb3_cure.__version__, "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
     texts = {
         out: tables.render("report.html.j2", **facts),
@@ -343,11 +308,8 @@ def write_report(
         files[folder / "table.md"] = text.encode()
         files |= {folder / part.name: part.content for part in section.parts if isinstance(part, Figure)}
     for path, content in files.items():
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
-        except OSError as error:
-            raise ResultsError(f"{path} cannot be written ({error.strerror}).") from None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
     return list(files)
 
 
@@ -355,7 +317,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure report``.
 
     :param argv: Command line, ``sys.argv`` by default
-    :return: 0, or 1 if the results cannot be read or the report cannot be written
+    :return: 0, or 1 if the results cannot be read
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

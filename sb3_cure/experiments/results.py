@@ -50,14 +50,6 @@ class CellResult:
     def done(self) -> bool:
         return self.status == DONE
 
-    @property
-    def sees_published_pixels(self) -> bool:
-        """Whether its images are those of the published results: only then numbers compare."""
-        crops = self.config["arguments"].get("augmentation") == "crop"
-        usual = {"image_size": 100 if crops else 84, "frame_stack": 3, "renderer": "dmc", "grayscale": False}
-        is_dmc = str(self.config["task"]).startswith("dmc_pixels/")
-        return is_dmc and {**usual, **self.config["env_kwargs"]} == usual
-
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values, where there are any.
 
@@ -164,11 +156,6 @@ class Experiment:
         :return: Cells by seed
         """
         return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}
-
-    @property
-    def sees_published_pixels(self) -> bool:
-        """Whether all of its finished cells do, see ``CellResult``."""
-        return all(cell.sees_published_pixels for cell in self.finished)
 
 
 def read_results(folder: str | Path) -> list[Experiment]:

@@ -2,17 +2,16 @@
 
 import argparse
 import os
-import platform
 import re
 import sys
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from sb3_cure.evaluation.result_files import write_json, write_text
+from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import Grid, GridError, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
@@ -34,7 +33,7 @@ def run_grid(
     pictures: bool = True,
     address: str | None = None,
     cpus_per_cell: float = 1,
-    gpus_per_cell: float | None = None,
+    gpus_per_cell: float = 0,
     retries: int = 3,
 ) -> list[Unit]:
     """Run the cells that are not done; after an interruption, the same call continues.
@@ -48,8 +47,7 @@ def run_grid(
     :param pictures: Whether to draw and to film each cell as well
     :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
-    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU. None
-        only where no machine has a GPU: Ray would start a cell per core, all on the first card
+    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU
     :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
     :raises GridError: with one sentence, before anything is written, if the grid cannot be run
@@ -104,14 +102,7 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 
 
 def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
-    left, failed = list(units), []
-    while left:
-        # Units of other processes come last: common heads wait for them.
-        left.sort(key=lambda unit: is_held(settings[0] / unit.folder))
-        unit = left.pop(0)
-        if not _run_unit(unit, *settings):
-            failed.append(unit)
-    return failed
+    return [unit for unit in units if not _run_unit(unit, *settings)]
 
 
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
@@ -156,56 +147,44 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     except ImportError:
         raise GridError('engine="ray" needs Ray, which is not installed: pip install "sb3-cure[cluster]".') from None
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
+    ray.init(address=address or "local", **own)
     try:
-        ray.init(address=address or "local", **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:  # also where RAY_AUTH_TOKEN is missing
-        reason = " ".join(str(error).split())
-        raise GridError(f"Ray does not connect to --address {address!r} ({reason}).") from None
-    try:
-        _check_resources(ray.nodes(), resources)
         # One process per unit, so that nothing of a unit burdens the next.
-        remote = ray.remote(max_calls=1, **{**resources, "num_gpus": resources["num_gpus"] or 0})(_run_on_worker)
-
-        def run_all(units: Sequence[Unit], settings: Settings) -> list[Unit]:
-            pending = {remote.remote(unit, settings, bool(resources["num_gpus"])): unit for unit in units}
-            failed = []
-            while pending:
-                for reference in ray.wait(list(pending), timeout=5)[0]:
-                    unit = pending.pop(reference)
-                    error = ""
-                    try:
-                        succeeded = ray.get(reference)
-                    except ray.exceptions.RayError as died:  # more often than `retries`
-                        succeeded, error = False, f"{died}\n"
-                    if succeeded and not (settings[0] / unit.folder).exists():
-                        error = f"{settings[0]} on the worker's machine is another folder than here: share one (--out)"
-                    if error:
-                        _write_error(unit, settings[0], error)
-                    if error or not succeeded:
-                        failed.append(unit)
-            return failed
-
-        yield run_all
+        remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
+        yield partial(_run_remotely, remote, bool(resources["num_gpus"]))
     finally:
         ray.shutdown()
 
 
-def _check_resources(nodes: Sequence[dict[str, Any]], resources: dict[str, Any]) -> None:
-    """Refuse cells that fit on no machine, which would wait for ever, and GPUs that Ray would not share out."""
-    for kind, amount in {"CPU": resources["num_cpus"], "GPU": resources["num_gpus"]}.items():
-        flag = f"--{kind.lower()}s-per-cell"
-        largest = max((node["Resources"].get(kind, 0) for node in nodes if node["Alive"]), default=0)
-        if amount is None and largest > 0:
-            raise GridError(f"The cluster has GPUs: give {flag}, the share of one per cell (0: compute on the CPU).")
-        if amount is not None and amount > largest:
-            raise GridError(f"{flag} is {amount:g}, but no machine of the cluster has more than {largest:g}.")
+def _run_remotely(remote: Any, has_gpu: bool, units: Sequence[Unit], settings: Settings) -> list[Unit]:
+    import ray
+
+    results, failed = settings[0], []
+    pending = {remote.remote(unit, settings, has_gpu): unit for unit in units}
+    while pending:
+        for reference in ray.wait(list(pending), timeout=5)[0]:
+            unit = pending.pop(reference)
+            try:
+                succeeded = ray.get(reference)
+            except ray.exceptions.RayError as died:  # more often than `retries`
+                succeeded = False
+                _write_error(unit, results, f"{died}\n")
+            if succeeded and not (results / unit.folder).exists():
+                succeeded = False
+                error = f"{results} on the worker's machine is another folder than here: share one (--out)"
+                _write_error(unit, results, error)
+            if not succeeded:
+                failed.append(unit)
+    return failed
 
 
 # ---------------------------------------------------------------- progress
 
 
 def status_lines(units: Sequence[Unit], results: Path) -> list[str]:
-    """State of each unit, and of those that have begun how far they are.
+    """State of each unit, and of cells that have begun their last evaluation.
+
+    Locks of other machines may be invisible: their cells read "interrupted" then.
 
     :param units: Cells and common heads
     :param results: Folder of all results
@@ -218,14 +197,16 @@ def _status(unit: Unit, results: Path) -> str:
     folder = results / unit.folder
     if unit.is_done(results):
         return "done"
-    if not (folder / "progress.json").exists():
-        return "running" if is_held(folder) else "failed" if (folder / ERROR).exists() else "waiting"
-    progress = read_kept(folder / "progress.json")
-    # Locks of other machines may be invisible; evaluations and bursts of updates report nothing for a while.
-    reports = progress["machine"] != platform.node() and time.time() - progress["time"] < 600
-    is_running = is_held(folder) or reports
-    state = "running" if is_running else "failed" if (folder / ERROR).exists() else "interrupted"
-    return f"{state}, {progress['text']}"
+    if is_held(folder):
+        state = "running"
+    elif (folder / ERROR).exists():
+        state = "failed"
+    else:
+        state = "interrupted" if (folder / "config.json").exists() else "waiting"
+    evaluations = read_rows(folder / "eval.csv") if (folder / "eval.csv").exists() else []
+    if not evaluations:
+        return state
+    return f"{state}, evaluated at {evaluations[-1]['environment_steps']:,} environment steps"
 
 
 # ---------------------------------------------------------------- command line
@@ -264,7 +245,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
     add("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
-    add("--gpus-per-cell", type=float, help="Ray: share of a GPU per cell, such as 0.25; 0: compute on the CPU")
+    add("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell (default: 0, compute on the CPU)")
     add("--retries", type=int, default=3, help="Ray: new starts of a cell after its worker died")
     add("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     add("--no-pictures", dest="pictures", action="store_false", help="neither draw nor film")
@@ -280,19 +261,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options = vars(parser.parse_args(arguments))
-    if "" not in sys.path:
-        sys.path.append("")  # a grid may name a class of a module in the working directory
-    ray_only = ("address", "gpus_per_cell", "cpus_per_cell", "retries")
-    given = [name for name in ray_only if options[name] != parser.get_default(name)]
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
     try:
         grid = load_grid(path, **choice)
-        if options["engine"] == "local" and given:
-            raise GridError(f"--{given[0].replace('_', '-')} needs --engine ray.")
         if dry_run:
             check_grid(grid, out)
-            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out, grid.cells)], out)), flush=True)
+            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out)], out)), flush=True)
             return 0
         failed = run_grid(grid, out, **options)
     except GridError as error:

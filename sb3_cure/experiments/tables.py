@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 
-from sb3_cure.experiments import published, statistics
+from sb3_cure.experiments import statistics
 from sb3_cure.experiments.results import NOT_RUN, CellResult, Experiment
 from sb3_cure.experiments.statistics import Estimate, PairedDifference
 from sb3_cure.experiments.visit_statistics import GRID_INTERVALS, Coverage, ErrorSummary
@@ -153,12 +153,6 @@ def ratio_text(estimate: Estimate) -> str:
     return f"{number_text(estimate.value, 2)} {shown}" if math.isfinite(estimate.value) else NONE
 
 
-def _published(value: published.MeanStd | None) -> str:
-    if value is None:
-        return NONE
-    return number_text(value.mean) + (f" ± {number_text(value.std)}" if value.std is not None else "")
-
-
 def plural(count: int, noun: str) -> str:
     """Count and noun: ``"1 seed"``, ``"2 seeds"``.
 
@@ -205,7 +199,7 @@ def _state(experiment: Experiment, task: str, method: str) -> str:
 
 
 def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
-    """Area under the curve, final return, spread over seeds, steps to thresholds.
+    """Area under the curve, final return, steps to thresholds.
 
     :param experiment: An experiment
     :param thresholds: Returns, for the steps to reach them
@@ -216,12 +210,10 @@ def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
         digits = return_digits(experiment, task)
         arm = statistics.summarise_arm(experiment, task, method, thresholds)
         row = [_mean_std(values, digits) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
-        spreads = statistics.interquartile_range(arm.finals), arm.curve_iqr
-        row += [number_text(spread, digits) for spread in spreads]
         row += [_reached(arm.reached[limit], experiment.budget) for limit in thresholds]
         rows.append([task, method, str(len(arm.seeds)), *row])
     steps = "".join(f"; >steps to {limit:,.15g}".replace("-", "\N{MINUS SIGN}") for limit in thresholds)
-    columns = "task; arm; >seeds; >area under curve; >final return; >IQR, final; >IQR, curve" + steps
+    columns = "task; arm; >seeds; >area under curve; >final return" + steps
     return _table("Learning curves", columns, rows, render_text("curves"))
 
 
@@ -239,30 +231,26 @@ def difference_table(
     rows: Sequence[PairedDifference],
     measure: str = "area under the curve",
     note: str | None = None,
-    compared: str | None = None,
 ) -> Table:
-    """Paired differences with both intervals.
+    """Paired differences with their intervals.
 
     :param experiment: An experiment
     :param rows: Its paired differences
     :param measure: Of what
     :param note: What to know about them, by default everything
-    :param compared: From which arm: by default the baseline; each row of another one names it
     :return: The table
     """
-    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >95 % percentile; >above; verdict"
+    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >above; verdict"
     shown = []
     for row in rows:
-        digits = difference_digits(row, experiment)
-        label = difference_label(row, None if compared else experiment.baseline)
-        numbers = [str(row.pairs), str(row.same_starts), *_value_and_interval(row.t, digits)]
-        numbers += [interval_text(row.percentile, digits), str(row.wins)]
-        shown.append([label, tasks_text(row), *numbers, row.t.verdict])
-    title = f"Paired difference {compared or f'from {compared_with(rows, experiment)}'}: {measure}"
+        value, interval = _value_and_interval(row.t, difference_digits(row, experiment))
+        numbers = [str(row.pairs), str(row.same_starts), value, interval, str(row.wins)]
+        shown.append([difference_label(row, experiment.baseline), tasks_text(row), *numbers, row.t.verdict])
+    title = f"Paired difference from {compared_with(rows, experiment)}: {measure}"
     return _table(title, columns, shown, render_text("differences") if note is None else note)
 
 
-def difference_label(row: PairedDifference, baseline: str | None) -> str:
+def difference_label(row: PairedDifference, baseline: str) -> str:
     """The arm, and the arm that it is compared with unless that is the baseline.
 
     :param row: A paired difference
@@ -303,41 +291,20 @@ def tasks_text(row: PairedDifference) -> str:
     return row.task or plural(len(row.differences), "task") + left_out
 
 
-def aggregate_table(experiment: Experiment, found: statistics.Aggregates) -> Table:
-    """Interquartile means and probabilities of improvement.
-
-    :param experiment: An experiment
-    :param found: Its aggregates
-    :return: The table
-    """
-    varied = any(experiment.baseline_of(method) != experiment.baseline for method in found.improvement)
-    better = {method: found.improvement.get(method, Estimate(math.nan)) for method in found.iqm}
-    rows = [
-        [method, *_value_and_interval(iqm, 3), *_value_and_interval(better[method], 2)]
-        for method, iqm in found.iqm.items()
-    ]
-    columns = ["arm", ">IQM", ">95 %", f">P(arm > {'its baseline' if varied else experiment.baseline})", ">95 %"]
-    note = render_text("aggregates", found, statistics.HIGHEST_RETURN, _baselines(experiment) if varied else "")
-    return Table("Aggregates over tasks", pd.DataFrame(rows, columns=columns), note)
-
-
 def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Table:
-    """SRL error by policy and head, and the paper's.
+    """SRL error by policy and head.
 
     :param experiment: An experiment
     :param summaries: SRL errors that its policies meet
     :return: The table
     """
-    compares, rows = experiment.sees_published_pixels, []
+    rows = []
     for row in summaries:
-        theirs = published.SRL_ERROR.get(published.task_key(row.task), {}).get(row.actor)
-        shown = " / ".join(f"{value:.4f}" for value in theirs) if theirs and compares and row.head == "own" else NONE
-        errors = [f"{value:.2e}" for value in (row.error_min, row.mean, row.error_max)]
         policy = [row.task, row.method, row.head.replace("_", " "), row.actor, str(len(row.values))]
-        rows.append([*policy, *errors, ratio_text(row.ratio), ratio_text(row.task_ratio), shown])
-    columns = "; ".join(["task; arm; head; actor; >seeds; >min; >mean; >max", *_RATIOS, ">paper"])
-    note = render_text("errors", published, _baselines(experiment), compares)
-    return _table("SRL error per step", columns, rows, note)
+        errors = [f"{value:.2e}" for value in (row.error_min, row.mean, row.error_max)]
+        rows.append([*policy, *errors, ratio_text(row.ratio), ratio_text(row.task_ratio)])
+    columns = "; ".join(["task; arm; head; actor; >seeds; >min; >mean; >max", *_RATIOS])
+    return _table("SRL error per step", columns, rows, render_text("errors", _baselines(experiment)))
 
 
 def _baselines(experiment: Experiment) -> str:
@@ -402,47 +369,17 @@ def rewards_met_table(experiment: Experiment) -> Table:
 
 
 def pretraining_table(experiment: Experiment) -> Table:
-    """Final returns and the paper's.
+    """Final returns.
 
     :param experiment: An experiment of kind ``"pretraining"``
     :return: The table
     """
-    rows, compares = [], experiment.sees_published_pixels
+    rows = []
     for task, method in experiment.arms:
         finals = statistics.summarise_arm(experiment, task, method).finals
-        papers = published.PRETRAINING.get(method.lower().replace("-", "_"), {}) if compares else {}
-        theirs = papers.get(published.task_key(task))
-        difference = number_text(float(finals.mean()) - theirs.mean) if len(finals) and theirs else NONE
-        ours = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
-        rows.append([task, method, str(len(finals)), ours, _published(theirs), difference])
-    note = render_text("pretraining", published.PAPER, experiment.budget, compares)
-    title = "Final return after pretraining, and the paper's"
-    return _table(title, "task; arm; >seeds; >ours; >paper; >difference", rows, note)
-
-
-def published_table(comparisons: Sequence[published.Comparison]) -> Table:
-    """Our returns, published ones, and the difference.
-
-    :param comparisons: Arms compared with published numbers
-    :return: The table
-    """
-    rows = []
-    for row in comparisons:
-        others = [
-            f"{name} {_published(value)}"
-            for name, tables in published.RETURNS.items()
-            if name != row.published_as and (value := tables[row.steps].get(published.task_key(row.task)))
-        ]
-        ours = number_text(row.ours) + (f" ± {number_text(row.std)}" if math.isfinite(row.std) else "")
-        theirs = [NONE, NONE, NONE]
-        if row.theirs is not None:
-            theirs = [f"{row.published_as} {_published(row.theirs)}", number_text(row.ours - row.theirs.mean)]
-            theirs.append(f"{row.ours / row.theirs.mean:.3f}")
-        run = [row.experiment, row.task, row.method, number_text(row.steps), str(row.seeds), ours]
-        judgement = render_text("judgement", row, published.SUSPECT_BELOW)
-        rows.append([*run, *theirs, judgement, "; ".join(others) or NONE])
-    columns = "experiment; task; arm; >steps; >seeds; >ours; >theirs; >difference; >ratio; judgement; other methods"
-    return _table("Beside published returns", columns, rows, render_text("beside_published", published))
+        shown = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
+        rows.append([task, method, str(len(finals)), shown])
+    return _table("Final return after pretraining", "task; arm; >seeds; >final return", rows)
 
 
 def conditions_table(experiment: Experiment) -> Table:

@@ -17,7 +17,7 @@ class RewardInputs:
     """What an intrinsic reward may read in one update; latents are computed when they are first read.
 
     :param batch: The true transitions
-    :param srl_error: SRL error of each sample, before the head's step, detached, [B]; None unless ``needs_srl``
+    :param judge: Returns the SRL error of each sample; None unless the reward says ``needs_srl``
     :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
     :param replay_buffer: The replay buffer, which has just drawn the batch
     :param look_up: Returns stored transitions by rows and environments, [n] each
@@ -27,15 +27,23 @@ class RewardInputs:
     def __init__(
         self,
         batch: Samples,
-        srl_error: th.Tensor | None,
+        judge: Callable[[], th.Tensor] | None,
         read: Callable[[str], th.Tensor],
         replay_buffer: ReplayBuffer,
         look_up: Callable[[np.ndarray, np.ndarray], Samples],
         encode: Callable[[Any], th.Tensor],
     ):
-        self.batch, self.srl_error = batch, srl_error
+        self.batch = batch
         self.replay_buffer, self.look_up, self.encode = replay_buffer, look_up, encode
-        self._read = read
+        self._judge, self._read = judge, read
+
+    @cached_property
+    def srl_error(self) -> th.Tensor:
+        """SRL error of each sample, before the head's step, detached, [B]; only for rewards that say ``needs_srl``."""
+        if self._judge is None:
+            raise ValueError("inputs.srl_error is for rewards that set needs_srl = True.")
+        with th.enable_grad():  # as in `_read_with_graph`
+            return self._judge()
 
     @cached_property
     def latents(self) -> th.Tensor:
@@ -56,7 +64,7 @@ class RewardInputs:
         """
         return RewardInputs(
             self.batch.of(key),
-            self.srl_error,
+            lambda: self.srl_error,
             lambda name: (self.latents if name == "observations" else self.next_latents)[:, where],
             self.replay_buffer,
             lambda rows, env_inds: self.look_up(rows, env_inds).of(key),

@@ -6,12 +6,12 @@ import torch as th
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
-from sb3_cure.intrinsic.reward_networks import scaled
 from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
+from sb3_cure.networks.layers import RunningStandardize
 
 
 class Reconstruction(IntrinsicReward):
-    """Squared error of a decoder, trained on detached latents, of where the step leads.
+    """Squared error of a decoder, trained on detached latents, of where the step leads; vectors are standardised.
 
     The SRL error of an autoencoder without its head: the encoder may learn by contrast, whose own error falls with
     novelty, and pictures show what its latents hold.
@@ -26,11 +26,13 @@ class Reconstruction(IntrinsicReward):
     def __init__(self, *args: Any, n_filters: int = 16, n_layers: int = 4):
         super().__init__(*args)
         self.decoder: PixelDecoder | VectorDecoder
+        self.vectors: RunningStandardize | None = None
         if is_image_space(self.observation_space):
             shape: tuple[int, ...] = self.observation_space.shape  # type: ignore[assignment]
             n_layers = min(n_layers, (min(shape[1:]) + 1) // 4)
             self.decoder = PixelDecoder(self.features_dim, shape, n_filters, n_layers)
         else:
+            self.vectors = RunningStandardize(self.observation_space)
             self.decoder = VectorDecoder(self.features_dim, get_flattened_obs_dim(self.observation_space))
 
     @classmethod
@@ -44,6 +46,8 @@ class Reconstruction(IntrinsicReward):
         :param inputs: Its next observations and their latents are read
         :return: Mean squared error, and that of each sample, [B]
         """
+        if self.vectors is not None:
+            self.vectors.update(inputs.batch.next_observations)
         error = self._squared_error(inputs.batch.next_observations, inputs.next_latents)
         return error.mean(), error.detach()
 
@@ -71,6 +75,6 @@ class Reconstruction(IntrinsicReward):
         return squared_error(self.decoder, latents, observations, self._target)
 
     def _target(self, observations: th.Tensor) -> th.Tensor:
-        if observations.dim() == 4:  # in the memory order in which the decoder draws
-            return observations.float().div_(255).sub_(0.5)
-        return scaled(observations, self.observation_space)
+        if self.vectors is not None:
+            return self.vectors(observations)  # type: ignore[no-any-return]
+        return observations.float().div_(255).sub_(0.5)  # in the memory order in which the decoder draws

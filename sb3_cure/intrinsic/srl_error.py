@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import DITHER
-from sb3_cure.networks.layers import flatten_vectors, scale_images
+from sb3_cure.networks.layers import scale_images
 from sb3_cure.srl import SRLHead
 
 
@@ -63,7 +63,6 @@ class SRLError(IntrinsicReward):
         :return: None, and the error, [B]
         """
         if not self.per_pixel:
-            assert inputs.srl_error is not None
             return None, inputs.srl_error
         batch = inputs.batch
         target = self._target(batch.next_observations if self.is_about_next else batch.observations)
@@ -88,7 +87,7 @@ class SRLError(IntrinsicReward):
         views = srl.augment.center(observations)
         if views.dim() == 4:
             return scale_images(views.contiguous(memory_format=th.channels_last))
-        return flatten_vectors(views, srl.encoder.view_space)
+        return srl.encoder.flatten(views)  # type: ignore[no-any-return]
 
     def _error(self, target: th.Tensor, latents: th.Tensor) -> th.Tensor:
         drawn = self._srl[0].reconstruct(latents)

@@ -21,6 +21,7 @@ from sb3_cure.networks.layers import (
     Projection,
     RunningStandardize,
     conv_sizes,
+    flatten_vectors,
     init_weights,
     scale_images,
 )
@@ -65,6 +66,14 @@ class Encoder(BaseFeaturesExtractor):
 
         :param views: [B, *view shape]
         """
+
+    def flatten(self, views: Any) -> th.Tensor:
+        """Flatten views of vectors as an autoencoder draws them: in the units in which the trunk reads them.
+
+        :param views: [B, *view shape]
+        :return: fp32, [B, n]
+        """
+        return flatten_vectors(views, self.view_space)
 
     def forward(self, views: Any) -> th.Tensor:
         """Encode views.
@@ -150,6 +159,14 @@ class VectorEncoder(Encoder):
         :param views: [B, *shape], or a dictionary of them
         """
         self.trunk[0].update(views)  # type: ignore[index, operator]
+
+    def flatten(self, views: Any) -> th.Tensor:
+        """Flatten and standardise views: forces of 100 N would drown joints in an error of raw units.
+
+        :param views: [B, *shape], or a dictionary of them
+        :return: fp32, [B, n]
+        """
+        return self.trunk[0](views)  # type: ignore[index, operator, no-any-return]
 
 
 class DictTrunk(nn.Module):

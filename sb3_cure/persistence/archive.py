@@ -226,9 +226,9 @@ class SavesModels(OffPolicyAlgorithm):
         env = maybe_make_env(env, kwargs.get("verbose", 0))  # type: ignore[arg-type]
         with reading(path, "zip") as (file, name):
             archive = ModelArchive(file, name)
-        if archive.is_pickled and trusted:
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         if archive.is_pickled:
+            if trusted:
+                return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
             raise ArchiveError(
                 f"{name} holds pickled settings, as SB3 saves them, and unpickling runs any code that is in them: if "
                 "you know where it comes from, load it with trusted=True (and save it again, which needs no pickle)."
@@ -255,23 +255,29 @@ class SavesModels(OffPolicyAlgorithm):
             raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
         vars(model).update(kwargs)
         model._setup_model()
-        # A temperature that was given stays as it was set up.
         given = {key for key in _TEMPERATURES if key in kwargs and kwargs[key] != settings.get(key)}
-        if "ent_coef" in given and getattr(model, "curiosity_ent_coef", None) is None:
-            given.add("curiosity_ent_coef")
+        model._load_tensors(archive, given)
+        return model
+
+    def _load_tensors(self, archive: ModelArchive, given: set[str]) -> None:
+        """Load all but the settings.
+
+        :param archive: Archive of such a model
+        :param given: Settings of temperatures that were given; these stay as they were set up
+        """
+        if "ent_coef" in given and getattr(self, "curiosity_ent_coef", None) is None:
+            given = {*given, "curiosity_ent_coef"}
         fresh = {name for key in given for name in _TEMPERATURES[key]}
-        saved, own = archive.read("parameters"), model.get_parameters()
-        parameters = {key: state for key, state in saved.items() if key not in fresh}
-        parameters |= {key: state for key, state in own.items() if key in fresh}
-        model.set_parameters(parameters, exact_match=True, device=device)
+        parameters = {key: state for key, state in archive.read("parameters").items() if key not in fresh}
+        parameters |= {key: state for key, state in self.get_parameters().items() if key in fresh}
+        self.set_parameters(parameters, exact_match=True, device=self.device)
         variables, states = archive.read("variables"), archive.read("parts")
-        with refusing(name):
-            for key in {*model._get_torch_save_params()[1]} - fresh:
-                recursive_getattr(model, key).data.copy_(variables[key])
-            for key, part in model._stateful_parts().items():
+        with refusing(archive.name):
+            for key in {*self._get_torch_save_params()[1]} - fresh:
+                recursive_getattr(self, key).data.copy_(variables[key])
+            for key, part in self._stateful_parts().items():
                 if key in states:
                     part.load_state_dict(states[key])
-        return model
 
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: th.device | str = "auto"

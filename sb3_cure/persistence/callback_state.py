@@ -1,4 +1,7 @@
-"""State of callbacks: their own ``state_dict()``, or the plain attributes that have changed since they were set up."""
+"""State of callbacks: their own ``state_dict()``, or the plain attributes that have changed since they were set up.
+
+An object that a callback keeps under two names becomes two objects.
+"""
 
 import io
 from typing import Any
@@ -10,7 +13,6 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.persistence.encoding import write_state
-from sb3_cure.persistence.env_state import NotKept, check_sharing
 
 #: Attribute with the contents of a callback's attributes when its first ``learn`` began
 _INITIAL = "_sb3_cure_initial"
@@ -46,10 +48,6 @@ def callback_state(callback: BaseCallback) -> dict[str, Any]:
     state["changed"] = {name: attributes[name] for name in changed}
     if not type(callback).__module__.startswith("stable_baselines3."):  # progress bars and the like are no state
         state["missing"] = [f"{state['class']}.{name}" for name, content in contents.items() if content is None]
-        try:
-            check_sharing(state["changed"].values(), state["class"])
-        except NotKept as error:
-            state["missing"].append(f"which memory {state['class']} shares ({error})")
     return state
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -15,11 +14,11 @@ from sb3_cure.data.frame_ring import FrameRing
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
 from sb3_cure.persistence.files import flush_to_disk
-from sb3_cure.persistence.generations import CheckpointError, Generation, Generations
-from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state, can_be_kept
+from sb3_cure.persistence.generations import CheckpointError, Generations
+from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
 from sb3_cure.persistence.resume import Run, training_state
 
-MODEL, STATE, BUFFER = "model.zip", "state.safetensors", "replay_buffer.safetensors"
+MODEL, STATE = "model.zip", "state.safetensors"
 
 
 class _Segment(NamedTuple):
@@ -39,9 +38,9 @@ class CheckpointWriter:
 
     def __init__(self, path: str | Path):
         self.generations = Generations(path)
-        self._segments: dict[str, list[_Segment]] = {}
-        #: Rings with the frames that the segments hold
-        self._rings: dict[str, FrameRing] = {}
+        #: Rings of the replay buffer, and which of their frames are in files, by the key of their image
+        self.rings: dict[str, FrameRing] = {}
+        self.segments: dict[str, list[_Segment]] = {}
 
     def write(self, model: OffPolicyAlgorithm, run: Run, keep: int) -> dict[str, Any]:
         """Write a checkpoint.
@@ -54,33 +53,22 @@ class CheckpointWriter:
         """
         state = training_state(model, run)
         buffer: Any = model.replay_buffer
-        rings = rings_of(buffer)
         segments: dict[str, list[_Segment]] = {}
-
-        def fill(folder: Path, number: int) -> dict[str, str]:
-            model.save(folder / MODEL)
-            if rings:
-                for place, (key, ring) in enumerate(rings.items()):
-                    segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{number:06d}")
-                state["buffer"] = buffer_state(buffer, frames=False)
-                state["segments"] = {key: [list(each[:3]) for each in own] for key, own in segments.items()}
-            else:
-                model.save_replay_buffer(folder / BUFFER)
-            write_state(folder / STATE, state)
-            return {segment.name: segment.digest for own in segments.values() for segment in own}
-
-        self.generations.write(fill, keep)
-        self.remember(rings, segments)
+        with self.generations.writing(keep) as draft:
+            model.save(draft.folder / MODEL)
+            for place, (key, ring) in enumerate(buffer.rings.items()):
+                segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{draft.number:06d}")
+                draft.sums.update({f"../segments/{each.name}": each.digest for each in segments[key]})
+            state["buffer"] = buffer_state(buffer, frames=False)
+            state["segments"] = {key: [list(each) for each in own] for key, own in segments.items()}
+            write_state(draft.folder / STATE, state)
+        self.rings, self.segments = buffer.rings, segments
         return state
-
-    def remember(self, rings: dict[str, FrameRing], segments: dict[str, list[_Segment]]) -> None:
-        """Note which frames are in files, so that they are not written again."""
-        self._rings, self._segments = rings, segments
 
     def _write_frames(self, ring: FrameRing, last: int, key: str, suffix: str) -> list[_Segment]:
         """Write new frames up to number ``last``, and leave out segments that the ring has overwritten."""
         oldest = max(last - ring.capacity, 0)
-        known = self._segments[key] if self._rings.get(key) is ring else []
+        known = self.segments[key] if self.rings.get(key) is ring else []
         segments = [segment for segment in known if segment.last > oldest]
         first = max(segments[-1].last if segments else 0, oldest)
         if first < last:
@@ -94,78 +82,31 @@ class CheckpointWriter:
             segments.append(_Segment(path.name, first, last, digest.hexdigest()))
         return segments
 
+    def read(self, model: Any, folder: Path) -> dict[str, Any]:
+        """Give a model that was loaded from a checkpoint's archive its replay buffer.
 
-def rings_of(buffer: ReplayBuffer | None) -> dict[str, FrameRing]:
-    """List the rings of frames of a replay buffer.
-
-    :param buffer: Replay buffer
-    :return: Rings by the key of their image; of observations that are no dictionary, under ``""``
-    """
-    return buffer.rings if isinstance(buffer, FrameStackReplayBuffer) else {}
-
-
-def load_checkpoint(model: Any, generation: Generation, writer: CheckpointWriter) -> dict[str, Any]:
-    """Give a model that was loaded from a checkpoint's archive its replay buffer.
-
-    :param model: Model
-    :param generation: Checkpoint
-    :param writer: Writer of this folder's checkpoints
-    :return: Training state
-    :raises CheckpointError: if it does not fit the environments
-    """
-    folder = generation.folder
-    state = read_state(folder / STATE)
-    if model.n_envs != state["n_envs"]:
-        raise CheckpointError(
-            f"resume got {model.n_envs} environments, but {folder} was written with {state['n_envs']}: give as many."
-        )
-    if "buffer" not in state:
-        model.load_replay_buffer(folder / BUFFER, truncate_last_traj=False)
+        :param model: Model
+        :param folder: Folder of the checkpoint
+        :return: Training state
+        :raises CheckpointError: if it is of another number of environments
+        """
+        state = read_state(folder / STATE)
+        if model.n_envs != state["n_envs"]:
+            raise CheckpointError(
+                f"resume got {model.n_envs} environments, but {folder} was written with {state['n_envs']}: give as "
+                "many."
+            )
+        buffer = model.replay_buffer = buffer_from_state(model, state.pop("buffer"), str(folder))
+        self.rings = buffer.rings
+        self.segments = {key: [_Segment(*each) for each in own] for key, own in state.pop("segments").items()}
+        for key, ring in self.rings.items():
+            for segment in self.segments[key]:
+                first = max(segment.first, buffer.counts[key] - ring.capacity)
+                with (self.generations.segments / segment.name).open("rb") as file:
+                    file.seek((first - segment.first) * int(np.prod(ring.frame_shape)))
+                    for piece in ring.pieces(first, segment.last):
+                        file.readinto(piece)
         return state
-    model.replay_buffer = buffer_from_state(model, state["buffer"], str(folder))
-    rings = rings_of(model.replay_buffer)
-    segments: dict[str, list[_Segment]] = {}
-    for key, ring in rings.items():
-        segments[key] = [
-            _Segment(name, first, last, generation.sums.get(f"../segments/{name}", ""))
-            for name, first, last in state["segments"][key]
-        ]
-        for name, first, last, digest in segments[key]:
-            if not digest:
-                raise CheckpointError(f"{folder} lacks the checksum of {name}")
-            kept = max(first, model.replay_buffer.counts[key] - ring.capacity)
-            with (writer.generations.segments / name).open("rb") as file:
-                file.seek((kept - first) * int(np.prod(ring.frame_shape)))
-                for piece in ring.pieces(kept, last):
-                    file.readinto(piece)
-    writer.remember(rings, segments)
-    return state
-
-
-def newest_generation(path: str | Path) -> Generation:
-    """Find the newest whole checkpoint, with a warning if others are newer.
-
-    :param path: Folder of checkpoints
-    :return: Checkpoint
-    :raises CheckpointError: if there is none
-    """
-    generations = Generations(path)
-    reasons = []
-    for number in reversed(generations.numbers()):
-        try:
-            generation = generations.read(number)
-        except CheckpointError as error:
-            reasons.append(str(error))
-            continue
-        damaged = generation.damaged()
-        if not damaged:
-            if reasons:
-                warnings.warn(f"{'; '.join(reasons)}. Resuming from {generation.folder.name} instead.", stacklevel=3)
-            return generation
-        reasons += [f"{each} is damaged or missing" for each in damaged]
-    if not reasons:
-        raise CheckpointError(f"there is no checkpoint in {path}: give the folder of an ExactCheckpoint.")
-    raise CheckpointError(f"no checkpoint in {path} is whole ({'; '.join(dict.fromkeys(reasons))}): start anew.")
 
 
 class ExactCheckpoint(BaseCallback):
@@ -234,9 +175,11 @@ class ExactCheckpoint(BaseCallback):
         name = type(self.model).__name__
         if not isinstance(getattr(self.model, "_run", None), Run):
             raise ValueError(f"ExactCheckpoint needs an algorithm that can resume, not {name}: use CheckpointCallback.")
-        buffer = type(self.model.replay_buffer)  # type: ignore[attr-defined]
-        if not can_be_kept(buffer):
-            raise ValueError(f"ExactCheckpoint cannot save a {buffer.__name__} without pickle: use another buffer.")
+        if type(self.model.replay_buffer) is not FrameStackReplayBuffer:  # type: ignore[attr-defined]
+            raise ValueError(
+                f"ExactCheckpoint saves a FrameStackReplayBuffer alone: give {name} "
+                "replay_buffer_class=FrameStackReplayBuffer, replay_buffer_kwargs=dict(frame_stack=1)."
+            )
         path = self.path.resolve()
         if path not in self._run.writers and self.exists(path):
             raise CheckpointError(

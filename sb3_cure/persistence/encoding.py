@@ -87,8 +87,6 @@ def check_version(version: Any, name: str) -> None:
 
 # ---------------------------------------------------------------------- names
 
-#: Replay buffers that are written without pickle
-BUFFERS = (FrameStackReplayBuffer, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer)
 #: Types of the numbers in arrays
 NUMBERS: tuple[type[np.generic], ...] = (
     *(np.bool_, np.float16, np.float32, np.float64),
@@ -115,9 +113,8 @@ def name_of(value: Any) -> str:
 NAMED: dict[str, Any] = {
     name_of(value): value
     for value in (
-        *BUFFERS,
+        *(FrameStackReplayBuffer, ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer),
         *NUMBERS,
-        HerReplayBuffer,
         encoders.PixelEncoder,
         encoders.VectorEncoder,
         encoders.DictEncoder,

@@ -13,10 +13,10 @@ whole if its files have the checksums of ``SHA256SUMS`` (which ``sha256sum -c`` 
 
 import contextlib
 import hashlib
-import os
 import re
 import shutil
-from collections.abc import Callable
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,29 +26,23 @@ from sb3_cure.persistence.files import flush_to_disk
 _NAME = re.compile(r"generation-(\d{6,})")
 _SUM = re.compile(r"([0-9a-f]{64})  (\S+)")
 _SUMS = "SHA256SUMS"
-_SEGMENT = "../segments/"
 
 
 class CheckpointError(ArchiveError):
     """A checkpoint cannot be written or read; the message says what to do."""
 
 
-class Generation(NamedTuple):
-    """A checkpoint and its checksums.
+class Draft(NamedTuple):
+    """A generation that is being written.
 
-    :param folder: Where its own files lie
-    :param sums: SHA-256 of each file that it needs, by path from there
+    :param number: Its number
+    :param folder: Where to write its own files
+    :param sums: Takes the checksums of the segments that it needs, by path from the folder
     """
 
+    number: int
     folder: Path
     sums: dict[str, str]
-
-    def damaged(self) -> list[Path]:
-        """List the files that are not as they were written.
-
-        :return: Their paths
-        """
-        return [self.folder / name for name, digest in self.sums.items() if _digest(self.folder / name) != digest]
 
 
 class Generations:
@@ -80,33 +74,35 @@ class Generations:
         """
         return self.path / f"generation-{number:06d}"
 
-    def read(self, number: int) -> Generation:
-        """Read the checksums of a generation.
+    def newest_whole(self) -> Path:
+        """Find the newest generation whose files are as they were written, with a warning if others are newer.
 
-        :param number: Number of the generation
-        :return: Generation, its files unread
-        :raises CheckpointError: if its checksums are missing or damaged
+        :return: Its folder
+        :raises CheckpointError: if there is none
         """
-        path = self.folder(number) / _SUMS
-        try:
-            lines = path.read_text().removesuffix("\n").split("\n")
-        except (OSError, UnicodeError) as error:
-            raise CheckpointError(f"{path} cannot be read ({type(error).__name__})") from error
-        matches = [_SUM.fullmatch(line) for line in lines]
-        sums = {match[2]: match[1] for match in matches if match}
-        own = {entry.name for entry in path.parent.iterdir()} - {_SUMS}
-        # The own files come last: where they are there, no line is missing.
-        if not all(matches) or not own <= sums.keys() or not own:
-            raise CheckpointError(f"{path} is damaged")
-        return Generation(path.parent, sums)
+        reasons: list[str] = []
+        for number in reversed(self.numbers()):
+            folder = self.folder(number)
+            try:
+                damaged = [name for name, digest in _read_sums(folder).items() if _digest(folder / name) != digest]
+            except CheckpointError as error:
+                reasons.append(str(error))
+                continue
+            if not damaged:
+                if reasons:
+                    warnings.warn(f"{'; '.join(reasons)}. Resuming from {folder.name} instead.", stacklevel=3)
+                return folder
+            reasons += [f"{folder / name} is damaged or missing" for name in damaged]
+        if not reasons:
+            raise CheckpointError(f"there is no checkpoint in {self.path}: give the folder of an ExactCheckpoint.")
+        raise CheckpointError(f"no checkpoint in {self.path} is whole ({'; '.join(reasons)}): start anew.")
 
-    def write(self, fill: Callable[[Path, int], dict[str, str]], keep: int) -> Generation:
+    @contextlib.contextmanager
+    def writing(self, keep: int) -> Iterator[Draft]:
         """Write the next generation, then remove what is no longer needed.
 
-        :param fill: Writes files into the folder that it gets, and segments with the number that it gets in their
-            names; returns the checksums of the segments that it needs, by name
         :param keep: Number of latest generations to keep
-        :return: What was written
+        :return: What to fill
         :raises OSError: if it could not be written; the generations are then as before
         :raises CheckpointError: if another training has written here since
         """
@@ -114,45 +110,55 @@ class Generations:
             raise CheckpointError(
                 f"another training writes checkpoints to {self.path}: end it, or choose another path."
             )
-        number = self._newest + 1
-        draft = self.path / f".unfinished-{number}-{os.getpid()}"
-        shutil.rmtree(draft, ignore_errors=True)
+        draft = Draft(self._newest + 1, self.path / f".unfinished-{self._newest + 1}", {})
         try:
+            shutil.rmtree(draft.folder, ignore_errors=True)
             self.segments.mkdir(exist_ok=True)
-            draft.mkdir()
-            segments = fill(draft, number)
-            own = sorted(draft.iterdir())
-            sums = {f"{_SEGMENT}{name}": digest for name, digest in segments.items()}
-            sums |= {path.name: str(_digest(path)) for path in own}
-            (draft / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
-            for path in (*own, draft / _SUMS, draft, self.segments):
+            draft.folder.mkdir()
+            yield draft
+            own = sorted(draft.folder.iterdir())
+            sums = {**draft.sums, **{path.name: _digest(path) for path in own}}
+            (draft.folder / _SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sums.items()))
+            for path in (*own, draft.folder / _SUMS, draft.folder, self.segments):
                 flush_to_disk(path)
-            draft.rename(self.folder(number))
-            self._newest = number
+            draft.folder.rename(self.folder(draft.number))
+            self._newest = draft.number
             flush_to_disk(self.path)
-        except BaseException:
-            shutil.rmtree(draft, ignore_errors=True)
+        finally:
             self._remove_all_but(keep)
-            raise
-        self._remove_all_but(keep)
-        return Generation(self.folder(number), sums)
 
     def _remove_all_but(self, keep: int) -> None:
         """Remove older generations and what no generation needs; what could not be removed is removed the next time."""
         # Where the checksums of one cannot be read, it is not known which segments it needs.
         with contextlib.suppress(OSError, CheckpointError):
             numbers = self.numbers()
-            for number in numbers[:-keep]:
-                # Renamed first, so that what is half removed does not look like a damaged generation.
-                gone = self.path / f".removed-{number}"
-                shutil.rmtree(gone, ignore_errors=True)
-                self.folder(number).rename(gone)
-            for leftover in (*self.path.glob(".removed-*"), *self.path.glob(".unfinished-*")):
-                shutil.rmtree(leftover, ignore_errors=True)
-            needed = {name for number in numbers[-keep:] for name in self.read(number).sums}
+            for folder in (*map(self.folder, numbers[:-keep]), *self.path.glob(".unfinished-*")):
+                shutil.rmtree(folder, ignore_errors=True)
+            needed = {Path(name).name for number in numbers[-keep:] for name in _read_sums(self.folder(number))}
             for path in self.segments.iterdir():
-                if f"{_SEGMENT}{path.name}" not in needed:
+                if path.name not in needed:
                     path.unlink(missing_ok=True)
+
+
+def _read_sums(folder: Path) -> dict[str, str]:
+    """Read the checksums of a generation.
+
+    :param folder: Its folder
+    :return: SHA-256 of each file that it needs, by path from there
+    :raises CheckpointError: if they are missing or damaged
+    """
+    path = folder / _SUMS
+    try:
+        lines = path.read_text().removesuffix("\n").split("\n")
+    except (OSError, UnicodeError) as error:
+        raise CheckpointError(f"{path} cannot be read ({type(error).__name__})") from error
+    matches = [_SUM.fullmatch(line) for line in lines]
+    sums = {match[2]: match[1] for match in matches if match}
+    own = {entry.name for entry in folder.iterdir()} - {_SUMS}
+    # The own files come last: where they are there, no line is missing.
+    if not all(matches) or not own <= sums.keys() or not own:
+        raise CheckpointError(f"{path} is damaged")
+    return sums
 
 
 def _digest(path: Path) -> str | None:

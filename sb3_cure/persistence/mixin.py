@@ -13,9 +13,9 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_cure.persistence.archive import SavesModels
 from sb3_cure.persistence.callback_state import list_callbacks
-from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, load_checkpoint, newest_generation
+from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter
 from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
-from sb3_cure.persistence.resume import Resumption, Run
+from sb3_cure.persistence.resume import Resumption, Run, load_random_state
 
 Self = TypeVar("Self", bound="Persistence")
 
@@ -59,29 +59,30 @@ class Persistence(SavesModels, SavesReplayBuffers):
 
         The next ``learn(total)``, with the total and the callbacks of the interrupted call, does what was left of it;
         ``learn(n, reset_num_timesteps=False)`` makes n more steps, as everywhere in SB3. Environments whose state could
-        not be kept begin a new episode, with a warning.
+        not be kept begin a new episode, with a warning. Do not use them between ``resume`` and ``learn``.
 
         :param path: Folder of the checkpoints
-        :param env: As many environments as before, built in the same way
+        :param env: As many environments as before, built in the same way. Their classes and ids are compared, their
+            arguments are not
         :param device: Device of the networks
         :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
         :param kwargs: Settings to change; training then no longer equals the one before
         :return: The model
         :raises CheckpointError: if there is no whole checkpoint, or another number of environments
-        :raises ValueError: if the environments were built in another way
+        :raises ValueError: if the environments have other layers, or another id
         """
-        generation = newest_generation(path)
-        model = cls.load(generation.folder / MODEL, env, device, custom_objects, force_reset=False, **kwargs)
         writer = CheckpointWriter(path)
-        state = load_checkpoint(model, generation, writer)
+        folder = writer.generations.newest_whole()
+        model = cls.load(folder / MODEL, env, device, custom_objects, force_reset=False, **kwargs)
+        state = writer.read(model, folder)
         run = model._run
         run.writers[Path(path).resolve()] = writer
-        run.resumed = Resumption(model, state, model._stateful_parts())
+        run.resumed = Resumption(model, state)
         if run.resumed.restore_error is not None:
             run.new_episode_said = True
             warnings.warn(f"the training begins a new episode, as {run.resumed.restore_error}.", stacklevel=2)
         if model.verbose >= 1:
-            print(f"Resumed from {generation.folder}, after {model.num_timesteps} agent steps")
+            print(f"Resumed from {folder}, after {model.num_timesteps} agent steps")
         return model
 
     def _setup_learn(
@@ -94,27 +95,30 @@ class Persistence(SavesModels, SavesReplayBuffers):
     ) -> tuple[int, BaseCallback]:
         run = self._run
         run.before_rollout = []
-        resumed = run.resumed = run.resumed if run.resumed is not None and run.resumed.applies(self) else None
-        if resumed is not None and reset_num_timesteps:
+        resumed = run.resumed
+        if resumed is not None and resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
+            resumed = run.resumed = None
+        continues = resumed is not None and reset_num_timesteps
+        if resumed is not None and continues:
             total_timesteps, reset_num_timesteps = resumed.left_of(total_timesteps), False
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         run.callbacks = list_callbacks(callback)
         if resumed is not None:
-            resumed.set_up(self, run.callbacks)
+            resumed.set_up(self, run.callbacks, continues)
         return total, callback
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """Collect as in SB3, after what must happen between an update and the next step.
+        """Collect as in SB3; before that write checkpoints, and continue the random streams of a resumed training.
 
         :param args: Arguments of SB3's ``collect_rollouts``
         :param kwargs: The same
         :return: What was collected
         """
         resumed, self._run.resumed = self._run.resumed, None
-        if resumed is not None:
-            resumed.enter(self, self._stateful_parts())
+        if resumed is not None:  # last of all, so that nothing can disturb them
+            load_random_state(self, resumed.state["random"])
         for act in self._run.before_rollout:
             act()
         return super().collect_rollouts(*args, **kwargs)

@@ -11,9 +11,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_cure.persistence.archive import Stateful
 from sb3_cure.persistence.callback_state import callback_state, load_callback_state
 from sb3_cure.persistence.env_state import load_random_streams, load_vec_env_state, random_streams, vec_env_state
+
+#: Attributes of SB3's logger
+_RECORDS = ("name_to_value", "name_to_count", "name_to_excluded")
 
 
 class Run:
@@ -43,7 +45,7 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
     return {
         "num_timesteps": model.num_timesteps,
         "n_envs": model.n_envs,
-        # Before the random streams, which a worker that is replaced meanwhile may use
+        # Before the random streams, from which a worker may draw that is replaced meanwhile
         "environments": vec_env_state(model.env),
         "callbacks": [callback_state(callback) for callback in run.callbacks],
         "recorded": _recorded(model.logger),
@@ -51,11 +53,11 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
     }
 
 
-def _recorded(logger: Logger) -> list[Any]:
+def _recorded(logger: Logger) -> dict[str, Any]:
     """List what was recorded and not yet logged, which callbacks may read."""
     kinds = bool | int | float | str | np.number | th.Tensor
-    values = {key: value for key, value in logger.name_to_value.items() if isinstance(value, kinds)}
-    return [[k, v, logger.name_to_count.get(k, 0), logger.name_to_excluded.get(k, ())] for k, v in values.items()]
+    plain = {key for key, value in logger.name_to_value.items() if isinstance(value, kinds)}
+    return {name: {k: v for k, v in getattr(logger, name).items() if k in plain} for name in _RECORDS}
 
 
 def random_state(model: OffPolicyAlgorithm) -> dict[str, Any]:
@@ -81,75 +83,49 @@ def load_random_state(model: OffPolicyAlgorithm, state: dict[str, Any]) -> None:
 
 
 class Resumption:
-    """What a resumed model restores in the first ``learn``: callbacks at its beginning, all else before the first step.
+    """What a resumed model restores: environments at once, callbacks when ``learn`` begins, random streams last of all.
 
     :param model: Model as it was saved, with its new environments
     :param state: Result of ``training_state``
-    :param parts: The model's parts with a state
-    :raises ValueError: if the environments were built in another way
+    :raises ValueError: if the environments have other layers
     """
 
-    def __init__(self, model: OffPolicyAlgorithm, state: dict[str, Any], parts: dict[str, Stateful]):
+    def __init__(self, model: OffPolicyAlgorithm, state: dict[str, Any]):
+        assert model.env is not None
         self.state, self.num_timesteps = state, model.num_timesteps
         # What SB3's set-up of `learn` changes
-        kept = ("_last_obs", "_last_episode_starts", "_last_original_obs", "_num_timesteps_at_start", "action_noise")
-        self._kept = {name: copy.deepcopy(getattr(model, name)) for name in kept}
-        self._parts = {name: copy.deepcopy(part.state_dict()) for name, part in parts.items()}
-        self._continued = False
+        self._num_timesteps_at_start = model._num_timesteps_at_start
+        self._action_noise = copy.deepcopy(model.action_noise)
         #: Why a new episode begins, or None
-        self.restore_error = load_vec_env_state(model.env, state["environments"])  # type: ignore[arg-type]
+        self.restore_error = load_vec_env_state(model.env, state["environments"])
         if self.restore_error is not None:
             model._last_obs = None
             # Other first states than those that this training has begun with
-            model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)  # type: ignore[union-attr]
-
-    def applies(self, model: OffPolicyAlgorithm) -> bool:
-        """Check that a call of ``learn`` continues from the checkpoint.
-
-        :param model: Model at the beginning of ``learn``
-        :return: Whether it is as it was resumed; not if pretraining was ended since
-        """
-        return model.num_timesteps == self.num_timesteps
+            model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)
 
     def left_of(self, total_timesteps: int) -> int:
-        """Get what is left of the interrupted call, which is then continued.
+        """Get what is left of the interrupted call.
 
         :param total_timesteps: Agent steps of that call
         :return: Agent steps, 0 or less if there are none
         """
-        self._continued = True
-        return self._kept["_num_timesteps_at_start"] + total_timesteps - self.num_timesteps
+        return self._num_timesteps_at_start + total_timesteps - self.num_timesteps
 
-    def set_up(self, model: OffPolicyAlgorithm, callbacks: list[BaseCallback]) -> None:
+    def set_up(self, model: OffPolicyAlgorithm, callbacks: list[BaseCallback], continues: bool) -> None:
         """Restore callbacks, and what SB3's set-up has begun anew.
 
         :param model: Model at the end of its ``_setup_learn``
         :param callbacks: All callbacks
+        :param continues: Whether this is the interrupted call of ``learn``
         """
-        model.action_noise = self._kept["action_noise"]
-        if self._continued:
-            model._num_timesteps_at_start = self._kept["_num_timesteps_at_start"]
-        logger = model.logger
-        for name, value, count, excluded in self.state["recorded"]:
-            logger.name_to_value[name], logger.name_to_count[name] = value, count
-            logger.name_to_excluded[name] = excluded
+        model.action_noise = copy.deepcopy(self._action_noise)
+        if continues:
+            model._num_timesteps_at_start = self._num_timesteps_at_start
+        for name, values in self.state["recorded"].items():
+            getattr(model.logger, name).update(values)
         saved = list(self.state["callbacks"])
         for callback in callbacks:
             own = next((each for each in saved if each["class"] == type(callback).__name__), None)
             if own is not None:
                 saved.remove(own)
                 load_callback_state(callback, own)
-
-    def enter(self, model: OffPolicyAlgorithm, parts: dict[str, Stateful]) -> None:
-        """Restore environments, parts and random streams, last of all, so that nothing can disturb them.
-
-        :param model: Model before its next step
-        :param parts: Its parts with a state
-        """
-        if self.restore_error is None:
-            load_vec_env_state(model.env, self.state["environments"])  # type: ignore[arg-type]
-            for name in ("_last_obs", "_last_episode_starts", "_last_original_obs"):
-                setattr(model, name, self._kept[name])
-        for name, part in parts.items():
-            part.load_state_dict(self._parts[name])
-        load_random_state(model, self.state["random"])

@@ -11,7 +11,6 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
 from sb3_cure.networks.encoders import Encoder
 from sb3_cure.networks.fast_ops import random_bytes_like
-from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -31,6 +30,7 @@ class RAE(SRLHead):
     """
 
     warmup_updates = 1000
+    error_tells_novelty = True
 
     def __init__(
         self,
@@ -64,10 +64,10 @@ class RAE(SRLHead):
 
         :param views: Centred views, [B, *view shape], images in 0-255
         :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
-        :return: Images in [-0.5, 0.5], [B, C, H, W]; flat vectors as they are, [B, out_dim]
+        :return: Images in [-0.5, 0.5], [B, C, H, W]; vectors as ``encoder.flatten`` gives them, [B, out_dim]
         """
         if not self.pixels:
-            return flatten_vectors(views, self.encoder.view_space)
+            return self.encoder.flatten(views)
         # NHWC, as the decoder writes: reading two memory orders at once is far slower than one copy of bytes.
         images = views.contiguous(memory_format=th.channels_last)
         # In units of 1/256 of a quantisation step, centred: half the bits of 16 are for the steps, half for the noise.

@@ -1,6 +1,10 @@
 """Check everything that environments return, and the actions that they get."""
 
+import contextlib
 import copy
+from collections.abc import Iterator
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,8 +20,8 @@ class FiniteCheck(VecEnvWrapper):
     """Raises an error for numbers that are not finite in float32, in which rewards are stored and networks compute.
 
     It checks observations of resets and steps, rewards, terminal observations and actions, and under ``VecNormalize``
-    also the values before it, which are stored. (A terminal observation that ``VecNormalize`` clips looks finite.)
-    Returned observations are copies, as environments may reuse their arrays.
+    the values before it, too, which it may clip. Returned observations are copies, as environments may reuse their
+    arrays.
 
     :param venv: Environments
     """
@@ -34,9 +38,8 @@ class FiniteCheck(VecEnvWrapper):
         :return: Copy of the first observations
         :raises BadTransitionError: If one is not finite
         """
-        observations = self.venv.reset()
-        self._check_observations("first observation", observations)
-        return copy.deepcopy(observations)
+        with self._checking_originals():
+            return copy.deepcopy(self._reset(self.venv, self._normalizer is not None))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Send actions.
@@ -57,17 +60,42 @@ class FiniteCheck(VecEnvWrapper):
         :return: Copy of the observations, rewards, dones and infos
         :raises BadTransitionError: If a number is not finite
         """
-        observations, rewards, dones, infos = self.venv.step_wait()
         self.n_steps += self.num_envs
+        with self._checking_originals():
+            observations, rewards, dones, infos = self._step_wait(self.venv, self._normalizer is not None)
+        return copy.deepcopy(observations), rewards, dones, infos
+
+    @contextlib.contextmanager
+    def _checking_originals(self) -> Iterator[None]:
+        """Let ``VecNormalize`` get what it normalizes through the same checks."""
+        if self._normalizer is None:
+            yield
+            return
+        venv = self._normalizer.venv
+        checked: Any = SimpleNamespace(
+            reset=partial(self._reset, venv, False), step_wait=partial(self._step_wait, venv, False)
+        )
+        self._normalizer.venv = checked
+        try:
+            yield
+        finally:
+            self._normalizer.venv = venv
+
+    def _reset(self, venv: VecEnv, is_normalized: bool) -> VecEnvObs:
+        observations = venv.reset()
+        self._check("first observation", observations, is_normalized)
+        return observations
+
+    def _step_wait(self, venv: VecEnv, is_normalized: bool) -> VecEnvStepReturn:
+        observations, rewards, dones, infos = venv.step_wait()
         if rewards.dtype == object:  # a worker process returned None
             rewards = rewards.astype(np.float32)
-        if self._normalizer is not None:
-            self._check("reward", self._normalizer.get_original_reward())
-        self._check("reward", rewards, self._normalizer is not None)
+        self._check("reward", rewards, is_normalized)
         for i in map(int, np.flatnonzero(dones)):
-            self._check("terminal observation", self._as_row(infos[i].get("terminal_observation")), index=i)
-        self._check_observations("observation", observations)
-        return copy.deepcopy(observations), rewards, dones, infos
+            terminal = self._as_row(infos[i].get("terminal_observation"))
+            self._check("terminal observation", terminal, is_normalized, index=i)
+        self._check("observation", observations, is_normalized)
+        return observations, rewards, dones, infos
 
     def _as_row(self, observation: Any) -> Any:
         """Add the dimension of environments; keys that are not in the space are left out, as they are not stored."""
@@ -75,12 +103,7 @@ class FiniteCheck(VecEnvWrapper):
             return {key: np.asarray(observation[key])[None] for key in self.observation_space}  # type: ignore[attr-defined]
         return np.zeros(0) if observation is None else np.asarray(observation)[None]
 
-    def _check_observations(self, kind: str, observations: Any) -> None:
-        if self._normalizer is not None:
-            self._check(kind, self._normalizer.get_original_obs())
-        self._check(kind, observations, self._normalizer is not None)
-
-    def _check(self, kind: str, values: Any, is_normalized: bool = False, index: int | None = None) -> None:
+    def _check(self, kind: str, values: Any, is_normalized: bool, index: int | None = None) -> None:
         if (found := _find_bad(values)) is None:
             return
         row, key, number = found

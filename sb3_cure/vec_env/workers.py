@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import partialmethod
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -38,14 +38,6 @@ class EnvFaultError(RuntimeError):
     restartable = True
 
 
-class _Failure(NamedTuple):
-    """Last answer of a worker that raised an exception."""
-
-    what: str
-    details: str
-    restartable: bool
-
-
 def _leave_with_parent() -> None:
     """End this process soon after its parent, as one that hangs in a step does not see the end of its pipe."""
     parent: Any = mp.parent_process()
@@ -57,7 +49,7 @@ def _leave_with_parent() -> None:
 
 
 def _work(remote: Connection, parent_remote: Connection, make_env: CloudpickleWrapper, again: bool) -> None:
-    """Run SB3's worker, and answer ``_Failure`` where an exception ends it.
+    """Run SB3's worker, and answer ``EnvFaultError`` where an exception ends it.
 
     :param remote: This end of the pipe
     :param parent_remote: The other end, to be closed
@@ -74,11 +66,13 @@ def _work(remote: Connection, parent_remote: Connection, make_env: CloudpickleWr
     try:
         sb3_worker(remote, parent_remote, make_env)
     except BaseException as error:
-        failure = _Failure(f"raised {error!r}", traceback.format_exc(), True)
-        if isinstance(error, FrameFaultError):
-            failure = _Failure(str(error), "", not isinstance(error, FrozenFramesError))
+        is_frame_fault = isinstance(error, FrameFaultError)
+        fault = EnvFaultError(str(error) if is_frame_fault else f"raised {error!r}")
+        fault.restartable = not isinstance(error, FrozenFramesError)
+        if not is_frame_fault:
+            fault.add_note(f"Traceback of the worker:\n{traceback.format_exc()}")
         with contextlib.suppress(OSError):
-            remote.send(failure)
+            remote.send(fault)
 
 
 class _Worker:
@@ -200,24 +194,22 @@ class _Worker:
             how = f"was killed by {signal.Signals(-code).name}" if code and code < 0 else f"ended with status {code}"
             raise self._lost(f"is lost, as its process {how}") from None
         self._n_unread -= 1
-        if isinstance(answer, _Failure):
-            raise self._lost(*answer)
+        if isinstance(answer, EnvFaultError):
+            raise self._lost(str(answer), answer)
         return answer
 
-    def _lost(self, what: str, details: str = "", restartable: bool = True) -> EnvFaultError:
+    def _lost(self, what: str, sent: EnvFaultError | None = None) -> EnvFaultError:
         """Stop the worker.
 
         :param what: What happened to it, the end of a sentence that begins with "Environment 0"
-        :param details: The worker's traceback, or ""
-        :param restartable: Whether another worker may take its place
+        :param sent: Error that the worker has sent
         :return: Error to raise
         """
         command = self._request[0]
         hint = " (scripts that start workers need `if __name__ == '__main__':`)" if command == "get_spaces" else ""
         fault = EnvFaultError(f"Environment {self.index} {what} in {command}{hint}.")
-        fault.restartable = restartable
-        if details:
-            fault.add_note(f"Traceback of the worker:\n{details}")
+        if sent is not None:
+            vars(fault).update(vars(sent))  # notes, and whether another worker may take its place
         self.stop(fault)
         return fault
 

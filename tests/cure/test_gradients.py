@@ -101,7 +101,8 @@ def test_curious_reward_trains_the_encoder_if_allowed(update: str, encoder_grad:
     """Its size changes the curious critics, the encoder unless ``curiosity_encoder_grad=False``, nothing else."""
     after = []
     for beta in (0.5, 1.0):
-        model = filled_model(curiosity_beta=beta, curiosity_encoder_grad=encoder_grad, update=update)
+        settings: dict[str, Any] = dict(curiosity_beta=beta, curiosity_encoder_grad=encoder_grad, update=update)
+        model = filled_model(normalize_curiosity=False, **settings)
         train_once(model, actors=False)
         after.append(groups(model))
     assert moved(*after) == {"curious critic"} | (ENCODER if encoder_grad else set())

@@ -76,6 +76,34 @@ def test_one_call_of_n_steps_equals_n_calls() -> None:
 # ---------------------------------------------------------------- intervals
 
 
+@UPDATES
+@pytest.mark.parametrize("task", [True, False])
+def test_head_and_curious_agent_skip_updates(task: bool, update: str) -> None:
+    """Of 12 updates the head makes every third, the curious agent every second, and its actor every second of those."""
+    model = model_with_transitions(srl_interval=3, curious_interval=2, update=update, task=task)
+    targets = [groups(model)["curious critic target"]]
+    for _ in range(12):
+        model.train(1, batch_size=8)
+        targets.append(groups(model)["curious critic target"])
+    expected = {"srl": 4, "curious critic": 6, "curious actor": 3, "curious temperature": 3}
+    expected |= {"task critic": 12 * task, "task actor": 6 * task, "task temperature": 6 * task}
+    assert steps(model) == expected
+    moved = [i for i, pair in enumerate(itertools.pairwise(targets)) if not equal(*pair)]
+    assert moved == [0, 4, 8]  # target_update_interval=2, of its own updates
+
+
+def test_interval_of_the_curious_agent_skips_its_reward() -> None:
+    model = model_with_transitions(intrinsic="rnd", curious_interval=3)
+    model.train(6, batch_size=8)
+    assert steps_of(model.policy.intrinsic.optimizer) == 2  # type: ignore[union-attr]
+
+
+def test_burst_ignores_intervals() -> None:
+    model = model_with_transitions(warmup_updates=6, srl_interval=3, curious_interval=2)
+    model.learn(1, reset_num_timesteps=False)
+    assert steps(model)["srl"] >= 6 and steps(model)["curious actor"] >= 6
+
+
 @pytest.mark.parametrize("interval", [1, 3])
 def test_targets_follow_every_few_updates(interval: int) -> None:
     """Target critics after each ``interval``-th update of critics, the target encoder of any update."""

@@ -23,7 +23,6 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_cure import CuReSAC, make_dmc_env
-from sb3_cure.envs import render_check
 from sb3_cure.evaluation import diagnostics
 from sb3_cure.evaluation.callbacks import DiagnosticsCallback, EvalBothCallback
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -245,27 +244,6 @@ def test_small_rewards_need_a_small_temperature() -> None:
     for log_prob_off, problem in ((0.0, False), (0.9, False), (-1.1, True)):
         temperature = diagnostics.Temperature("task", 1e-6, True, log_prob + log_prob_off)
         assert bool(diagnostics.temperature_at_bound([temperature], model, (1e-4, 1e2)).problem) == problem  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize("software", [True, False])
-def test_software_rendering_on_a_gpu_machine(software: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is warned of when training starts, but not if the GPU renders."""
-    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(th.cuda, "get_device_name", lambda index: "NVIDIA H200")
-    renderer = "llvmpipe (LLVM 15.0.6, 256 bits)" if software else "NVIDIA H200/PCIe/SSE2"
-    monkeypatch.setattr(render_check, "try_rendering", lambda: {"renderer": renderer})
-    env = make_dmc_env("cartpole", "swingup", image_size=40)
-    warned, logged = watch(tiny_model("CnnPolicy", env), 30)
-    env.close()
-    assert logged["software_rendering"] == software
-    monkeypatch.setattr(render_check, "try_rendering", lambda: pytest.fail("rendered without need"))
-    assert diagnostics.software_rendering(DummyVecEnv([PixelBox])) is None
-    if not software:
-        assert warned == []
-        return
-    assert warned[0] == "software_rendering" and len(warned) == 2
-    assert warned[1].startswith("After 0 agent steps: OpenGL renders on the CPU (llvmpipe (LLVM 15.0.6, 256 bits)), a")
 
 
 # -------------------------------------------------------------------------- criteria

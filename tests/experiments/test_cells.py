@@ -73,14 +73,11 @@ def test_cell_keeps_its_curve(finished: tuple[Cell, Path]) -> None:
 
 
 def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
-    """Versions, commit, and every argument: as given, by default, and as the model resolved it."""
+    """Versions, machine, commit, and the arguments as given."""
     cell, out = finished
     conditions = json.loads((out / cell.folder / "run.json").read_text())
     assert conditions["attempts"] == 1 and conditions["device"] == "cpu" and conditions["precision"] == "fp32"
     assert {"mujoco", "torch", "sb3_contrib", "sb3_cure"} <= conditions["versions"].keys() and "commit" in conditions
-    arguments = conditions["arguments"]
-    assert arguments["warmup_updates"] == 2 and arguments["gamma"] == 0.99 and arguments["target_entropy"] != "auto"
-    assert arguments["tensorboard_log"] is None, "what is switched off is told as well"
     config = json.loads((out / cell.folder / "config.json").read_text())
     assert config["action_repeat"] == 4 and config["arguments"]["batch_size"] == 8
 
@@ -286,23 +283,6 @@ def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest
     assert read_rows(folder / "episodes.csv") == before and steps_of(folder) == [0, 160]
 
 
-def test_damaged_checkpoint_is_put_aside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """The cell starts anew instead of failing for ever, and says why."""
-    cell = only_cell(tmp_path, budget=120)
-    with monkeypatch.context() as full:
-        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            run_cell(cell, tmp_path, 0, pictures=False)
-    for path in (tmp_path / cell.folder / "checkpoint").rglob("model.zip"):
-        path.write_bytes(path.read_bytes()[:1000])
-    folder = run_cell(cell, tmp_path, 10, pictures=False)
-    assert "its checkpoints are kept in unusable-" in capsys.readouterr().out
-    assert list(folder.glob("unusable-*/**/model.zip"))
-    assert steps_of(folder) == [0, 120] and cell.is_done(tmp_path)
-
-
 def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second one is refused while the first runs."""
     cell = only_cell(tmp_path, budget=40)
@@ -331,7 +311,7 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     titles: list[str] = []
     draw, write = plots.curiosity_map, media.write_video
     monkeypatch.setattr(plots, "curiosity_map", lambda *args, **how: (maps.append(args[1]), titles.append(args[3])))
-    monkeypatch.setattr(media, "write_video", lambda *args: (titles.append(args[-1]), write(*args)))
+    monkeypatch.setattr(media, "write_video", lambda *args: (titles.extend(args[1]), write(*args)))
     cell = only_cell(tmp_path, kind="visitation", budget=80, tasks=[DMC_TASK], evaluation=dict(every=240, episodes=1))
     folder = run_cell(cell, tmp_path)
     assert sorted(path.name for path in folder.glob("*.mp4")) == ["curious_policy.mp4", "task_policy.mp4"]

@@ -84,20 +84,26 @@ def test_other_settings_in_the_folder_are_refused(tmp_path: Path) -> None:
     assert described["seeds"] == [0, 7, 8] and described["methods"].keys() == {"cure", "further"}
 
 
-def test_progress_of_other_machines_is_trusted(tmp_path: Path) -> None:
-    """Their locks may be invisible here; of this machine only a held lock counts."""
+def test_states_of_cells(tmp_path: Path) -> None:
+    """Of a cell that has begun also how far it is."""
     (cell,) = load_grid(write_grid(tmp_path)).cells
     folder = tmp_path / cell.folder
     folder.mkdir(parents=True)
-    assert run.status_lines([cell], tmp_path) == [f"{cell.folder}: waiting"]
-    cells.write_progress(folder, 8, 400, 2.0)
-    here = json.loads((folder / "progress.json").read_text())
-    states = []
-    for change in ({}, {"machine": "another"}, {"machine": "another", "time": here["time"] - 3600}):
-        (folder / "progress.json").write_text(json.dumps({**here, **change}))
-        states.append(run.status_lines([cell], tmp_path)[0].partition(": ")[2])
-    progress = "8 of 400, about 2 min left"
-    assert states == [f"interrupted, {progress}", f"running, {progress}", f"interrupted, {progress}"]
+
+    def state() -> str:
+        return run.status_lines([cell], tmp_path)[0].partition(": ")[2]
+
+    assert state() == "waiting"
+    (folder / "config.json").touch()
+    assert state() == "interrupted"
+    (folder / "eval.csv").write_text("environment_steps\n0\n1600\n")
+    assert state() == "interrupted, evaluated at 1,600 environment steps"
+    with cells.alone_in(folder):
+        assert state() == "running, evaluated at 1,600 environment steps"
+    (folder / "error.txt").touch()
+    assert state().startswith("failed")
+    (folder / "DONE").touch()
+    assert state() == "done"
 
 
 # ------------------------------------------------------------------- processes
@@ -217,20 +223,10 @@ def open_files(pid: int) -> set[Path]:
     return {link.resolve() for link in Path(f"/proc/{pid}/fd").iterdir()}
 
 
-def test_cluster_that_does_not_fit_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refused before anything is written: too few cores, and cards that nobody asks for."""
-    pytest.importorskip("ray")
-    grid, out = load_grid(write_grid(tmp_path)), tmp_path / "out"
-    monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 2, "CPU": 2}')
-    for wanted, sentence in (
-        (dict(cpus_per_cell=999), "--cpus-per-cell is 999, but no machine of the cluster has more than 2"),
-        (dict(), "The cluster has GPUs: give --gpus-per-cell"),
-    ):
-        with pytest.raises(GridError, match=sentence):
-            run.run_grid(grid, out, engine="ray", **wanted)
+def test_unknown_engine_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GridError, match="engine must be one of local, ray"):
-        run.run_grid(grid, out, engine="rya")
-    assert not out.exists()
+        run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="rya")
+    assert not (tmp_path / "out").exists()
 
 
 def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

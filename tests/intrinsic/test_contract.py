@@ -1,16 +1,20 @@
 """What an intrinsic reward may read, what is done with its results, and how rewards are built."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
-from envs_for_tests import VectorBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
-from updates_for_tests import filled_model, groups, moved, train_once
+from updates_for_tests import equal, filled_model, groups, moved, train_once
 
-from sb3_cure.intrinsic import IntrinsicReward, OwnGenerator, RewardInputs
-from sb3_cure.srl import RAE, SRLOutput
+from sb3_cure.intrinsic import INTRINSIC_REWARDS, IntrinsicReward, OwnGenerator, RewardInputs
+from sb3_cure.intrinsic.rnd import RND
+from sb3_cure.intrinsic.srl_error import SRLError
+from sb3_cure.persistence import ExactCheckpoint
+from sb3_cure.srl import RAE, SRLHead, SRLOutput
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
 
@@ -85,7 +89,8 @@ def test_latents_are_of_centred_views(augmentation: str | None, update: str) -> 
         assert found[name].dtype == th.float32 and not found[name].requires_grad
         th.testing.assert_close(found[name], model.policy.encode(observations).detach(), rtol=1e-5, atol=1e-5)
     assert not th.equal(*found.values())
-    assert inputs.srl_error is None  # it is not computed from the head
+    with pytest.raises(ValueError, match="needs_srl"):  # computed after the head's step it would be another
+        _ = inputs.srl_error
 
 
 def test_latents_are_computed_once_when_read() -> None:
@@ -211,6 +216,67 @@ def test_srl_error_is_of_the_head_before_its_step(target: str, update: str) -> N
     th.testing.assert_close(latents, policy.encoder(batch.views.float() / 255).detach())
 
 
+@UPDATES
+def test_error_that_a_reward_reads_leaves_the_shared_graph(update: str) -> None:
+    """In a phase of RL the head's error is computed for the reward alone, and the critics still train the encoder."""
+    model = filled_model(srl="rae", update=update)
+    before = groups(model)
+    train_once(model, srl=False)
+    assert not equal(before["trunk"], groups(model)["trunk"]) and equal(before["head"], groups(model)["head"])
+
+
+@pytest.mark.parametrize("intrinsic_kwargs", [{}, {"per_pixel": True}])
+def test_frozen_head_is_computed_only_for_a_reward_that_reads_it(intrinsic_kwargs: dict[str, Any]) -> None:
+    """Neither for a metric, nor for a reward that draws by itself."""
+    calls: list[Any] = []
+
+    class Spy(RAE):
+        def loss(self, batch: Any, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            calls.append(batch)
+            return super().loss(batch, latents)
+
+    model = filled_model(srl=Spy, curiosity_target="next_observation", intrinsic_kwargs=intrinsic_kwargs)
+    model.policy.representation_frozen = True
+    model.train(1, 8)
+    assert len(calls) == (0 if intrinsic_kwargs else 1)
+
+
+@pytest.mark.parametrize(
+    ("srl", "expected"),
+    [("rae", SRLError), ("vae", SRLError), *((srl, RND) for srl in ("curl", "spr", "forward", "inverse", None))],
+)
+def test_auto_follows_the_errors_that_tell_novelty(
+    srl: str | None, expected: type[IntrinsicReward], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The choice is printed, and survives a file and a checkpoint."""
+    model = filled_model(pixels=True, srl=srl, intrinsic="auto", verbose=1)
+    assert type(model.policy.intrinsic) is expected
+    name = next(name for name, reward in INTRINSIC_REWARDS.items() if reward is expected)
+    assert f"rewarded by {name!r}" in capsys.readouterr().out
+    model.save(tmp_path / "model")
+    model.learn(10, callback=ExactCheckpoint(10, tmp_path / "checkpoint"))
+    loaded = type(model).load(tmp_path / "model", env=model.env)
+    resumed = type(model).resume(tmp_path / "checkpoint", PixelBox())
+    for again in (loaded, resumed):
+        assert again.intrinsic == "auto" and type(again.policy.intrinsic) is expected
+        assert equal(groups(again).get("reward", []), groups(model).get("reward", []))
+
+
+def test_auto_takes_the_word_of_a_head_of_the_users() -> None:
+    """A head that says nothing is not followed."""
+
+    class Says(RAE):
+        error_tells_novelty = True
+
+    class Silent(SRLHead):
+        def loss(self, batch: Any, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
+            error = latents.square().sum(dim=1)
+            return SRLOutput(error.mean(), error.detach())
+
+    for head, reward in ((Says, SRLError), (Silent, RND)):
+        assert type(filled_model(srl=head, intrinsic="auto").policy.intrinsic) is reward
+
+
 def test_rewards_draw_from_generators_of_their_own() -> None:
     """Whatever a reward draws, networks begin alike and torch's stream goes on alike; two rewards draw apart."""
 
@@ -238,7 +304,7 @@ def test_rewards_draw_from_generators_of_their_own() -> None:
         (dict(intrinsic="novelty"), "intrinsic is"),
         (dict(intrinsic=nn.Linear), "intrinsic"),
         (dict(srl=None, intrinsic="shuffled"), "srl is None"),
-        (dict(srl="inverse", intrinsic_kwargs=dict(per_pixel=True)), "Inverse does not draw"),
+        (dict(srl="inverse", intrinsic="srl_error", intrinsic_kwargs=dict(per_pixel=True)), "Inverse does not draw"),
         (dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="novelty")), "choose one of"),
         (dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="mine")), "encoder is 'mine'"),
         (dict(intrinsic="particle", intrinsic_kwargs=dict(space="pixels")), "space is 'pixels'"),

@@ -12,14 +12,18 @@ ALONE: dict[str, Any] = dict(srl=None, task=False, curiosity_encoder_grad=False,
 
 @pytest.mark.parametrize("pixels", [True, False])
 def test_reward_is_the_error_of_where_the_step_leads(pixels: bool) -> None:
-    """Mean over pixels of the squared difference from the stored next observation; the decoder alone learns it."""
+    """Mean over pixels (standardised entries) of the squared difference from the stored next observation.
+
+    The decoder alone learns it.
+    """
     model = filled_model(pixels=pixels, learning_rate=0.1 if pixels else 0.01, **ALONE)
     reward: Any = model.policy.intrinsic
     found: list[th.Tensor] = []
     model.policy.scale.register_forward_pre_hook(lambda _, args: found.append(args[0].clone()))
     batch, before = sampled(model), groups(model)
     with th.no_grad():
-        seen = batch.next_observations.float() / 255 - 0.5 if pixels else batch.next_observations
+        seen = batch.next_observations.float()
+        seen = seen / 255 - 0.5 if pixels else (seen - seen.mean(dim=0)) / seen.std(dim=0, correction=0)
         drawn = reward.decoder(model.policy.encode(batch.next_observations))
         expected = (drawn - seen).square().flatten(1).mean(dim=1)
     for _ in range(3):

@@ -41,7 +41,7 @@ every_reward = pytest.mark.parametrize("arm", ARMS)
 def inputs_of(model: CuReSAC, batch: Any, latents: th.Tensor, next_latents: th.Tensor) -> RewardInputs:
     """What a reward reads, with given latents."""
     read = {"observations": latents, "next_observations": next_latents}
-    of_model = model._reward_inputs(batch)
+    of_model = model._reward_inputs(batch, None, {})
     return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, of_model.look_up, of_model.encode)  # type: ignore[arg-type]
 
 

@@ -68,7 +68,6 @@ CHANGES: dict[str, Any] = {
     "another array": lambda state: state["arrays"].update(more=np.zeros(3)),
     "fewer rows": lambda state: state["counters"].update(pos=3, full=False),
     "counts missing": lambda state: state["counters"].pop("counts"),
-    "another class": lambda state: state.update({"class": "ReplayBuffer"}),
 }
 
 

@@ -38,7 +38,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from benchmarks import faults
 from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
-from sb3_cure.data.buffers import FrameRing, stored_places, transitions
+from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer, stored_places, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -324,6 +324,9 @@ class SafeTD3(Persistence, TD3):
 def test_other_algorithms_continue_bit_for_bit(tmp_path: Path) -> None:
     """The mixin needs nothing of CuReSAC."""
     arguments: Any = dict(learning_starts=5, buffer_size=60, seed=0, device="cpu", policy_kwargs=dict(net_arch=[4]))
+    with pytest.raises(ValueError, match="replay_buffer_class=FrameStackReplayBuffer"):
+        SafeTD3("MlpPolicy", vectors(), **arguments).learn(40, callback=ExactCheckpoint(8, tmp_path))
+    arguments |= dict(replay_buffer_class=FrameStackReplayBuffer, replay_buffer_kwargs=dict(frame_stack=1))
     results = []
     for name in ("whole", "killed"):
         model = SafeTD3("MlpPolicy", vectors(), **arguments)
@@ -452,7 +455,7 @@ def test_frames_are_written_once(tmp_path: Path) -> None:
     ring = model.replay_buffer.rings[""]
     frame_bytes = int(np.prod(ring.frame_shape))
     segments = read_state(kept.folder(numbers[-1]) / "state.safetensors")["segments"][""]
-    for name, first, last in segments:
+    for name, first, last, _ in segments:
         assert kept.segments.joinpath(name).stat().st_size == (last - first) * frame_bytes
     assert all(one[2] == other[1] for one, other in itertools.pairwise(segments))
     # No more is kept than the ring holds and what the older generations and the oldest segment need.
@@ -474,10 +477,10 @@ def test_frames_of_each_image_are_written_once(tmp_path: Path) -> None:
     assert state["segments"].keys() == buffer.rings.keys() == {"front", "wrist"}
     for key, ring in buffer.rings.items():
         spans = state["segments"][key]
-        assert [first for _, first, _ in spans][1:] == [last for *_, last in spans[:-1]]
+        assert [first for _, first, *_ in spans][1:] == [last for *_, last, _ in spans[:-1]]
         assert spans[-1][2] == buffer.counts[key] and len(spans) >= 5
         frame = int(np.prod(ring.frame_shape))
-        assert all(sizes[name] == (last - first) * frame for name, first, last in spans)
+        assert all(sizes[name] == (last - first) * frame for name, first, last, _ in spans)
     resumed: Any = CuReSAC.resume(tmp_path, env(), device="cpu")
     rows, env_inds, _ = stored_places(buffer)
     found: Any

@@ -100,12 +100,23 @@ def test_no_environment_gets_an_action_that_is_not_finite() -> None:
     assert env.n_steps == 0 and model.replay_buffer.pos == 0
 
 
-@pytest.mark.parametrize("flaw", ["reward", "reset"])
-def test_values_that_normalization_clips_are_found(flaw: str) -> None:
-    """The replay buffer stores the original ones."""
-    venv = VecNormalize(DummyVecEnv([functools.partial(Flawed, {0 if flaw == "reset" else 3: flaw}, INF)]), False)
-    with pytest.raises(BadTransitionError, match="environment 0 returned inf in the"):
-        tiny_model("MlpPolicy", venv).learn(10)
+@pytest.mark.parametrize(
+    ("step", "flaw", "kind"),
+    [
+        (0, "reset", "first observation"),
+        (3, "reward", "reward"),
+        (3, "observation", "observation"),
+        (5, "observation", "terminal observation"),
+    ],
+)
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_values_that_normalization_clips_are_found(step: int, flaw: str, kind: str, as_dict: bool) -> None:
+    """The replay buffer would store the original ones, or the bound of the clipped terminal observation."""
+    venv = VecNormalize(DummyVecEnv([functools.partial(Flawed, {step: flaw}, INF, as_dict)]))
+    model = tiny_model("MultiInputPolicy" if as_dict else "MlpPolicy", venv)
+    with pytest.raises(BadTransitionError, match=f"environment 0 returned inf in the {kind}"):
+        model.learn(10)
+    assert np.isfinite(venv.ret_rms.mean) and np.isfinite(venv.ret_rms.var)
 
 
 def test_spoilt_statistics_are_not_the_environments_fault() -> None:
