@@ -30,7 +30,6 @@ class RAE(SRLHead):
     """
 
     warmup_updates = 1000
-    error_tells_novelty = True
 
     def __init__(
         self,

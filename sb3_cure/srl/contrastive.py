@@ -33,6 +33,8 @@ class CURL(SRLHead):
     :raises ValueError: for another error
     """
 
+    error_tells_novelty = False
+
     def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64, error: str = "infonce"):
         super().__init__(encoder, observation_space)
         if error not in ("infonce", "positive"):

@@ -24,6 +24,7 @@ class NextLatents(SRLHead):
     :param action_space: Action space
     """
 
+    error_tells_novelty = False
     models_transitions = True
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box):
@@ -123,6 +124,7 @@ class Inverse(SRLHead):
     :param hidden_dim: Width of the hidden layer
     """
 
+    error_tells_novelty = False
     needs_next_latents = True
     models_transitions = True
 

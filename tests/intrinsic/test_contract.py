@@ -263,17 +263,17 @@ def test_auto_follows_the_errors_that_tell_novelty(
 
 
 def test_auto_takes_the_word_of_a_head_of_the_users() -> None:
-    """A head that says nothing is not followed."""
-
-    class Says(RAE):
-        error_tells_novelty = True
+    """A head that says nothing is followed, as in the paper."""
 
     class Silent(SRLHead):
         def loss(self, batch: Any, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
             error = latents.square().sum(dim=1)
             return SRLOutput(error.mean(), error.detach())
 
-    for head, reward in ((Says, SRLError), (Silent, RND)):
+    class Says(Silent):
+        error_tells_novelty = False
+
+    for head, reward in ((Silent, SRLError), (Says, RND)):
         assert type(filled_model(srl=head, intrinsic="auto").policy.intrinsic) is reward
 
 
