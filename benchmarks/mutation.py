@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parent.parent
 GROUPS = {
     "cure/cure.py": """cure/test_gradients.py cure/test_schedules.py cure/test_actor_critic.py test_polyak_rates.py
         cure/test_update_equals_sb3.py cure/test_training.py intrinsic/test_contract.py
-        srl/test_contract.py::test_error_is_one_number_per_sample_detached
+        srl/test_contract.py
         -k 'not (one_update_per or vectors or can_be_changed or frame_stack or board)'""",
     "cure/critics.py": "cure/test_critics.py cure/test_gradients.py cure/test_actor_critic.py",
     "cure/encoder_update.py": "cure/test_encoder_update.py cure/test_gradients.py",

@@ -37,7 +37,7 @@ class LatentCritic(MixedPrecision):
         action_dim: int,
         net_arch: list[int],
         activation_fn: type[nn.Module],
-        n_critics: int = 2,
+        n_critics: int,
         n_values: int = 1,
         critic_arch: str = "mlp",
     ):

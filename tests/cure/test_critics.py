@@ -25,13 +25,13 @@ def inputs(batch: int = 6) -> tuple[th.Tensor, th.Tensor]:
 def test_critics_are_separate_networks(n_critics: int) -> None:
     """[B, n_critics, n_values] in the networks' order, each with its own parameters."""
     latents, actions = inputs()
-    critic = LatentCritic(3, 2, [8, 8], nn.ReLU, n_critics, n_values=4)
+    critic = LatentCritic(3, 2, [8, 6], nn.ReLU, n_critics, n_values=4)
     values = critic(latents, actions)
     assert values.shape == (6, n_critics, 4)
     for i, expected in enumerate(critic_values(critic, latents, actions)):
         th.testing.assert_close(values[:, i], expected)
-    # Weights and biases of 5 -> 8 -> 8 -> 4
-    assert sum(p.numel() for p in critic.parameters()) == n_critics * (5 * 8 + 8 + 8 * 8 + 8 + 8 * 4 + 4)
+    # Weights and biases of 5 -> 8 -> 6 -> 4
+    assert sum(p.numel() for p in critic.parameters()) == n_critics * (5 * 8 + 8 + 8 * 6 + 6 + 6 * 4 + 4)
 
 
 @CRITICS

@@ -3,6 +3,7 @@
 import itertools
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from agents_for_tests import steps_of
@@ -141,6 +142,22 @@ def test_targets_take_running_statistics() -> None:
     policy = tiny_model("MlpPolicy", VectorBox(), policy_kwargs=policy_kwargs).learn(15).policy
     online, target = dict(policy.encoder.named_buffers()), dict(policy.encoder_target.named_buffers())
     assert len(online) == 3 and differences(online, target) == []
+
+
+@UPDATES
+@pytest.mark.parametrize("frozen", [False, True])
+def test_statistics_of_vectors_follow_the_batch(frozen: bool, update: str) -> None:
+    """Those of encoder and target alike, once an update, unless the representation is frozen."""
+    model = model_with_transitions(update=update, target_update_interval=2)
+    model.policy.representation_frozen = frozen
+    model._n_batches = 1  # no Polyak step, which would copy them
+    np.random.seed(0)
+    observations = model.replay_buffer.sample(8).observations  # type: ignore[union-attr]
+    np.random.seed(0)
+    model.train(1, batch_size=8)
+    for encoder in (model.policy.encoder, model.policy.encoder_target):
+        expected = th.zeros(2) if frozen else observations.mean(dim=0)
+        th.testing.assert_close(encoder.trunk[0].mean, expected)  # type: ignore[index]
 
 
 @pytest.mark.parametrize(("period", "interval"), [(None, 2), (1, 2), (2, 3), (3, 1)])
