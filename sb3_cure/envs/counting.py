@@ -9,6 +9,9 @@ from gymnasium.utils import RecordConstructorArgs
 
 from sb3_cure.envs.physics import physics_state, physics_state_names
 
+#: Key of the info in which ``TaskReward`` puts the reward; no environment has one of this name
+TASK_REWARD = "sb3_cure.task_reward"
+
 
 class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Puts the cell of the true state that each step leads to into ``info["cell"]``.
@@ -38,7 +41,7 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Puts the reward into ``info["task_reward"]``, so that callbacks see it below wrappers of rewards.
+    """Puts the reward into ``info[TASK_REWARD]``, so that callbacks see it below wrappers of rewards.
 
     Wrappers that repeat actions must be inside of it: outside, they pass on the info of the last repeat alone.
 
@@ -56,7 +59,7 @@ class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         :return: What the environment returns, with its reward in the info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, "task_reward": float(reward)}
+        return observation, reward, terminated, truncated, {**info, TASK_REWARD: float(reward)}
 
 
 class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):

@@ -18,6 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
+from sb3_cure.envs.counting import TASK_REWARD
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
@@ -258,7 +259,7 @@ class _Record(BaseCallback):
         model: Any = self.model
         infos, dones = self.locals["infos"], self.locals["dones"]
         given = zip(infos, self.locals["rewards"], strict=True)
-        rewards = np.array([info.get("task_reward", reward) for info, reward in given], dtype=np.float64)
+        rewards = np.array([info.get(TASK_REWARD, reward) for info, reward in given], dtype=np.float64)
         self.rewards_met += float(rewards.sum())
         if model.num_timesteps - len(rewards) >= model.learning_starts:
             where = _second_actor_acted(model, len(rewards))

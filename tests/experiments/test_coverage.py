@@ -9,7 +9,7 @@ import pytest
 from grids_for_tests import DMC_TASK, method, write_grid
 
 from sb3_cure.envs import physics_state, physics_state_names, rendering
-from sb3_cure.envs.counting import CellInfo
+from sb3_cure.envs.counting import TASK_REWARD, CellInfo
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments.cells import run_cell
@@ -65,7 +65,7 @@ def test_oracle_rewards_training_alone(tmp_path: Path) -> None:
     for env in (cell.make_env(), cell.make_eval_env()):
         env.reset(seed=0)
         *_, reward, _, _, info = env.step(np.zeros(1, np.float32))
-        rewards.append((reward, info.get("task_reward")))
+        rewards.append((reward, info.get(TASK_REWARD)))
         env.close()
     (oracle, met), (task, _) = rewards
     assert oracle == 1 and met == task < 0.1

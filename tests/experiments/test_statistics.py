@@ -126,8 +126,8 @@ def test_sign_flips_are_counted_exactly() -> None:
     assert statistics.sign_flip_p([np.array([1.0, 2.0, 3.0])]) == 2 / 8
     assert statistics.sign_flip_p([np.array([3.0, -2.0, 4.0])]) == 4 / 8
     assert statistics.sign_flip_p([np.array([5.0])]) == 1
-    # Means of tasks: 10 and the mean of 1, -1: no sign of the second task's sum to 0 changes that 10 is extreme
-    assert statistics.sign_flip_p([np.array([10.0]), np.array([1.0, -1.0])]) == 6 / 8
+    # Tasks are weighed evenly: 1, 3 / 2 and -1 / 2 have the sum 2; 3, 2, -2 and -3 are as far from 0
+    assert statistics.sign_flip_p([np.array([1.0]), np.array([3.0, -1.0])]) == 4 / 8
 
 
 def test_holm_steps_down() -> None:
