@@ -298,8 +298,8 @@ class _Record(BaseCallback):
 
     def _evaluate_if_due(self, finished: bool) -> None:
         steps = self.num_timesteps * self.action_repeat
-        due = is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished)
-        if self.evaluates and due and not self.has_reached_return:
+        may_evaluate = self.evaluates and not self.has_reached_return
+        if may_evaluate and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             self.evaluate(finished)
         self._tick()
 
