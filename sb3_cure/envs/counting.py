@@ -1,4 +1,4 @@
-"""Visits of cells of the true state: in the info, for callbacks, and as a reward."""
+"""Visits of cells of the true state, in the info and as a reward; and the task's reward below other ones."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,6 +8,9 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from sb3_cure.envs.physics import physics_state, physics_state_names
+
+#: Key of the info in which ``TaskReward`` puts the reward; no environment has one of this name
+TASK_REWARD = "sb3_cure.task_reward"
 
 
 class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -35,6 +38,28 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         cell = _cell(self.env, self._indices, self._widths)
         return observation, reward, terminated, truncated, {**info, "cell": cell}
+
+
+class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Puts the reward into ``info[TASK_REWARD]``, so that callbacks see it below wrappers of rewards.
+
+    Wrappers that repeat actions must be inside of it: outside, they pass on the info of the last repeat alone.
+
+    :param env: An environment that gives the task's reward
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment.
+
+        :param action: The action
+        :return: What the environment returns, with its reward in the info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, {**info, TASK_REWARD: float(reward)}
 
 
 class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):

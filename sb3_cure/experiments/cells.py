@@ -18,6 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
+from sb3_cure.envs.counting import TASK_REWARD
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
@@ -34,8 +35,10 @@ EVAL_SEED = 10_000
 ERROR = "error.txt"
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
-    "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
+    "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met", "rewards_met_task",
+    "rewards_met_curious", "rewards_met_late", "cpu_seconds",
 )  # fmt: skip
+_REWARDS_MET = ("rewards_met", "rewards_met_task", "rewards_met_curious", "rewards_met_late")
 _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 
 
@@ -72,7 +75,7 @@ def check_cell(folder: Path, cell: Cell) -> None:
     :param cell: The cell
     :raises GridError: if they differ
     """
-    keys = ("kind", "budget", "eval_every", "eval_episodes", "coverage", *SETTINGS)
+    keys = ("kind", "budget", "eval_every", "eval_episodes", "coverage", "stop_at_return", *SETTINGS)
     check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in keys})
 
 
@@ -197,14 +200,20 @@ class _Record(BaseCallback):
         self.evaluates = False
         self.evaluations: list[Row] = []
         self.episodes: list[Row] = []
-        #: Machine and versions of each attempt, this one last
+        #: Machine, versions, precision and CPU time of each attempt, this one last
         self.attempts: list[Row] = []
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
         self.loss_sum, self.n_losses = th.zeros(()), 0
-        #: Sum of the rewards of all transitions that training has collected
+        #: Sum of the task's rewards of all transitions that training has collected
         self.rewards_met = 0.0
-        self._now = time.monotonic()
+        #: Of these, where the task policy and where the curious (or random) second actor acted; the rest: the warm-up
+        self.rewards_met_task = self.rewards_met_curious = 0.0
+        #: Of these, after the first tenth of an episode; of episodes that have ended
+        self.rewards_met_late = 0.0
+        #: Rewards of each environment's episode so far
+        self.episode_rewards: list[list[float]] = []
+        self._now, self._cpu_now = time.monotonic(), time.process_time()
         self._has_begun = False
 
     def state_dict(self) -> dict[str, Any]:
@@ -212,8 +221,8 @@ class _Record(BaseCallback):
 
         :return: Records, but not clocks
         """
-        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", "loss_sum", "n_losses", "rewards_met")
-        return {name: getattr(self, name) for name in names}
+        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", "loss_sum", "n_losses")
+        return {name: getattr(self, name) for name in (*names, *_REWARDS_MET, "episode_rewards")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from these records.
@@ -229,7 +238,7 @@ class _Record(BaseCallback):
         """Note machine and versions once, after the records of earlier attempts were restored."""
         if not self._has_begun:
             self._has_begun = True
-            self.attempts.append({"started": _now(), **describe_run(), "device": str(model.device)})
+            self.attempts.append({"started": _now(), **_describe(model), "cpu_seconds": 0.0})
 
     def _on_training_start(self) -> None:
         self._begin_attempt(self.model)  # type: ignore[arg-type]
@@ -241,9 +250,33 @@ class _Record(BaseCallback):
             self.loss_sum = self.loss_sum.to(value.device) + value
             self.n_losses += 1
         if self.evaluates:
-            self.rewards_met += float(np.sum(self.locals["rewards"]))
+            self._count_rewards()
         self._tick()
-        return True
+        return not self.has_reached_return
+
+    def _count_rewards(self) -> None:
+        """Add the task's rewards of this step to the sums."""
+        model: Any = self.model
+        infos, dones = self.locals["infos"], self.locals["dones"]
+        given = zip(infos, self.locals["rewards"], strict=True)
+        rewards = np.array([info.get(TASK_REWARD, reward) for info, reward in given], dtype=np.float64)
+        self.rewards_met += float(rewards.sum())
+        if model.num_timesteps - len(rewards) >= model.learning_starts:
+            where = _second_actor_acted(model, len(rewards))
+            self.rewards_met_curious += float(rewards[where].sum())
+            self.rewards_met_task += float(rewards[~where].sum())
+        self.episode_rewards = self.episode_rewards or [[] for _ in rewards]
+        for episode, reward, done in zip(self.episode_rewards, rewards.tolist(), dones, strict=True):
+            episode.append(reward)
+            if done:
+                self.rewards_met_late += sum(episode[-(-len(episode) // 10) :])
+                episode.clear()
+
+    @property
+    def has_reached_return(self) -> bool:
+        """Whether the cell ends early: its last two evaluations have reached ``stop_at_return``."""
+        limit, returns = self.cell.stop_at_return, [row["return_mean"] for row in self.evaluations[-2:]]
+        return limit is not None and len(returns) == 2 and all(value != "" and value >= limit for value in returns)
 
     def _on_rollout_start(self) -> None:
         self._evaluate_if_due(finished=False)
@@ -252,48 +285,66 @@ class _Record(BaseCallback):
         self._evaluate_if_due(finished=True)
 
     def _tick(self) -> None:
-        now = time.monotonic()
+        now, cpu_now = time.monotonic(), time.process_time()
         self.seconds += now - self._now
-        self._now = now
+        if self.attempts:
+            self.attempts[-1]["cpu_seconds"] += cpu_now - self._cpu_now
+        self._now, self._cpu_now = now, cpu_now
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU time of all attempts, without what a kill undid."""
+        return round(sum(attempt.get("cpu_seconds", 0.0) for attempt in self.attempts), 1)
 
     def _evaluate_if_due(self, finished: bool) -> None:
         steps = self.num_timesteps * self.action_repeat
-        if self.evaluates and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
-            self.evaluate()
+        may_evaluate = self.evaluates and not self.has_reached_return
+        if may_evaluate and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
+            self.evaluate(finished)
         self._tick()
 
-    def evaluate(self) -> None:
-        """Evaluate each policy over episodes that start alike in all cells, see ``run_episodes``."""
+    def evaluate(self, finished: bool) -> None:
+        """Evaluate each policy over episodes that start alike in all cells, see ``run_episodes``.
+
+        :param finished: Whether training has ended
+        """
         model: Any = self.model
-        steps = model.num_timesteps
+        steps, actors = model.num_timesteps, trained_actors(model)
         row: Row = dict.fromkeys(_EVAL_COLUMNS, "")
         row.update(environment_steps=steps * self.action_repeat, agent_steps=steps, updates=model._n_updates)
-        for actor in trained_actors(model):
-            # Environments may draw from the global generators of Python or NumPy, as training does.
-            with untouched_randomness(model.device, EVAL_SEED):
-                episodes = list(run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED))
-            returns = [float(episode.total_reward) for episode in episodes]
-            if not np.isfinite(returns).all():
-                raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: correct its rewards.")
-            for number, value in enumerate(returns):
-                values = (row["environment_steps"], actor, number, value)
-                self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
-            if actor == "task":
-                row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
-            else:
-                row["curious_return_mean"] = float(np.mean(returns))
-            if getattr(model.policy, "measures_errors", False):
-                errors = np.concatenate([episode.srl_errors for episode in episodes])
-                row[f"{actor}_srl_error"] = float(errors.mean())
+        self.evaluations.append(row)
+        if "task" in actors:
+            self._measure("task", row)
+        is_last = finished or self.has_reached_return
+        if "curious" in actors and (is_last or self.cell.eval_curious != "end"):
+            self._measure("curious", row)
         row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
         self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
-        row["seconds"] = round(self.seconds, 1)
-        if self.cell.collects_task_rewards:
-            row["rewards_met"] = round(self.rewards_met, 3)
-        self.evaluations.append(row)
+        row.update(seconds=round(self.seconds, 1), cpu_seconds=self.cpu_seconds)
+        row.update({name: round(getattr(self, name), 3) for name in _REWARDS_MET})
         self.write_tables()
         print(f"{self.folder}: {row['environment_steps']:,} of {self.cell.budget:,} environment steps", flush=True)
+
+    def _measure(self, actor: str, row: Row) -> None:
+        """Evaluate one policy, and write its returns and SRL error into a row of ``eval.csv``."""
+        model = self.model
+        # Environments may draw from the global generators of Python or NumPy, as training does.
+        with untouched_randomness(model.device, EVAL_SEED):
+            episodes = list(run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED))
+        returns = [float(episode.total_reward) for episode in episodes]
+        if not np.isfinite(returns).all():
+            raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: correct its rewards.")
+        for number, value in enumerate(returns):
+            values = (row["environment_steps"], actor, number, value)
+            self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
+        if actor == "task":
+            row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
+        else:
+            row["curious_return_mean"] = float(np.mean(returns))
+        if getattr(model.policy, "measures_errors", False):
+            errors = np.concatenate([episode.srl_errors for episode in episodes])
+            row[f"{actor}_srl_error"] = float(errors.mean())
 
     def write_tables(self) -> None:
         write_csv(self.folder / "eval.csv", _EVAL_COLUMNS, self.evaluations)
@@ -307,12 +358,11 @@ class _Record(BaseCallback):
         """
         self._begin_attempt(model)
         return {
-            **describe_run(),
-            "device": str(model.device),
-            "precision": getattr(model, "_computed_precision", "fp32"),
+            **_describe(model),
             "started": self.attempts[0]["started"],
             "finished": _now(),
             "seconds": round(self.seconds, 1),
+            "cpu_seconds": self.cpu_seconds,
             "attempts": len(self.attempts),
             **({"history": self.attempts} if len(self.attempts) > 1 else {}),
         }
@@ -370,6 +420,18 @@ def is_held(folder: Path) -> bool:
     except OSError:
         return False
     return False
+
+
+def _second_actor_acted(model: Any, n_envs: int) -> np.ndarray:
+    """Where the curious (or random) second actor chose the last actions, bool [n_envs]."""
+    if not model.task:  # the policy itself is the curious one
+        return np.ones(n_envs, dtype=bool)
+    return model._mixer.curious if model.curiosity in ("separate", "random") else np.zeros(n_envs, dtype=bool)
+
+
+def _describe(model: CuReSAC) -> dict[str, Any]:
+    """Versions, machine and commit, and where and in which number format the model computes."""
+    return {**describe_run(), "device": str(model.device), "precision": model._computed_precision}
 
 
 def _now() -> str:

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, zoo_file
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.envs.counting import CellInfo
+from sb3_cure.envs.counting import CellInfo, TaskReward
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
@@ -100,10 +100,12 @@ class Evaluation(_Part):
 
     :param every: Environment steps between two evaluations
     :param episodes: Episodes of an evaluation, of each policy
+    :param curious: ``"end"``: evaluate the curious policy in the last evaluation only; None: in each
     """
 
     every: PositiveInt = 10_000
     episodes: PositiveInt = 10
+    curious: Literal["end"] | None = None
 
 
 #: Settings that are merged with an override key by key
@@ -141,6 +143,7 @@ class GridFile(_Part):
     :param evaluation: When and how to evaluate
     :param baseline: The arm with which the others are compared, by default the first
     :param coverage: Cells of the true state to count, if any
+    :param stop_at_return: A cell ends early once two evaluations in a row have reached this return
     """
 
     experiment: _Name
@@ -152,6 +155,7 @@ class GridFile(_Part):
     evaluation: Evaluation = Evaluation()
     baseline: str = ""
     coverage: Coverage | None = None
+    stop_at_return: float | None = None
 
     @pydantic.model_validator(mode="after")
     def _check_names(self) -> "GridFile":
@@ -190,6 +194,8 @@ class Cell:
     :param pretrain: The phase before training, if any
     :param algo: A key of ``ALGORITHMS``
     :param coverage: Cells of the true state to count, if any
+    :param eval_curious: ``"end"``: evaluate the curious policy in the last evaluation only
+    :param stop_at_return: End early once two evaluations in a row have reached this return
     """
 
     experiment: str
@@ -206,6 +212,8 @@ class Cell:
     pretrain: Pretraining | None = None
     algo: str = "cure_sac"
     coverage: Coverage | None = None
+    eval_curious: Literal["end"] | None = None
+    stop_at_return: float | None = None
 
     @property
     def folder(self) -> Path:
@@ -221,9 +229,15 @@ class Cell:
         return {**arguments, **self.custom_objects()}
 
     def make_env(self) -> gym.Env:
-        """Make an environment to train in, with the wrappers of ``env_wrapper``, as in rl-zoo's files."""
+        """Make an environment to train in, with the wrappers of ``env_wrapper``, as in rl-zoo's files.
+
+        The first wrapper of rewards gets a ``TaskReward`` below it.
+        """
         env = gym.make(self.task, **self.env_kwargs)
+        pays_task = True
         for wrap, kwargs in self._wrappers():
+            if pays_task and _changes_rewards(wrap):
+                env, pays_task = TaskReward(env), False
             env = wrap(env, **kwargs)
         return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
@@ -239,11 +253,6 @@ class Cell:
             if not _changes_rewards(wrap):
                 env = wrap(env, **kwargs)
         return env
-
-    @property
-    def collects_task_rewards(self) -> bool:
-        """Whether the rewards of training are the task's."""
-        return not any(_changes_rewards(wrap) for wrap, _ in self._wrappers())
 
     def _wrappers(self) -> Iterator[tuple[Any, dict[str, Any]]]:
         """Wrappers of ``env_wrapper`` and their arguments, innermost first."""
@@ -373,7 +382,8 @@ def load_grid(
         _check_pixels(arms, path)
     of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
     cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
-    description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump()}
+    # Without None: `grid.json` of earlier versions lacks newer keys, and is compared
+    description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump(exclude_none=True)}
     return Grid(file.experiment, file.kind, cells, arms, description)
 
 
@@ -442,6 +452,8 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
         pretrain=method.pretrain,
         algo=method.algo,
         coverage=file.coverage,
+        eval_curious=file.evaluation.curious,
+        stop_at_return=file.stop_at_return,
     )
 
 

@@ -128,7 +128,8 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
         headlines += _exploration_headlines(experiment, list(explored))
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
-        headlines += compared
+        # "Nothing to compare" is about returns alone
+        headlines += compared if compared or headlines else [_why_no_comparison(experiment)]
         if experiment.kind == "pretraining":
             parts.insert(0, tables.pretraining_table(experiment))
         parts += more
@@ -151,6 +152,8 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         ("curious_srl_error", "curious_srl_error", "SRL error\n(deterministic actions)", True),
     ):
         if curves := _stacked(experiment, column):
+            if "srl" in column:
+                curves = _one_head_each(experiment, curves)
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
 
@@ -163,6 +166,18 @@ def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str
         if len(steps) >= at_least:
             curves.setdefault(task, {})[method] = steps, values
     return curves
+
+
+def _one_head_each(experiment: Experiment, curves: Mapping[str, Mapping[str, Curves]]) -> dict[str, dict[str, Curves]]:
+    """Panels of one SRL head each, as losses and errors of different heads have different units."""
+    panels: dict[str, dict[str, Curves]] = {}
+    for task, arms in curves.items():
+        done = {method: next(iter(experiment.done(task, method).values())) for method in arms}
+        heads = {method: cell.config["arguments"].get("srl", "rae") for method, cell in done.items()}
+        for method, found in arms.items():
+            name = f"{task}, {heads[method]}" if len(set(heads.values())) > 1 else task
+            panels.setdefault(name, {})[method] = found
+    return panels
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
@@ -224,10 +239,8 @@ def _comparison(
 ) -> tuple[list[str], list[Part]]:
     """Headlines and tables of returns."""
     differences = statistics.paired_differences(experiment)
-    parts: list[Part] = [tables.curves_table(experiment, thresholds)]
-    met = tables.rewards_met_table(experiment)
-    if len(met.rows):
-        parts.append(met)
+    more = tables.reached_table(experiment, thresholds), tables.rewards_met_table(experiment)
+    parts: list[Part] = [tables.curves_table(experiment), *(table for table in more if len(table.rows))]
     several = {row.method for row in differences if row.task is None}
     headlines = []
     for row in differences:
@@ -237,11 +250,12 @@ def _comparison(
             headlines.append(render_text("difference", row, value, interval, tasks_text(row)))
     if differences:
         parts += _difference_parts(experiment, differences, colors)
-    elif len(experiment.methods) > 1:
-        headlines.append(render_text("nothing_shared", experiment.baseline))
-    else:
-        headlines.append(render_text("one_arm"))
     return headlines, parts
+
+
+def _why_no_comparison(experiment: Experiment) -> str:
+    several = len(experiment.methods) > 1
+    return render_text("nothing_shared", experiment.baseline) if several else render_text("one_arm")
 
 
 def _difference_parts(

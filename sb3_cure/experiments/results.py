@@ -53,6 +53,8 @@ class CellResult:
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values, where there are any.
 
+        A cell that stopped early, at ``stop_at_return``, holds its last return until the budget.
+
         :param column: A column of ``eval.csv``, or ``"cells"`` of ``coverage.csv``
         :return: Steps and values, [n] each
         """
@@ -60,7 +62,10 @@ class CellResult:
         if column not in table:
             return np.zeros(0), np.zeros(0)
         known = table.dropna(subset=[column])
-        return known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
+        steps, values = known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
+        if column == "return_mean" and stops_early(self.config) and len(steps) and steps[-1] < self.config["budget"]:
+            steps, values = np.append(steps, self.config["budget"]), np.append(values, values[-1])
+        return steps, values
 
     def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         """True physics states that were visited (``visits.npz``).
@@ -195,7 +200,7 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     for task in experiment.tasks:
         done = [cell for cell in experiment.finished if cell.task == task]
         for cell in done[1:]:
-            _check_settings(done[0], cell, ("eval_every", "eval_episodes", "coverage"))
+            _check_settings(done[0], cell, ("eval_every", "eval_episodes", "coverage", "stop_at_return"))
     return experiment
 
 
@@ -226,16 +231,25 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, grid: dict[str, 
     visits = _read_table(folder / "visitation.csv", is_visitation, "error_min", "error_mean", "error_max")
     covered = _read_table(folder / "coverage.csv", False, "environment_steps", "cells")
     if budget > 0 and len(evaluations):
-        _check_whole(folder / "eval.csv", evaluations, budget, config["arguments"].get("task", True))
+        _check_whole(folder / "eval.csv", evaluations, config)
     return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits, covered)
 
 
-def _check_whole(path: Path, evaluations: pd.DataFrame, budget: int, learns_task: bool) -> None:
+def stops_early(config: dict[str, Any]) -> bool:
+    """Whether a cell may end before its budget.
+
+    :param config: Its ``config.json``
+    """
+    return config.get("stop_at_return") is not None
+
+
+def _check_whole(path: Path, evaluations: pd.DataFrame, config: dict[str, Any]) -> None:
     """Refuse a curve that does not go from 0 to the budget, or lacks returns: its area would be wrong."""
-    steps = evaluations["environment_steps"]
-    if steps.iloc[0] > 0 or steps.iloc[-1] < budget or not (steps.diff().dropna() > 0).all():
+    steps, budget = evaluations["environment_steps"], config["budget"]
+    is_short = steps.iloc[-1] < budget and not stops_early(config)
+    if steps.iloc[0] > 0 or is_short or not (steps.diff().dropna() > 0).all():
         raise ResultsError(f"{path} does not go step by step from 0 to {budget} environment steps: {_FIX}.")
-    if learns_task and not np.isfinite(evaluations["return_mean"]).all():
+    if config["arguments"].get("task", True) and not np.isfinite(evaluations["return_mean"]).all():
         raise ResultsError(f"{path} has a row without return_mean: {_FIX}.")
 
 

@@ -43,6 +43,19 @@ def steps_to_threshold(steps: np.ndarray, values: np.ndarray, threshold: float) 
     return float(steps[reached[0]]) if len(reached) else float("inf")
 
 
+def restricted_mean(times: np.ndarray, limit: float) -> float:
+    """Restricted mean time: what did not happen until the limit counts as the limit.
+
+    Unlike a median, it uses all times, and unlike a mean of the finite ones, it does not favour an arm whose slow seeds
+    never get there.
+
+    :param times: Time of each seed, infinite if it did not happen, [seeds]
+    :param limit: Time at which all were last observed
+    :return: Mean of min(time, limit); nan without a time
+    """
+    return float(np.minimum(times, limit).mean()) if len(times) else float("nan")
+
+
 def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
     """Interpolate the curves of several seeds to common steps.
 
@@ -66,8 +79,9 @@ class ArmSummary:
 
     :param seeds: Seeds that are done and have a curve
     :param areas: Area under the curve by seed
-    :param starts: Return of the first evaluation by seed, before training
+    :param starts: Return and SRL error of the first evaluation by seed, before training; nan: not measured [seeds, 2]
     :param finals: Return of the last evaluation by seed
+    :param lasts: Mean return of the last three evaluations by seed
     :param reached: For each threshold the steps of each seed
     """
 
@@ -75,6 +89,7 @@ class ArmSummary:
     areas: np.ndarray
     starts: np.ndarray
     finals: np.ndarray
+    lasts: np.ndarray
     reached: dict[float, np.ndarray]
 
 
@@ -89,11 +104,13 @@ def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Se
     """
     cells = {seed: cell for seed, cell in experiment.done(task, method).items() if len(cell.curve()[0]) > 1}
     curves = [cell.curve() for cell in cells.values()]
+    starts = [cell.evaluations.reindex(columns=["return_mean", "task_srl_error"]).iloc[0] for cell in cells.values()]
     return ArmSummary(
         tuple(cells),
         np.array([area_under_curve(*curve) for curve in curves]),
-        np.array([values[0] for _, values in curves]),
+        np.array(starts, dtype=float).reshape(-1, 2),
         np.array([values[-1] for _, values in curves]),
+        np.array([values[-3:].mean() for _, values in curves]),
         {limit: np.array([steps_to_threshold(*curve, limit) for curve in curves]) for limit in thresholds},
     )
 
@@ -202,6 +219,37 @@ def final_values(experiment: Experiment, task: str, method: str, column: str) ->
     return {seed: float(values[-1]) for seed, values in curves.items() if len(values)}
 
 
+def sign_flip_p(groups: Sequence[np.ndarray]) -> float:
+    """Two-sided sign-flip test of paired differences, whose mean is 0 if the arms can be exchanged in each pair.
+
+    Exact up to 16 pairs: all signs are tried. With n pairs p is at least 2^(1-n). No distribution is assumed.
+
+    :param groups: Differences between the arms: one array per task; tasks are weighed evenly
+    :return: p value
+    """
+    weighted = np.concatenate([group / len(group) for group in groups if len(group)] or [np.zeros(0)])
+    if len(weighted) < 2:  # which scipy refuses: with either sign it is as far from 0
+        return 1.0
+    # scipy compares with a tolerance, so that a sum's rounding does not decide
+    found = stats.permutation_test(
+        (weighted,), np.sum, permutation_type="samples", n_resamples=2**16, vectorized=True, random_state=0
+    )
+    return float(found.pvalue)
+
+
+def holm(p_values: Sequence[float]) -> np.ndarray:
+    """Correct p values for their number by Holm's step-down method.
+
+    :param p_values: Of all comparisons, [n]
+    :return: Corrected values in the same order, [n]
+    """
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p)
+    corrected = np.empty(len(p))
+    corrected[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    return np.minimum(corrected, 1)
+
+
 @dataclass(frozen=True)
 class PairedDifference:
     """Difference between two arms, seed by seed.
@@ -211,7 +259,8 @@ class PairedDifference:
     :param task: Short name, or None for all tasks together
     :param differences: By task, one value per seed that both arms have done
     :param t: Mean difference with its t interval
-    :param same_starts: In how many pairs both arms earn the same before training, as they do from equal weights
+    :param same_starts: In how many pairs both arms have the same return and, where both measure it, the same SRL error
+        before training, as they do from equal weights
     :param left_out: Tasks with a single pair, which do not count where others have more
     """
 
@@ -227,6 +276,11 @@ class PairedDifference:
     def wins(self) -> int:
         """In how many pairs the arm is above the baseline."""
         return int(sum((values > 0).sum() for values in self.differences.values()))
+
+    @property
+    def p(self) -> float:
+        """p value of ``sign_flip_p``, not corrected."""
+        return sign_flip_p(list(self.differences.values()))
 
     @property
     def pairs(self) -> int:
@@ -250,7 +304,9 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
             _, mine, its = np.intersect1d(ours.seeds, theirs.seeds, assume_unique=True, return_indices=True)
             if len(mine):
                 by_task[task] = getattr(ours, measure)[mine] - getattr(theirs, measure)[its]
-                same[task] = int((ours.starts[mine] == theirs.starts[its]).sum())
+                # Returns of sparse tasks are all zero at first: there the SRL error tells equal weights
+                first, second = ours.starts[mine], theirs.starts[its]
+                same[task] = int(((first == second) | np.isnan(first) | np.isnan(second)).all(axis=1).sum())
         # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
         rows: list[tuple[str | None, dict[str, np.ndarray]]] = [(None, judged)] if len(by_task) > 1 else []

@@ -1,6 +1,7 @@
 """Tables of reports. Their notes, and how they look, are in templates."""
 
 import base64
+import itertools
 import json
 import math
 import re
@@ -198,32 +199,43 @@ def _state(experiment: Experiment, task: str, method: str) -> str:
     return "; ".join(f"{status}: {', '.join(found)}" for status, found in seeds.items())
 
 
-def curves_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
-    """Area under the curve, final return, steps to thresholds.
+def curves_table(experiment: Experiment) -> Table:
+    """Area under the curve and final return; of arms without returns, such as those without a task, a dash.
 
     :param experiment: An experiment
-    :param thresholds: Returns, for the steps to reach them
     :return: The table
     """
     rows = []
     for task, method in experiment.arms:
-        digits = return_digits(experiment, task)
-        arm = statistics.summarise_arm(experiment, task, method, thresholds)
-        row = [_mean_std(values, digits) or _state(experiment, task, method) for values in (arm.areas, arm.finals)]
-        row += [_reached(arm.reached[limit], experiment.budget) for limit in thresholds]
+        digits, arm = return_digits(experiment, task), statistics.summarise_arm(experiment, task, method)
+        missing = NONE if experiment.done(task, method) else _state(experiment, task, method)
+        row = [_mean_std(values, digits) or missing for values in (arm.areas, arm.finals)]
         rows.append([task, method, str(len(arm.seeds)), *row])
-    steps = "".join(f"; >steps to {limit:,.15g}".replace("-", "\N{MINUS SIGN}") for limit in thresholds)
-    columns = "task; arm; >seeds; >area under curve; >final return" + steps
-    return _table("Learning curves", columns, rows, render_text("curves"))
+    return _table("Learning curves", "task; arm; >seeds; >area under curve; >final return", rows, render_text("curves"))
 
 
-def _reached(steps: np.ndarray, budget: int) -> str:
-    count = int(np.isfinite(steps).sum())
-    if not count:
-        return "not reached" if len(steps) else NONE
-    median = float(np.median(steps))
-    shown = number_text(median) if np.isfinite(median) else f"> {number_text(budget)}"
-    return f"{shown} ({count} of {len(steps)})"
+def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
+    """How many seeds reach and solve returns, and the steps until then.
+
+    :param experiment: An experiment
+    :param thresholds: Returns
+    :return: The table; without rows for a return that no arm reaches on a task
+    """
+    rows = []
+    for task, limit in itertools.product(experiment.tasks, thresholds):
+        arms = {arm: statistics.summarise_arm(experiment, task, arm, [limit]) for arm in experiment.methods}
+        if not any(np.isfinite(arm.reached[limit]).any() for arm in arms.values()):
+            continue
+        for method, arm in arms.items():
+            if n := len(arm.seeds):
+                steps, shown = arm.reached[limit], f"{limit:,.15g}".replace("-", "\N{MINUS SIGN}")
+                counts = [f"{int(found.sum())} of {n}" for found in (np.isfinite(steps), arm.lasts >= limit)]
+                median = float(np.median(steps))
+                until = number_text(median) if np.isfinite(median) else f"> {number_text(experiment.budget)}"
+                mean = number_text(statistics.restricted_mean(steps, experiment.budget))
+                rows.append([task, shown, method, *counts, until, mean])
+    columns = "task; >return; arm; >reached; >solved; >steps, median; >steps, restricted mean"
+    return _table("Returns reached", columns, rows, render_text("reached"))
 
 
 def difference_table(
@@ -240,14 +252,19 @@ def difference_table(
     :param note: What to know about them, by default everything
     :return: The table
     """
-    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >above; verdict"
+    columns = "arm; task; >pairs; >same start; >difference; >95 % t; >above; >p; >p, Holm; verdict"
     shown = []
-    for row in rows:
+    for row, corrected in zip(rows, statistics.holm([row.p for row in rows]), strict=True):
         value, interval = _value_and_interval(row.t, difference_digits(row, experiment))
         numbers = [str(row.pairs), str(row.same_starts), value, interval, str(row.wins)]
+        numbers += [_p_text(row.p), _p_text(corrected)]
         shown.append([difference_label(row, experiment.baseline), tasks_text(row), *numbers, row.t.verdict])
     title = f"Paired difference from {compared_with(rows, experiment)}: {measure}"
     return _table(title, columns, shown, render_text("differences") if note is None else note)
+
+
+def _p_text(p: float) -> str:
+    return f"{p:.3f}" if p >= 0.001 else f"{p:.1e}"
 
 
 def difference_label(row: PairedDifference, baseline: str) -> str:
@@ -363,8 +380,20 @@ def rewards_met_table(experiment: Experiment) -> Table:
         if len(met) and (met >= 0).all():
             against = statistics.rewards_met_difference(experiment, task, method)
             text = NONE if method == experiment.baseline_of(method) else ratio_text(against)
-            shown.append([task, method, str(len(met)), _mean_std(met), f"{np.log1p(met).mean():.2f}", text])
-    columns = "task; arm; >seeds; >rewards met, c; >log(1 + c); >minus baseline's"
+            parts = [
+                np.array(list(statistics.final_values(experiment, task, method, f"rewards_met_{part}").values()))
+                for part in ("task", "curious", "late")
+            ]
+            numbers = [
+                _mean_std(met),
+                *(_mean_std(part) or NONE for part in parts),
+                f"{np.log1p(met).mean():.2f}",
+                text,
+            ]
+            shown.append([task, method, str(len(met)), *numbers])
+    columns = (
+        "task; arm; >seeds; >rewards met, c; >by task policy; >by second actor; >late; >log(1 + c); >minus baseline's"
+    )
     return _table("Rewards met in training", columns, shown, render_text("rewards_met", _baselines(experiment)))
 
 
@@ -396,14 +425,18 @@ def conditions_table(experiment: Experiment) -> Table:
         letter = letters.setdefault(packages, chr(ord("A") + len(letters))) if packages else NONE
         trained = number_text(float(steps[-1])) if len(steps) else NONE
         pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
-        machine = [str(run.get(key) or NONE) for key in ("device", "precision", "machine")]
-        row = [cell.task, cell.method, str(cell.seed), trained, pretrained, _duration(run.get("seconds")), *machine]
+        attempts: list[dict[str, Any]] = [*run.get("history", ()), run]
+        machine = [_list(each.get(key) for each in attempts) for key in ("device", "precision", "machine")]
+        times = [_duration(run.get(key)) for key in ("seconds", "cpu_seconds")]
+        row = [cell.task, cell.method, str(cell.seed), trained, pretrained, *times, *machine]
         rows.append([*row, letter, _commits(cell), str(run.get("attempts") or NONE)])
-    columns = "task; arm; seeds; >environment steps; >pretraining steps; >wall-clock; device; precision; machine"
+    columns = (
+        "task; arm; seeds; >environment steps; >pretraining steps; >wall-clock; >CPU time; device; precision; machine"
+    )
     frame = _table("", columns + "; versions; commit; >attempts", rows).rows
     commits = frame.groupby(["task", "seeds"], sort=False).commit.nunique()
     mixed = sorted(f"{task} seed {seed}" for (task, seed), count in commits.items() if count > 1)
-    own = ["seeds", ">wall-clock"]
+    own = ["seeds", ">wall-clock", ">CPU time"]
     alike = frame.groupby([name for name in frame if name not in own], sort=False)
     merged = alike[own].agg(", ".join).reset_index()[list(frame)]
     return Table("Run conditions", merged, render_text("conditions", letters, mixed))

@@ -82,6 +82,56 @@ def test_cell_keeps_what_it_was_run_with(finished: tuple[Cell, Path]) -> None:
     assert config["action_repeat"] == 4 and config["arguments"]["batch_size"] == 8
 
 
+def test_cell_stops_at_a_return_reached_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a row, and not in the first evaluation alone; also if it is killed between the stop and its end."""
+    returns = {0: 9.0, 40: 1.0, 80: 9.0, 120: 9.0, 160: 9.0}
+    measure = cells._Record._measure
+
+    def measure_as_told(self: Any, actor: str, row: dict[str, Any]) -> None:
+        measure(self, actor, row)
+        if actor == "task":
+            row["return_mean"] = returns[row["environment_steps"]]
+
+    monkeypatch.setattr(cells._Record, "_measure", measure_as_told)
+    evaluation = dict(every=40, episodes=1, curious="end")
+    cell = only_cell(tmp_path, budget=400, stop_at_return=8, evaluation=evaluation)
+    with monkeypatch.context() as full:
+        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_cell(cell, tmp_path, 0, pictures=False)
+    folder = run_cell(cell, tmp_path, 0, pictures=False)
+    rows = read_rows(folder / "eval.csv")
+    assert [row["environment_steps"] for row in rows] == [0, 40, 80, 120]
+    assert [row["curious_return_mean"] != "" for row in rows] == [False, False, False, True], "at the end only"
+    assert cell.is_done(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arm", "by_task", "by_second"),
+    [
+        (dict(curiosity=None), 80, 0),
+        (dict(curiosity_prob=1.0), 0, 80),
+        (dict(curiosity="random", curiosity_prob=1.0), 0, 80),
+        (dict(task=False), 0, 80),
+    ],
+)
+def test_rewards_met_by_actor_and_late(
+    arm: dict[str, Any], by_task: int, by_second: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reward of 1 in each of 100 steps: 20 of the warm-up, 80 by who acted; late are 18 of the 20 of an episode."""
+    step = PixelBox.step
+
+    def step_for_one(self: PixelBox, action: np.ndarray) -> tuple[Any, ...]:
+        observation, _, *rest = step(self, action)
+        return observation, 1.0, *rest
+
+    monkeypatch.setattr(PixelBox, "step", step_for_one)
+    cell = only_cell(tmp_path, methods={"arm": method(**arm)}, evaluation=dict(every=200, episodes=1))
+    last = read_rows(run_cell(cell, tmp_path, pictures=False) / "eval.csv")[-1]
+    assert last["rewards_met"] == 100 and last["rewards_met_late"] == 5 * 18
+    assert (last["rewards_met_task"], last["rewards_met_curious"]) == (by_task, by_second)
+
+
 def test_finished_cell_is_not_run_twice(finished: tuple[Cell, Path]) -> None:
     cell, out = finished
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.name != ".lock"}
@@ -248,7 +298,7 @@ def test_killed_cell_ends_like_one_that_was_not(minutes: float, tmp_path: Path, 
     *_, cell = pretrained_grid(tmp_path, TASK, warm_up=20, budget=120).cells
 
     def outcome(folder: Path) -> Any:
-        evaluations = [{**row, "seconds": 0} for row in read_rows(folder / "eval.csv")]
+        evaluations = [{**row, "seconds": 0, "cpu_seconds": 0} for row in read_rows(folder / "eval.csv")]
         return state_of(CuReSAC.load(folder / "model.zip")), (folder / "episodes.csv").read_text(), evaluations
 
     expected = outcome(run_cell(cell, tmp_path / "whole", minutes, pictures=False))
@@ -268,6 +318,9 @@ def test_killed_cell_ends_like_one_that_was_not(minutes: float, tmp_path: Path, 
         conditions = json.loads((folder / cell.folder / "run.json").read_text())
         assert len(conditions["history"]) == conditions["attempts"] == 2
         assert conditions["started"] == conditions["history"][0]["started"]
+        assert [each["precision"] for each in conditions["history"]] == ["fp32", "fp32"]
+        spent = [each["cpu_seconds"] for each in conditions["history"]]
+        assert spent[-1] > 0 and conditions["cpu_seconds"] == pytest.approx(sum(spent), abs=0.1)
 
 
 def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

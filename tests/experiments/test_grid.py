@@ -1,6 +1,8 @@
 """Grid files: what they hold, and that what cannot be run is refused before the first cell."""
 
+import json
 import random
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -209,3 +211,20 @@ def test_project_pretraining_trains_in_miniature() -> None:
         model.learn(40)
         assert model.num_timesteps == 40
         assert float(model.logger.name_to_value["train/srl_loss"]) > 0
+
+
+def test_folders_of_earlier_versions_are_continued(tmp_path: Path) -> None:
+    """Their grid.json and config.json lack newer keys, which is no other setting; another stop is one."""
+    grid = load_grid(write_grid(tmp_path))
+    assert grid.description["evaluation"] == {"every": 160, "episodes": 2} and "stop_at_return" not in grid.description
+    (cell,) = grid.cells
+    folder = tmp_path / cell.folder
+    folder.mkdir(parents=True)
+    (tmp_path / "tiny" / "grid.json").write_text(json.dumps(grid.description))
+    earlier = {key: value for key, value in asdict(cell).items() if key not in ("eval_curious", "stop_at_return")}
+    (folder / "config.json").write_text(json.dumps(earlier))
+    (folder / "DONE").touch()
+    run.check_grid(grid, tmp_path)
+    (folder / "config.json").write_text(json.dumps(asdict(cell)))
+    with pytest.raises(GridError, match="stop_at_return was None and is 500"):
+        run.check_grid(load_grid(write_grid(tmp_path, stop_at_return=500)), tmp_path)

@@ -102,14 +102,21 @@ def rows_of(path: Path, heading: str) -> list[list[str]]:
 def test_tables_of_curves(results: Path) -> None:
     _, baseline, cure, unfinished, not_run = rows_of(results / "curves" / "table.md", "Learning curves")
     # Means of 50 and 100, 100 and 200; sample standard deviations
-    assert baseline[2:] == ["2", "75 ± 35", "150 ± 71", *["not reached"] * 3]
-    assert cure[2:] == ["2", "150 ± 71", "300 ± 141", "> 100,000 (1 of 2)", "not reached", "not reached"]
-    assert unfinished[2:5] == ["0", "unfinished: 0; failed: 1", "unfinished: 0; failed: 1"]
-    assert not_run[2:5] == ["0", "not run", "not run"]
+    assert baseline[2:] == ["2", "75 ± 35", "150 ± 71"]
+    assert cure[2:] == ["2", "150 ± 71", "300 ± 141"]
+    assert unfinished[2:] == ["0", "unfinished: 0; failed: 1", "unfinished: 0; failed: 1"]
+    assert not_run[2:] == ["0", "not run", "not run"]
+    # Nobody reaches 500 or 750. Finals are 200 and 400, means of the last three evaluations 100 and 200.
+    reached = rows_of(results / "curves" / "table.md", "Returns reached")[1:]
+    assert [row[:5] for row in reached] == [
+        [TASK, "250", "sac_ae", "0 of 2", "0 of 2"],
+        [TASK, "250", "cure_sac_ae", "1 of 2", "0 of 2"],
+    ]
+    assert [row[5:] for row in reached] == [["> 100,000", "100,000"]] * 2
     (difference,) = rows_of(results / "curves" / "table.md", "Paired difference from sac\\_ae: area")[1:]
     minus = "\N{MINUS SIGN}"
     assert difference[:5] == ["cure_sac_ae", TASK, "2", "2", "75.0"]
-    assert difference[5:] == [f"[{minus}242.7, 392.7]", "2", "inconclusive"]
+    assert difference[5:] == [f"[{minus}242.7, 392.7]", "2", "0.500", "0.500", "inconclusive"]
     headlines = (results / "curves" / "table.md").read_text().replace("\\", "")
     assert "cure_sac_ae minus sac_ae: area under the curve 75.0" in headlines
     assert "2 pairs of seeds on cartpole-swingup: inconclusive." in headlines
@@ -131,9 +138,38 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     assert cure[2:5] == ["3", "13 ± 6", "533 ± 416"]
     assert cure[5].startswith("2.00 [")  # of 4 and 1
     assert (tmp_path / "cells_reached.png").exists()
-    assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in (tmp_path / "table.md").read_text().replace(
-        "\\", ""
+    text = (tmp_path / "table.md").read_text().replace("\\", "")
+    assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in text
+
+
+def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> None:
+    """Arms without a task beside one with returns: the report does not say that there is nothing to compare."""
+    write_grid(tmp_path, seeds=1, methods={"cure": {}, "other": {}, "oracle": {}}, baseline="cure")
+    for method in ("cure", "other", "oracle"):
+        returns = curve(0, 100) if method == "oracle" else dict.fromkeys(curve(0, 0), "")
+        cell = write_cell(tmp_path, TASK, method, 0, returns, arguments={**CURE, "task": method == "oracle"})
+        columns = ("environment_steps", "agent_steps", "cells", "entropy_bits")
+        write_csv(cell / "coverage.csv", columns, [(100_000, 0, 10, 1.0)])
+    assert report.main([str(tmp_path)]) == 0
+    text = (tmp_path / "table.md").read_text()
+    assert "times the cells of cure" in text and "nothing to compare" not in text
+    assert rows_of(tmp_path / "table.md", "Learning curves")[1][2:] == ["0", NONE, NONE]
+
+
+def test_losses_of_different_heads_do_not_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A panel for each head, but one of returns."""
+    write_grid(tmp_path, seeds=1)
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1, 2))
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, curve(0, 1, 2), arguments={**CURE, "srl": "curl"})
+    drawn = {}
+    monkeypatch.setattr(
+        report.plots, "learning_curves", lambda file, curves, colors, label, *how: drawn.update({label: list(curves)})
     )
+    monkeypatch.setattr(report.plots, "paired_differences", lambda *drawing: None)
+    (experiment,) = report.read_results(tmp_path)
+    report.describe(experiment, [100])
+    assert drawn["SRL loss"] == [f"{TASK}, rae", f"{TASK}, curl"]
+    assert drawn["episode return\n(deterministic actions)"] == [TASK]
 
 
 def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
@@ -144,9 +180,10 @@ def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
             write_cell(tmp_path, TASK, method, seed, curve(0, 0), rewards_met=met)
     assert report.main([str(tmp_path)]) == 0
     _, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Rewards met in training")
-    assert baseline[2:] == ["2", "4 ± 6", "1.15", NONE]
-    assert cure[2:5] == ["3", "38 ± 53", "2.90"]
-    assert cure[5] == "2.30 [2.30, 2.30]"  # log(10) in both pairs
+    # Earlier versions did not record who acted
+    assert baseline[2:] == ["2", "4 ± 6", NONE, NONE, NONE, "1.15", NONE]
+    assert cure[2:4] == ["3", "38 ± 53"] and cure[7] == "2.90"
+    assert cure[8] == "2.30 [2.30, 2.30]"  # log(10) in both pairs
     write_cell(tmp_path, TASK, "cure_sac_ae", 2, curve(0, 0), rewards_met=-1)
     assert report.main([str(tmp_path)]) == 0
     assert "38 ±" not in (tmp_path / "table.md").read_text()
@@ -197,7 +234,7 @@ def test_conditions_and_plots(results: Path) -> None:
     _, row, *_ = rows_of(results / "curves" / "table.md", "Run conditions")
     machine = ["cpu", "bf16", "x86_64, 2 threads, AVX512"]
     none = "\N{EN DASH}"
-    assert row[2:] == ["0, 1", "100,000", none, "1.0 h, 1.0 h", *machine, "A", "abc1234", "1"]
+    assert row[2:] == ["0, 1", "100,000", none, "1.0 h, 1.0 h", f"{none}, {none}", *machine, "A", "abc1234", "1"]
     text = (results / "curves" / "table.md").read_text()
     assert "Versions A: sb3\\_cure 0.1.0, torch 2.13.0." in text and "different commits" not in text
     rows = rows_of(results / "pretraining" / "table.md", "Run conditions")[1:]
@@ -237,9 +274,10 @@ def test_names_are_text_only(tmp_path: Path) -> None:
         assert "<" not in text and not re.search(r"(?<!\\)\]\(b\)", text)
         lines = [line for line in text.splitlines() if line.startswith("|")]
         header = next(line for line in lines if "area under curve" in line)
-        rows = [line for line in lines if line.startswith(f"| {TASK} | ") and "not reached" in line]
-        assert len(rows) == 2
-        assert {len(re.findall(r"(?<!\\)\|", line)) for line in [header, *rows]} == {9}
+        first = lines.index(header)
+        rows = lines[first : first + 4]
+        assert all(row.startswith(f"| {TASK} | ") for row in rows[2:])
+        assert {len(re.findall(r"(?<!\\)\|", line)) for line in rows} == {6}
 
 
 def test_media_of_first_seed_or_all(tmp_path: Path) -> None:

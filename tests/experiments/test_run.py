@@ -169,7 +169,8 @@ def has_evaluated(folder: Path) -> bool:
 
 
 def outcome(folder: Path) -> Any:
-    return [{**row, "seconds": 0} for row in read_rows(folder / "eval.csv")], (folder / "episodes.csv").read_text()
+    evaluations = [{**row, "seconds": 0, "cpu_seconds": 0} for row in read_rows(folder / "eval.csv")]
+    return evaluations, (folder / "episodes.csv").read_text()
 
 
 def test_killed_grid_ends_like_one_that_was_not(tmp_path: Path, slow_grid: Any) -> None:

@@ -33,6 +33,32 @@ def test_areas_finals_and_thresholds(results: Path) -> None:
     np.testing.assert_array_equal(arm.reached[500], [np.inf, np.inf])
 
 
+def test_cell_that_stopped_holds_its_last_return(tmp_path: Path) -> None:
+    """It ends at 50 000 of 100 000 steps: the area is that of 0 to 400 in 50 000 steps, and 400 from there on."""
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=1, stop_at_return=300)
+    for method in ("sac_ae", "cure_sac_ae"):
+        write_cell(folder, TASK, method, 0, {0: 0, 25_000: 200, 50_000: 400}, stop_at_return=300)
+    (experiment,) = read_results(folder)
+    arm = statistics.summarise_arm(experiment, TASK, "sac_ae", [300])
+    np.testing.assert_allclose(arm.areas, [(200 + 400) / 2])
+    np.testing.assert_array_equal(arm.reached[300], [50_000])
+    np.testing.assert_allclose(arm.lasts, [(200 + 400 + 400) / 3])
+
+
+def test_equal_starts_are_told_by_the_error(tmp_path: Path) -> None:
+    """Returns of a sparse task are zero at first whatever the weights; an arm without errors is told by returns."""
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=3)
+    for seed, error in enumerate(("0.001", "0.002", "")):
+        write_cell(folder, TASK, "sac_ae", seed, curve(0, 0))
+        cell = write_cell(folder, TASK, "cure_sac_ae", seed, curve(0, 0))
+        rows = (cell / "eval.csv").read_text()
+        (cell / "eval.csv").write_text(rows.replace(",0.001,", f",{error},"))
+    (difference,) = statistics.paired_differences(read_results(folder)[0])
+    assert (difference.same_starts, difference.pairs) == (2, 3)
+
+
 def test_area_counts_steps_not_evaluations() -> None:
     """Trapezoids: 10 on 0..10, then 5 on average over 90 steps."""
     area = statistics.area_under_curve(np.array([0, 10, 100]), np.array([10.0, 10.0, 0.0]))
@@ -93,6 +119,26 @@ def test_interval_over_tasks_agrees_with_theory() -> None:
     expected = stats.norm.ppf(0.975) * np.sqrt(sum(group.var(ddof=1) / 400 for group in groups)) / 2
     assert estimate.high is not None
     assert estimate.high - estimate.value == pytest.approx(expected, rel=0.02)
+
+
+def test_sign_flips_are_counted_exactly() -> None:
+    """Of 8 signs of 1, 2, 3 the sums 6 and -6 are as far from 0; with 3, -2, 4 four of them: 5, -5, 9, -9."""
+    assert statistics.sign_flip_p([np.array([1.0, 2.0, 3.0])]) == 2 / 8
+    assert statistics.sign_flip_p([np.array([3.0, -2.0, 4.0])]) == 4 / 8
+    assert statistics.sign_flip_p([np.array([5.0])]) == 1
+    # Tasks are weighed evenly: 1, 3 / 2 and -1 / 2 have the sum 2; 3, 2, -2 and -3 are as far from 0
+    assert statistics.sign_flip_p([np.array([1.0]), np.array([3.0, -1.0])]) == 4 / 8
+
+
+def test_holm_steps_down() -> None:
+    """3 x .01; then 2 x .03; the largest is at least what was before it; order is kept."""
+    np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])
+    np.testing.assert_allclose(statistics.holm([0.9, 0.6]), [1, 1])
+
+
+def test_restricted_mean_counts_the_limit() -> None:
+    """A seed that is late, or never there, counts as the limit."""
+    assert statistics.restricted_mean(np.array([10.0, 150.0, np.inf]), 100) == pytest.approx(70)
 
 
 @settings(deadline=None, max_examples=20)
