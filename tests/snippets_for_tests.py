@@ -1,10 +1,14 @@
-"""Run the Python of a page of the documentation in miniature: ``python snippets_for_tests.py page.py``.
+"""Run the Python of pages of the documentation in miniature: ``python snippets_for_tests.py folder ...``.
 
-Trainings last a few steps of short episodes with tiny networks and images, and callbacks come due in them.
+Each folder has a ``page.py``, which runs there in a process and namespace of its own. Trainings last a few steps of
+short episodes with tiny networks and images, and callbacks come due in them. Packages are imported once, before the
+fork.
 """
 
+import os
 import runpy
 import sys
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -61,7 +65,25 @@ def one_worker(make: Callable[..., Any], env: Any, n_envs: int = 1, **kwargs: An
     return make(env, 1, **kwargs)
 
 
-def main(page: str) -> None:
+def run_page(folder: str) -> bool:
+    """Whether the page ran to its end."""
+    child = os.fork()
+    if child:
+        return os.waitpid(child, 0)[1] == 0
+    status = 1
+    try:
+        os.chdir(folder)
+        runpy.run_path("page.py", run_name="__main__")
+        status = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def shrink_everything() -> None:
     shrink(CuReBase, "__init__", tiny_model)
     for name in ("learn", "pretrain", "fit_representation"):
         shrink(sb3_cure.CuReSAC, name, few)
@@ -74,8 +96,9 @@ def main(page: str) -> None:
     evaluation.run_episodes = callbacks.run_episodes = rollouts.run_episodes
     shrink(callbacks.PeriodicCallback, "__init__", soon)
     shrink(ExactCheckpoint, "__init__", checkpoint_soon)
-    runpy.run_path(page, run_name="__main__")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    shrink_everything()
+    failed = [folder for folder in sys.argv[1:] if not run_page(folder)]
+    sys.exit(f"failed: {failed}" if failed else 0)
