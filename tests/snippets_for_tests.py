@@ -6,10 +6,10 @@ fork.
 """
 
 import os
-import runpy
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -73,7 +73,7 @@ def run_page(folder: str) -> bool:
     status = 1
     try:
         os.chdir(folder)
-        runpy.run_path("page.py", run_name="__main__")
+        exec(compile(Path("page.py").read_text(), "page.py", "exec"), {"__name__": "__main__"})
         status = 0
     except BaseException:
         traceback.print_exc()
