@@ -45,7 +45,8 @@ def few(run: Callable[..., Any], model: Any, steps: int, *args: Any, **kwargs: A
 
 
 def small_env(make: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> gym.Env:
-    return gym.wrappers.TimeLimit(make(*args, **{**kwargs, "image_size": 32}), 4)
+    # 36 px: the smallest images of SB3's own network
+    return gym.wrappers.TimeLimit(make(*args, **{**kwargs, "image_size": 36}), 4)
 
 
 def two_episodes(run: Callable[..., Any], model: Any, env: gym.Env, n: int, *args: Any, **kwargs: Any) -> Any:
