@@ -19,7 +19,7 @@ author = "The sb3_cure developers"
 copyright = author
 version = release = sb3_cure.__version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
 exclude_patterns = ["_build"]
 suppress_warnings = ["myst.header"]  # tables begin with small headings
 

@@ -33,74 +33,39 @@ PUBLIC = (
 )
 
 
-def blocks(page: str, language: str = "python") -> list[str]:
-    """
+def blocks(page: str | Path) -> list[str]:
+    """The page's blocks of Python.
+
     :param page: Path in the repository
-    :param language: As after the fence
-    :return: The page's blocks of code
     """
-    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), re.S)
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.S)
+
+
+def without_model(block: str) -> str:
+    """The block but for the lines that make an environment and a model of it."""
+    return re.sub(r"^(env|model) =.*\n", "", block, flags=re.M)
 
 
 def class_of(page: str, name: str) -> Any:
     """The class as it stands in the page."""
     block = next(block for block in blocks(page) if f"class {name}" in block)
     namespace: dict = {"__name__": "page"}
-    exec(compile(block[: block.index("model = CuReSAC")], page, "exec"), namespace)
+    exec(compile(without_model(block), page, "exec"), namespace)
     return namespace[name]
 
 
-def test_twenty_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And the first page of the documentation has the same."""
-    block = next(block for block in blocks("README.md") if "CuReSAC" in block)
-    assert block in blocks("docs/start.md")
-    assert len(block.splitlines()) <= 20
-    monkeypatch.chdir(tmp_path)
-    names: dict = {}
-    exec(compile(block.replace("12_500", "8"), "README.md", "exec"), names)
-    assert names["model"].num_timesteps == 8
-    assert names["action"].shape == names["env"].action_space.shape
-
-
-@pytest.mark.parametrize("example", ["Pendulum-v1", "class Reach"])
-def test_own_camera_of_the_guide_trains(example: str) -> None:
-    """Frames are kept once."""
-    block = next(block for block in blocks("docs/guide/environments.md") if example in block)
-    names: dict = {"__name__": "page"}
-    exec(compile(block.replace("5000", "8"), "environments.md", "exec"), names)
-    model = names["model"]
-    assert model.num_timesteps == 8
-    assert model.replay_buffer.frame_stack == 3
-    assert model.observation_space.shape == (9, 48, 48)
-
-
-def test_several_environments_of_the_guide_step_in_workers(tmp_path: Path) -> None:
-    """As a script, which the workers import again."""
-    block = next(block for block in blocks("docs/guide/environments.md") if "SubprocVecEnv" in block)
-    assert "n_envs=4" in block and "learn(1000)" in block
-    (tmp_path / "script.py").write_text(block.replace("n_envs=4", "n_envs=2").replace("learn(1000)", "learn(8)"))
-    subprocess.run([sys.executable, tmp_path / "script.py"], check=True, cwd=tmp_path, timeout=300)
-
-
-def test_own_camera_of_the_guide_is_watched_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = blocks("docs/guide/environments.md")
-    block = next(block for block in page if "CuriosityMapCallback" in block)
-    small = "verbose=1, policy_kwargs=dict(net_arch=[16]), learning_starts=30"
-    block = block.replace("5000", "20").replace("1000", "20").replace("verbose=1", small)
-    monkeypatch.chdir(tmp_path)
-    imports = "from sb3_cure import CuReSAC\nfrom sb3_cure.envs import make_pixel_env\n"
-    assert imports in page[1]
-    names: dict = {"__name__": "page"}
-    exec(compile(imports + block, "environments.md", "exec"), names)
-    assert names["model"].num_timesteps == 20
-    made = {path.name for path in tmp_path.rglob("*.*")}
-    assert made >= {"pendulum.zip", "curiosity_map_20_steps.png", "curious_policy_20_steps.mp4"}
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_python_of_pages_parses(page: Path) -> None:
-    for block in blocks(str(page.relative_to(ROOT))):
-        compile(block, page.name, "exec")
+def test_snippets_run_when_pasted(tmp_path: Path) -> None:
+    """Each page's, one after the other, in a fresh namespace, with fewer steps, smaller networks and smaller images."""
+    folders = []
+    for page in PAGES:
+        if page.parent.name != "results" and blocks(page):
+            folders.append(tmp_path / page.relative_to(ROOT).with_suffix(""))
+            folders[-1].mkdir(parents=True)
+            (folders[-1] / "page.py").write_text("\n".join(blocks(page)))
+    program = [sys.executable, Path(__file__).parent / "snippets_for_tests.py", *folders]
+    run = subprocess.run(program, capture_output=True, text=True, timeout=900)
+    assert len(folders) > 10
+    assert run.returncode == 0, run.stderr
 
 
 def test_own_head_of_the_guide_trains_saves_and_loads(tmp_path: Path) -> None:
@@ -149,7 +114,7 @@ def test_a_policy_leaves_for_the_robot_as_the_guide_says(tmp_path: Path, monkeyp
     model = tiny_model("CnnPolicy", PixelBox(low=-0.5, high=2.0))
     names: dict = {"model": model}
     for block in (here, on_the_robot):
-        exec(compile(block, "robot.md", "exec"), names)
+        exec(compile(without_model(block), "robot.md", "exec"), names)
     actions, _ = model.predict(names["images"].numpy(), deterministic=True)
     np.testing.assert_allclose(names["actions"].detach(), actions, atol=1e-5)
     np.testing.assert_allclose(names["action"], actions[0], atol=1e-5)

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from torch.utils import collect_env
 
 from sb3_cure import __version__
+from sb3_cure.cli.usage import install_command
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
 from sb3_cure.networks.precision import resolve_precision
 
@@ -85,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         errors.append(f"missing: {', '.join(missing)}; pip install {' '.join(missing)}")
     for extra, purpose in EXTRAS.items():
         line, missing = check_packages(needed[extra])
-        install = f'; missing: {", ".join(missing)} (pip install "{PACKAGE}[{extra}]")' if missing else ""
+        install = f"; missing: {', '.join(missing)} ({install_command(extra)})" if missing else ""
         print(f"{extra} ({purpose}): {line}{install}")
 
     device = th.device("cuda" if th.cuda.is_available() else "cpu")

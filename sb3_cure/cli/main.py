@@ -5,6 +5,8 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from sb3_cure import __version__
+from sb3_cure.cli.usage import UsageError, install_command, nearest
 from sb3_cure.networks.allocator import tune_allocator
 
 
@@ -39,21 +41,26 @@ def usage() -> str:
     :return: The text
     """
     lines = [f"  {name:<12} {command.purpose}" for name, command in COMMANDS.items()]
-    return "\n".join(["usage: sb3-cure COMMAND [ARGUMENTS]   (sb3-cure COMMAND --help shows them)", "", *lines])
+    first = "usage: sb3-cure COMMAND [ARGUMENTS]   (sb3-cure COMMAND --help shows them; sb3-cure --version)"
+    return "\n".join([first, "", *lines])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand.
 
     :param argv: Command line without the program's name, ``sys.argv[1:]`` by default
-    :return: Exit status
+    :return: Exit status: 2 if the command line or a file that it names is wrong, 130 after Ctrl-C
     """
     name, *arguments = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
         print(usage())
         return 0
+    if name == "--version":
+        print(f"sb3-cure {__version__}")
+        return 0
     if name not in COMMANDS:
-        print(f"sb3-cure has no command {name!r}; it has {', '.join(COMMANDS)}.", file=sys.stderr)
+        known = [*COMMANDS, "--version", "--help"]
+        print(f"sb3-cure has no command {name!r} among {', '.join(COMMANDS)}{nearest(name, known)}", file=sys.stderr)
         return 2
     command = COMMANDS[name]
     try:
@@ -61,13 +68,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if command.extra is None or str(error.name).startswith("sb3_cure"):
             raise
-        install = f'pip install "sb3-cure[{command.extra}]"'
-        print(f"sb3-cure {name} needs {error.name}, which is not installed: {install}", file=sys.stderr)
+        install = install_command(command.extra)
+        print(f"sb3-cure {name} needs {error.name}, which is not installed: {install}.", file=sys.stderr)
         return 2
     tune_allocator()
     if "" not in sys.path:
         sys.path.append("")  # the user may name classes and environments of the working directory
-    return program(arguments) or 0
+    try:
+        return program(arguments) or 0
+    except UsageError as error:
+        print(f"sb3-cure {name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"sb3-cure {name} was stopped and keeps nothing of this call: give the same command again.")
+        return 130
 
 
 if __name__ == "__main__":

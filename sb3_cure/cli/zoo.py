@@ -6,10 +6,10 @@ replay buffer. Ours do neither.
 
 import argparse
 import contextlib
-import importlib
 import sys
+import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,16 @@ import rl_zoo3.train
 import yaml
 from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_class_by_name, get_model_path
+from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_model_path
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
-from sb3_cure.cli.zoo_files import ALGORITHMS, zoo_file
+from sb3_cure.cli.progress import TimeLeft, time_text
+from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
+from sb3_cure.cli.zoo_files import ALGORITHMS, check_environment, find_class, import_module, packaged_files, zoo_file
+from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
 DEFAULT_ALGORITHM = "cure_sac"
@@ -35,6 +39,19 @@ DEFAULT_SETTINGS = "cure_sac_ae"
 OWN = ("srl", "intrinsic")
 #: Settings of a run that make a replay import and call code, or unpickle files
 TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
+
+
+@contextlib.contextmanager
+def _refusals_in_one_sentence(*functions: Any) -> Iterator[None]:
+    """Settings that are refused, or name an unknown argument, are the user's: show no traceback."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except (TypeError, ValueError) as error:
+        if isinstance(error, TypeError) and "unexpected keyword argument" not in str(error):
+            raise
+        raise UsageError(one_sentence(error, *functions)) from error
 
 
 # ------------------------------------------------------------------ training
@@ -50,21 +67,24 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
     - ``--trial-id 0`` is the first trial, not none;
+    - settings that cannot be used are refused in one sentence, and training tells the time that is left;
     - ``optimize`` samples only what the chosen kind of curiosity uses.
     """
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if self.trial_id is not None:
             if not (self.storage and self.study_name):
-                raise ValueError("--trial-id names a trial of a study: add --storage and --study-name.")
+                raise UsageError("--trial-id names a trial of a study: add --storage and --study-name.")
             trial = self.load_trial(self.storage, self.study_name, self.trial_id)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
         self.config = str(zoo_file(self.config))
+        if not Path(self.config).is_file():
+            raise UsageError(missing_file(Path(self.config), packaged_files()))
         env_name = self.env_name
         if self.config.endswith((".yml", ".yaml")):
             # rl-zoo3 looks for the environment's own id, then for "default".
-            self.env_name = EnvironmentName(self._entry(yaml.safe_load(Path(self.config).read_text())))
+            self.env_name = EnvironmentName(self._entry(_read_yaml(Path(self.config))))
         try:
             return super().read_hyperparameters()
         finally:
@@ -76,11 +96,35 @@ class ExperimentManager(exp_manager.ExperimentManager):
         names += ["atari"] if self._is_atari else []
         return next((name for name in [*names, "default"] if name in entries), task)
 
+    def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
+        algorithm = ALGOS[self.algo]
+        with _refusals_in_one_sentence(algorithm, *algorithm.policy_aliases.values(), make_dmc_env):
+            return super().setup_experiment()
+
+    def create_callbacks(self) -> None:
+        super().create_callbacks()
+        if not (self.show_progress or self.optimize_hyperparameters):
+            self.callbacks.append(TimeLeft(self.env_name.gym_id))
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        super().save_trained_model(model)
+        path = f"{self.save_path}/{self.env_name}.zip"
+        if model.num_timesteps < self.n_timesteps:  # rl-zoo3 catches Ctrl-C
+            print(
+                f"Stopped at step {model.num_timesteps:,} of {self.n_timesteps:,}: {path} keeps the model, and "
+                f"the same command with -i {path} begins a new training from its weights."
+            )
+
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
+        for name in ("policy", "n_timesteps"):
+            if name not in hyperparams and not (name == "n_timesteps" and self.n_timesteps > 0):
+                raise UsageError(
+                    f"{self.config} has no {name!r} for {self.env_name.gym_id}{nearest(name, hyperparams)}"
+                )
         for name in (*OWN, "replay_buffer_class"):
             value = hyperparams.get(name)
             if isinstance(value, str) and "." in value:
-                hyperparams[name] = get_class_by_name(value)
+                hyperparams[name] = find_class(value)
         processed = super()._preprocess_hyperparams(hyperparams)
         rate = processed[0].get("learning_rate")
         if isinstance(rate, SimpleLinearSchedule):  # which archives do not know
@@ -97,7 +141,26 @@ class ExperimentManager(exp_manager.ExperimentManager):
             curiosity = self._hyperparams.get("curiosity", "separate")
             sampler = partial(sample_params, curiosity=curiosity, quantiles=self.algo == "cure_tqc")
             HYPERPARAMS_SAMPLER[self.algo] = sampler
-        super().hyperparameters_optimization()
+        self._n_ended, self._start = 0, time.monotonic()
+        try:
+            super().hyperparameters_optimization()
+        except ValueError as error:
+            if "No trials are completed" not in str(error):  # Optuna's, where there is no best one to show
+                raise
+            print(f"No trial was completed in {time_text(time.monotonic() - self._start)}.")
+
+    def objective(self, trial: optuna.Trial) -> float:
+        try:
+            return super().objective(trial)
+        except KeyboardInterrupt:  # which rl-zoo3 catches further out
+            kept = f"{self.storage} keeps all completed trials, and the same command adds to them"
+            print(f"Stopped: {kept if self.storage else 'without --storage no trial is kept for another call'}.")
+            raise
+        finally:
+            self._n_ended += 1
+            left = (time.monotonic() - self._start) * ((self.n_trials or 0) / self._n_ended - 1)
+            if left > 0:
+                print(f"Trial {self._n_ended} of {self.n_trials} ended, about {time_text(left)} left", flush=True)
 
 
 def sample_params(
@@ -166,12 +229,16 @@ def train(arguments: Sequence[str]) -> None:
         ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
+    _check_values(arguments)
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
     parser.add_argument("--env")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--algo", default=DEFAULT_ALGORITHM)
     given, rest = parser.parse_known_args(arguments)
+    for package in given.gym_packages:
+        import_module(package)
     if given.env is not None:
+        check_environment(given.env)
         module, _, task = given.env.rpartition(":")
         rest += ["--env", task]
         given.gym_packages += [module] if module else []
@@ -185,6 +252,39 @@ def train(arguments: Sequence[str]) -> None:
         rl_zoo3.train.train()
     finally:
         sys.argv = own_arguments
+
+
+def _check_values(arguments: Sequence[str]) -> None:
+    """Refuse what rl-zoo3's own parser would end in a traceback for."""
+    parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
+    for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
+        parser.add_argument(*flags, nargs="+", action=StoreDict)
+    parser.add_argument("-i", "--trained-agent", type=Path)
+    given, _ = _parse(parser, arguments)
+    agent = given.trained_agent
+    if agent is not None and not (agent.suffix == ".zip" and agent.is_file()):
+        raise UsageError(missing_file(agent) if agent.suffix == ".zip" else f"-i {agent} must be a model, a .zip file.")
+
+
+def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    try:
+        return parser.parse_known_args(arguments)
+    except (NameError, SyntaxError) as error:  # of StoreDict, which evaluates values
+        raise UsageError(
+            f"{error.args[0]}: -params and --env-kwargs take name:value with values as in Python, and text in quotes "
+            "for the shell, too ('srl:\"curl\"')."
+        ) from None
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """Entries of a settings file."""
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} is no YAML file: {one_sentence(error)}.") from None
+    if not isinstance(content, dict):
+        raise UsageError(f"{path} must have an entry for each task, or 'default:'.")
+    return content
 
 
 def optimize(arguments: Sequence[str]) -> None:
@@ -219,11 +319,11 @@ def enjoy(arguments: Sequence[str]) -> None:
     """
     parser = _parser("enjoy", "Watch a trained agent, and print the returns of its episodes.")
     parser.add_argument("--no-render", action="store_true", help="Open no window, only print the returns")
-    args = parser.parse_args(arguments)
+    args = _parse_all(parser, arguments)
     if is_headless() and not args.no_render:
         print("There is no display to show the agent on (as with --no-render); `record` writes a video.")
         args.no_render = True
-    model, env, _ = _load(parser, args, None if args.no_render else "human")
+    model, env, _ = _load(args, None if args.no_render else "human")
     episodes = _play(model, env, args)
     env.close()
     print(f"{len(episodes)} Episodes")
@@ -239,8 +339,8 @@ def record(arguments: Sequence[str]) -> None:
     """
     parser = _parser("record", "Write a video of a trained agent.")
     parser.add_argument("-o", "--output-folder", type=Path, help="Default: videos, in the run's folder")
-    args = parser.parse_args(arguments)
-    model, env, path = _load(parser, args, "rgb_array")
+    args = _parse_all(parser, arguments)
+    model, env, path = _load(args, "rgb_array")
     folder = args.output_folder or path.parent / "videos"
     recorder = VecVideoRecorder(env, str(folder), lambda step: step == 0, args.n_timesteps, name_prefix=path.stem)
     _play(model, recorder, args)
@@ -271,25 +371,34 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _load(
-    parser: argparse.ArgumentParser, args: argparse.Namespace, render_mode: str | None
-) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
+def _parse_all(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    args, unknown = _parse(parser, arguments)
+    if unknown:
+        known = [flag for action in parser._actions for flag in action.option_strings]
+        raise UsageError(f"there is no {unknown[0]!r}{nearest(unknown[0], known)}")
+    return args
+
+
+def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
     """The model with the smallest replay buffer, its run's environment, and its path."""
-    module, _, task = args.env.rpartition(":")
-    for package in [*args.gym_packages, *([module] if module else [])]:
-        importlib.import_module(package)
+    for package in args.gym_packages:
+        import_module(package)
+    check_environment(args.env)
+    task = args.env.rpartition(":")[2]
     name = EnvironmentName(task)
     flags = args.load_best, args.load_checkpoint, args.load_last_checkpoint
     try:
         _, found, _ = get_model_path(args.exp_id, args.folder, args.algo, name, *flags)
     except (AssertionError, ValueError) as error:
-        parser.error(str(error))
+        runs = {path.parent.name.rpartition("_")[0] for path in Path(args.folder, args.algo).glob("*/*.zip")}
+        trained = f"; trained there: {', '.join(sorted(runs))}" if runs else ""
+        raise UsageError(f"{one_sentence(error).rstrip('.')}{trained}.") from None
     path = Path(found)
     print(f"Loading {path}")
     folder = path.parent / name
     settings, arguments = _read_settings(folder / "config.yml"), _read_settings(folder / "args.yml")
     if not args.trusted and (named := [name for name in TRUSTED_SETTINGS if settings.get(name)]):
-        parser.error(
+        raise UsageError(
             f"{folder / 'config.yml'} has {' and '.join(named)}, which can run any code: if you know where it comes "
             "from, add --trusted."
         )
@@ -298,14 +407,15 @@ def _load(
         env_kwargs["render_mode"] = render_mode
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
-    env = create_test_env(
-        task, stats_path=str(folder), should_render=False, hyperparams=settings, env_kwargs=env_kwargs
-    )
-    objects: dict[str, Any] = {name: get_class_by_name(vars(args)[name]) for name in OWN if vars(args)[name]}
+    objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in OWN if vars(args)[name]}
     # The smallest buffer, of the default class: it is not used, and the run's class may not be in the archive.
     objects.update(replay_buffer_class=None, replay_buffer_kwargs={}, optimize_memory_usage=False)
     load: Any = ALGORITHMS[args.algo].load
-    model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
+    with _refusals_in_one_sentence(make_dmc_env):
+        env = create_test_env(
+            task, stats_path=str(folder), should_render=False, hyperparams=settings, env_kwargs=env_kwargs
+        )
+        model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
     return model, model.get_env(), path
 
 

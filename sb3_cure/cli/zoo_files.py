@@ -1,8 +1,12 @@
 """Algorithms and YAML files of the package by name, such as ``fast/cure_sac_ae``."""
 
+import importlib
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
+from sb3_cure.cli.usage import UsageError, nearest
 from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 
 #: Algorithms by their name for ``--algo`` and in grids
@@ -19,15 +23,70 @@ def zoo_file(name: str | Path, folder: Path = ZOO) -> Path:
     :param name: A file of the package by its path in ``folder`` without suffix, or the path of any other with suffix
     :param folder: ``ZOO`` or ``GRIDS``
     :return: Path of the file; one with a suffix is returned as it is, whether it exists or not
-    :raises ValueError: with the known names, for an unknown one
+    :raises UsageError: with the nearest names, for an unknown one
     """
     path = Path(name)
     if path.suffix:
         return path
-    files = [*sorted(folder.glob("*.yml")), *sorted(folder.glob("fast/*.yml"))]
-    known = {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+    known = packaged_files(folder)
     if path.as_posix() not in known:
-        raise ValueError(
-            f"{str(name)!r} is neither the path of a YAML file nor one of the package's: {', '.join(known)}."
+        raise UsageError(
+            f"{str(name)!r} is neither the path of a YAML file nor a name of the package's, such as "
+            f"{next(iter(known))}{nearest(str(name), known)}"
         )
     return known[path.as_posix()]
+
+
+def packaged_files(folder: Path = ZOO) -> dict[str, Path]:
+    """List the package's YAML files.
+
+    :param folder: ``ZOO`` or ``GRIDS``
+    :return: Path by name
+    """
+    files = [*sorted(folder.glob("*.yml")), *sorted(folder.glob("fast/*.yml"))]
+    return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+
+
+def check_environment(task: str) -> None:
+    """Refuse an unknown environment.
+
+    :param task: Gymnasium id, or ``my_module:My-v0`` with the module that registers it
+    :raises UsageError: with the nearest names
+    """
+    module, _, name = task.rpartition(":")
+    if module:
+        import_module(module)
+    if name not in gym.registry:
+        raise UsageError(f"there is no environment {name!r}{nearest(name, gym.registry)}")
+
+
+def import_module(name: str) -> Any:
+    """Import a module that the user names.
+
+    :param name: Its name
+    :return: The module
+    :raises UsageError: with the nearest names in the working directory, if there is no such module
+    """
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):  # one that the module itself imports
+            raise
+        here = [path.stem for path in Path().glob("*.py")]
+        raise UsageError(f"there is no module {error.name!r}{nearest(error.name, here)}") from None
+
+
+def find_class(name: str) -> Any:
+    """Import a class that the user names.
+
+    :param name: Such as ``my_module.MyClass``
+    :return: The class
+    :raises UsageError: with the nearest names, if there is no such class or module
+    """
+    module_name, _, class_name = name.rpartition(".")
+    if not module_name:
+        raise UsageError(f"{name!r} must name a class with its module, such as my_module.MyClass.")
+    module = import_module(module_name)
+    if not hasattr(module, class_name):
+        raise UsageError(f"{module_name} has no {class_name!r}{nearest(class_name, vars(module))}")
+    return getattr(module, class_name)

@@ -16,6 +16,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_cure.cli.progress import TimeLeft
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.counting import TASK_REWARD
@@ -119,7 +120,7 @@ class _CellRun:
     def _train(self) -> None:
         """Make the same calls in every attempt: a resumed model does what is left of them."""
         cell, record = self.cell, self.record
-        callbacks: list[BaseCallback] = [record, self.checkpoints]
+        callbacks: list[BaseCallback] = [record, self.checkpoints, TimeLeft(str(cell.folder))]
         if cell.pretrain is not None and self.pretrains:
             steps = record.agent_steps(cell.pretrain.budget)
             self.model.pretrain(steps, cell.pretrain.collector, callback=[*callbacks])

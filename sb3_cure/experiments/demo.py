@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0
+    :return: 0, or 130 after Ctrl-C
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder to write (default: demo)")
@@ -123,7 +123,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start = time.monotonic()
     progress = Progress(eval_env, options.steps, 60 * options.minutes * (1 - MEASURING))
     rows = ReconstructionCallback(out, max(options.steps // ROWS, 1), title=title)
-    model.learn(options.steps, callback=[progress, rows])
+    try:
+        model.learn(options.steps, callback=[progress, rows])
+    except KeyboardInterrupt:
+        model.save(out / "model.zip")
+        print(f"Stopped: {out / 'model.zip'} keeps the model of step {model.num_timesteps:,}; the demo begins anew.")
+        return 130
     seconds = time.monotonic() - start
     if not progress.rows or progress.rows[-1]["agent_steps"] < model.num_timesteps:
         progress.evaluate()

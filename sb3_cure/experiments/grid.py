@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import importlib
 import json
 import pkgutil
 import re
@@ -17,8 +16,10 @@ import torch as th
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, zoo_file
+from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
+from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, packaged_files, zoo_file
 from sb3_cure.cure.algorithms import CuReSAC
+from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.counting import CellInfo, TaskReward
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
@@ -31,7 +32,7 @@ SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
 _CLASSES = ("srl", "intrinsic", "replay_buffer_class")
 
 
-class GridError(ValueError):
+class GridError(UsageError):
     """A grid file or a choice from it that cannot be run; the message is for its author."""
 
 
@@ -48,13 +49,10 @@ def short_name(task: str) -> str:
 
 
 def _check_registered(task: str) -> str:
-    module, _, name = task.rpartition(":")
     try:
-        if module:
-            importlib.import_module(module)
-        gym.spec(name)
-    except (gym.error.Error, ImportError, TypeError) as error:
-        raise ValueError(f"{' '.join(str(error).split())} (one of your own is my_module:My-v0)") from error
+        check_environment(task)
+    except UsageError as error:
+        raise ValueError(f"{str(error).rstrip('.')} (one of your own is my_module:My-v0)") from error
     return task
 
 
@@ -390,7 +388,7 @@ def load_grid(
 def _find(name: str | Path, folder: Path) -> Path:
     try:
         return zoo_file(name, folder)
-    except ValueError as error:
+    except UsageError as error:
         raise GridError(str(error)) from None
 
 
@@ -398,12 +396,18 @@ def _validated(path: Path, content: Any) -> GridFile:
     try:
         return GridFile.model_validate(content)
     except pydantic.ValidationError as error:
-        wrong = [
-            f"{'.'.join(map(str, each['loc'])) or 'it'}: {each['msg'].removeprefix('Value error, ')}"
-            + (f" (got {each['input']!r:.60})" if each["loc"] else "")
-            for each in error.errors()
-        ]
-        raise GridError(f"{path} is no grid: {'; '.join(wrong)}.") from None
+        wrong = "; ".join(_validation_message(each) for each in error.errors())
+        raise GridError(f"{path} is no grid: {wrong}.") from None
+
+
+def _validation_message(error: Any) -> str:
+    """Message of one of pydantic's errors, with the nearest keys if a key is unknown."""
+    keys = [str(key) for key in error["loc"]]
+    if error["type"] == "extra_forbidden":
+        known = {name for part in (GridFile, Method, Evaluation) for name in part.model_fields}
+        return f"{'.'.join(keys)} is no key of a grid{nearest(keys[-1], known)}".rstrip(".")
+    text = f"{'.'.join(keys) or 'it'}: {error['msg'].removeprefix('Value error, ')}"
+    return text + (f" (got {error['input']!r:.60})" if keys else "")
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
@@ -484,6 +488,8 @@ _Loader.add_implicit_resolver(
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        raise GridError(missing_file(path, [*packaged_files(GRIDS), *packaged_files(ZOO)]))
     try:
         content = yaml.load(path.read_text(), _Loader)  # a SafeLoader
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
@@ -499,7 +505,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> set[str]:
     for name in names or ():
         if name not in known:
-            raise GridError(f"{name!r} is not in {path}, which has {', '.join(known)}: choose among these.")
+            raise GridError(f"{name!r} is not in {path}, which has {', '.join(known)}{nearest(name, known)}")
     return {known[name] for name in (known if names is None else names)}
 
 
@@ -520,5 +526,5 @@ def check_arms(cells: Iterable[Cell]) -> None:
         except GLUnavailableError:  # with Ray other machines may have OpenGL
             return
         except Exception as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            reason = f"{type(error).__name__}: {one_sentence(error, ALGORITHMS[cell.algo], make_dmc_env)}"
             raise GridError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error

@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 import sb3_cure
+from sb3_cure.cli.usage import missing_file
 from sb3_cure.evaluation import plots
 from sb3_cure.experiments import statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
@@ -331,7 +332,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure report``.
 
     :param argv: Command line, ``sys.argv`` by default
-    :return: 0, or 1 if the results cannot be read
+    :return: 0, 1 if the results cannot be read, or 2 if there are none
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -343,6 +344,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     media_help = "seeds with videos and pictures (default: of each arm the first that has some)"
     parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=media_help)
     options = parser.parse_args(argv)
+    if not options.results.is_dir():
+        print(f"{parser.prog}: {missing_file(options.results)}", file=sys.stderr)
+        return 2
     try:
         written = write_report(
             options.results, options.out or options.results / "report.html", options.thresholds, options.media

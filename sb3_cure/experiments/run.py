@@ -4,6 +4,7 @@ import argparse
 import os
 import re
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
@@ -11,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from sb3_cure.cli.progress import time_text
+from sb3_cure.cli.usage import install_command
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import Grid, GridError, check_arms, load_grid, read_kept
@@ -102,7 +105,13 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 
 
 def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
-    return [unit for unit in units if not _run_unit(unit, *settings)]
+    failed, start = [], time.monotonic()
+    for number, unit in enumerate(units, 1):
+        if not _run_unit(unit, *settings):
+            failed.append(unit)
+        left = (time.monotonic() - start) * (len(units) / number - 1)
+        print(f"{number} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""), flush=True)
+    return failed
 
 
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
@@ -145,7 +154,8 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     try:
         import ray
     except ImportError:
-        raise GridError('engine="ray" needs Ray, which is not installed: pip install "sb3-cure[cluster]".') from None
+        needs = f'engine="ray" needs Ray, which is not installed: {install_command("cluster")}.'
+        raise GridError(needs) from None
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
     ray.init(address=address or "local", **own)
     try:
@@ -274,7 +284,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("Stopped; the same command continues from the last checkpoints.")
+        print(
+            f"Stopped: {out} keeps the finished cells and the last checkpoints, from which the same command continues."
+        )
         return 130
     for unit in failed:
         print(f"{unit.folder} failed, see {out / unit.folder / ERROR}", flush=True)

@@ -42,7 +42,7 @@ def test_doctor_names_missing_packages(
     assert main(["doctor"]) == status
     report = capsys.readouterr().out
     assert "no-such-package" in report and ("ERROR" in report) == bool(status)
-    assert ('pip install "sb3-cure[zoo]"' in report) == (extra == "zoo")
+    assert ("pip install -e '.[zoo]'" in report) == (extra == "zoo")
 
 
 def test_doctor_warns_of_unused_gpus(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,9 +41,9 @@ def test_grids_and_settings_of_the_package_by_name(tmp_path: Path) -> None:
     methods = {"a": {"config": "fast/sac_ae"}}
     (cell,) = load_grid(write_grid(tmp_path, methods=methods, tasks=[DMC_TASK], seeds=1)).cells
     assert (cell.arguments["policy"], cell.env_kwargs["renderer"]) == ("CnnPolicy", "fast")
-    with pytest.raises(GridError, match=r"'fast/curve' is neither .*, visitation, .*, fast/curves, "):
+    with pytest.raises(GridError, match=r"'fast/curve' is neither .* did you mean fast/curves"):
         load_grid("fast/curve")
-    with pytest.raises(GridError, match=r"'sac' is neither .*, sac_ae, .*, fast/sac_ae, "):
+    with pytest.raises(GridError, match=r"'sac' is neither .* did you mean sac_ae"):
         load_grid(write_grid(tmp_path, methods={"a": {"config": "sac"}}))
 
 
@@ -90,16 +90,19 @@ def test_numbers_with_exponents_alone_are_numbers(tmp_path: Path) -> None:
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "an unknown kind": (dict(kind="curve"), "kind: Input should be 'curves', 'visitation' or 'pretraining'"),
-    "an unknown key": (dict(budgets=3), "budgets: Extra inputs are not permitted"),
+    "an unknown key": (dict(budgets=3), "budgets is no key of a grid; did you mean budget"),
     "no seeds": (dict(seeds=0), "seeds: .*at least 1 item"),
-    "an unknown task": (dict(tasks=["dmc_pixels/cartpole-swing-v0"]), "tasks.0: .*`cartpole-swing` doesn't exist"),
-    "no module": (dict(tasks=["no_camera:tests/Camera-v0"]), "tasks.0: No module named 'no_camera'"),
+    "an unknown task": (
+        dict(tasks=["dmc_pixels/cartpole-swing-v0"]),
+        "tasks.0: .*did you mean dmc_pixels/cartpole-swingup-v0",
+    ),
+    "no module": (dict(tasks=["no_camera:tests/Camera-v0"]), "tasks.0: there is no module 'no_camera'"),
     "tasks of one folder": (dict(tasks=["CartPole-v0", "CartPole-v1"]), "two tasks would share a folder"),
     "no folder": (dict(experiment="../elsewhere"), "experiment: String should match pattern"),
     "a method that is no folder": (dict(methods={"a/b": {"config": "zoo.yml"}}), "methods.a/b.*should match pattern"),
     "no zoo file": (
         dict(methods={"a": {"config": "no.yml"}}),
-        "no.yml cannot be read .*, or a name of the package's without suffix",
+        "there is no .*no.yml",
     ),
     "neither of both": (dict(methods={"a": {"config": "zoo.yml", "train": False}}), "'a' neither trains nor"),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),

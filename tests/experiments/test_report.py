@@ -300,12 +300,12 @@ def test_media_of_first_seed_or_all(tmp_path: Path) -> None:
 
 
 def test_errors_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report.main([str(tmp_path / "nowhere")]) == 1
+    assert report.main([str(tmp_path / "nowhere")]) == 2
     write_curves(tmp_path / "curves")
     (tmp_path / "curves" / TASK / "sac_ae" / "seed0" / "eval.csv").write_text("nonsense")
     assert report.main([str(tmp_path)]) == 1
     first, second = capsys.readouterr().err.splitlines()
-    assert "nowhere holds no experiment" in first and "eval.csv cannot be read" in second
+    assert "there is no" in first and "eval.csv cannot be read" in second
     with pytest.raises(SystemExit):
         report.main([str(tmp_path), "--thresholds", "many"])
     assert "--thresholds: invalid returns value: 'many'" in capsys.readouterr().err

@@ -1,0 +1,60 @@
+"""Sentences for those who typed a command: an unknown name, and how to install an extra."""
+
+import difflib
+import inspect
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+
+class UsageError(ValueError):
+    """A command line, or a file that it names, that cannot be used; the message is one sentence for its author."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Suggest known names.
+
+    :param name: What was typed
+    :param known: Names that there are
+    :return: ``"; did you mean a, b or c?"``, or ``"."`` where nothing is near
+    """
+    by_lower_case = {each.lower(): each for each in known}
+    found = [by_lower_case[each] for each in difflib.get_close_matches(name.lower(), by_lower_case)]
+    return f"; did you mean {' or '.join(filter(None, (', '.join(found[:-1]), found[-1])))}?" if found else "."
+
+
+def missing_file(path: Path, names: Iterable[str] = ()) -> str:
+    """Say that there is no such file or folder, and what in its folder has a similar name.
+
+    :param path: Where nothing is
+    :param names: Other names that might have been meant
+    :return: One sentence
+    """
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    return f"there is no {path}{nearest(str(path), [*map(str, beside), *names])}"
+
+
+def one_sentence(error: Exception, *functions: Any) -> str:
+    """Message of an error in one line, with the nearest names if it is about an unknown argument.
+
+    :param error: The error
+    :param functions: Functions and classes that may have got the argument
+    :return: The line
+    """
+    text = " ".join(str(error).split())
+    wrong = re.search(r"unexpected keyword argument '(\w+)'", text)
+    if wrong is None:
+        return text
+    classes = [base for each in functions for base in (each.mro() if isinstance(each, type) else [each])]
+    known = {name for each in classes for name in inspect.signature(each).parameters}
+    return f"there is no argument {wrong[1]!r}{nearest(wrong[1], known - {'self', 'args', 'kwargs'})}"
+
+
+def install_command(extra: str) -> str:
+    """Command that installs an extra of this package.
+
+    :param extra: Its name
+    :return: The command, and where to give it
+    """
+    return f"pip install -e '.[{extra}]' -c constraints.txt, in the checkout of sb3_cure"
