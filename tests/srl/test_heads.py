@@ -58,6 +58,14 @@ def test_measured_error_is_that_of_a_transition_alone(srl: str) -> None:
     np.testing.assert_allclose(srl_errors(model, batch), errors, rtol=1e-4, atol=1e-5)
 
 
+def test_moving_average_of_spr_keeps_no_graph() -> None:
+    """Which would grow with each update."""
+    model = filled_model(pixels=True, srl="spr", curiosity=None)
+    train_once(model, rl=False)
+    target: Any = model.policy.srl.target_projection  # type: ignore[union-attr]
+    assert all(parameter.grad_fn is None and not parameter.requires_grad for parameter in target.parameters())
+
+
 def test_noise_of_the_vae_is_that_of_its_own_variance() -> None:
     """Measured, it draws from the mean; trained, from N(mean, sigma^2): what is drawn varies as much as that."""
     model = filled_model(srl="vae", curiosity=None)
