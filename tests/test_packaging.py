@@ -81,10 +81,10 @@ def test_files_are_found_by_name_or_path(tmp_path: Path) -> None:
         assert zoo_file(name, folder) == folder / f"{name}.yml"
         assert zoo_file(name, folder).is_file()
     assert zoo_file("mine/sac_ae.yml") == Path("mine/sac_ae.yml")
-    with pytest.raises(ValueError, match=r"^'fast/sac' is neither .*: .*, sac_ae, .*, fast/sac_ae, .*\.$"):
+    with pytest.raises(ValueError, match=r"^'fast/sac' is neither .*; did you mean fast/sac_ae"):
         zoo_file("fast/sac")
-    with pytest.raises(ValueError, match=r"curves_curl, .*fast/curves_curl"):
-        zoo_file("sac_ae", GRIDS)
+    with pytest.raises(ValueError, match=r"; did you mean .*curves_curl"):
+        zoo_file("curve_curl", GRIDS)
 
 
 def test_changelog_and_citation_name_the_version() -> None:
