@@ -58,7 +58,8 @@ class CuReBase(OffPolicyAlgorithm):
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Gradient steps per phase when alternating
-    :param srl_interval: Updates between two of head and encoder by the SRL loss; in the burst each of them
+    :param srl_interval: Updates between two of head and encoder by the SRL loss; each of them in the burst, and where
+        nothing else is learned
     :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
         novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,

@@ -162,9 +162,9 @@ class CuRe(CuReBase):
     def _phase(self) -> tuple[bool, bool]:
         """Whether the next update trains the representation, and whether it trains actors and critics."""
         learns_srl = self.srl is not None and not self.policy.representation_frozen
-        learns_srl = learns_srl and (self._in_burst or self._n_updates % self.srl_interval == 0)
         if not (self.task or self._has_curious_agent):
             return learns_srl, False
+        learns_srl = learns_srl and (self._in_burst or self._n_updates % self.srl_interval == 0)
         if not self._alternates:
             return learns_srl, True
         srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy

@@ -93,6 +93,12 @@ def test_head_and_curious_agent_skip_updates(task: bool, update: str) -> None:
     assert moved == [0, 4, 8]  # target_update_interval=2, of its own updates
 
 
+def test_head_alone_makes_each_update() -> None:
+    model = model_with_transitions(srl_interval=3)
+    model.fit_representation(6)
+    assert steps(model)["srl"] == 6
+
+
 def test_interval_of_the_curious_agent_skips_its_reward() -> None:
     model = model_with_transitions(intrinsic="rnd", curious_interval=3)
     model.train(6, batch_size=8)
