@@ -47,7 +47,7 @@ GROUPS = {
     "cure/encoder_update.py": "cure/test_encoder_update.py cure/test_gradients.py",
     "cure/mixers.py": """cure/test_mixers.py persistence/test_resume.py
         cure/test_training.py::test_schedules_follow_the_progress_of_the_call""",
-    "cure/pretraining.py": "cure intrinsic '-kpretrain or transfer'",
+    "cure/pretraining.py": "cure intrinsic -k 'pretrain or transfer'",
     "srl/*.py": "cure/test_gradients.py srl intrinsic/test_contract.py cure/test_dictionaries.py",
     "intrinsic/*.py": "intrinsic cure/test_gradients.py cure/test_dictionaries.py",
     "data/buffers.py": "data/test_buffers.py persistence/test_frame_rows.py",
@@ -110,7 +110,8 @@ def _run(row: Row) -> Row:
             path.write_text(mutate_code(before, get_operator(row["operator"])(), row["occurrence"]))
             after = path.read_text().splitlines()
             mutant = after[row["line"] - 1].strip() if len(after) == len(before.splitlines()) else "(line removed)"
-        tests = [name if name[0] in "-n" else f"tests/{name}" for name in shlex.split(TESTS[row["file"]])]
+        words = shlex.split(TESTS[row["file"]])
+        tests = [f"tests/{word}" if Path(folder, "tests", word.partition("::")[0]).exists() else word for word in words]
         command = f"{sys.executable} -m pytest -x -q -p no:cacheprovider --hypothesis-seed=0 --basetemp=tmp".split()
         limited = [
             "timeout",
