@@ -143,9 +143,7 @@ def stack(evaluations: Sequence[pd.DataFrame]) -> Curve:
     return steps, np.stack([np.interp(steps, rows.environment_steps, rows.return_mean) for rows in evaluations])
 
 
-def collect(
-    results: Path, grid: Grid, costs: dict[str, Any]
-) -> tuple[dict[str, list[str]], dict[str, dict[str, Curve]]]:
+def collect(results: Path, grid: Grid, costs: dict[str, Any]) -> tuple[Texts, Curves]:
     """Collect what is shown.
 
     :param results: Folder of all results

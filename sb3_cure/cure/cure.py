@@ -187,11 +187,11 @@ class CuRe(CuReBase):
         reward = policy.intrinsic if "curious" in turns or (turns and self.curiosity == "bonus") else None
         curious_rewards = None
         if reward is not None and reward.needs_srl:  # the reward is of the head before its step
-            curious_rewards = self._curious_rewards(self._reward_inputs(batch, srl, metrics), metrics)
+            curious_rewards = self._curious_rewards(batch, srl, metrics)
         if srl is not None:
             self._update_srl(srl.loss)
         if reward is not None and not reward.needs_srl:
-            curious_rewards = self._curious_rewards(self._reward_inputs(batch, srl, metrics), metrics)
+            curious_rewards = self._curious_rewards(batch, srl, metrics)
         if learns_rl:
             self._update_agents(batch, turns, curious_rewards, metrics)
         encoder.finish()
@@ -248,10 +248,10 @@ class CuRe(CuReBase):
             )
         srl.after_step()
 
-    def _curious_rewards(self, inputs: RewardInputs, metrics: Metrics) -> th.Tensor:
+    def _curious_rewards(self, batch: Samples, srl: SRLOutput | None, metrics: Metrics) -> th.Tensor:
         """Scaled intrinsic reward of this batch, [B, 1], never stored, so never stale; and the step of its own loss."""
         reward: Any = self.policy.intrinsic
-        loss, raw = reward.loss(inputs)
+        loss, raw = reward.loss(self._reward_inputs(batch, srl, metrics))
         raw = raw.detach().float()
         if loss is not None:
             self._learn("intrinsic", "intrinsic reward", loss.float(), reward.optimizer)
