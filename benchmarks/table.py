@@ -6,7 +6,7 @@
 
 Reads the cells of ``zoo_configs/experiments/fast/benchmark.yml`` in ``results/fast_benchmark/``, and where one of them
 is missing that of ``time_to_return.py`` in ``results/by_the_clock/``, if it has an evaluation at the same step. The
-random policy is played once and kept in ``results/fast_benchmark/random.csv``.
+random policy is played once and kept in ``results/fast_benchmark/random.csv``, with machine and versions beside it.
 """
 
 import argparse
@@ -23,7 +23,7 @@ import pandas as pd
 
 from benchmarks.public_returns import episode_return
 from sb3_cure.evaluation.plots import arm_colors, learning_curves
-from sb3_cure.evaluation.result_files import Row, write_csv, write_text
+from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.cells import EVAL_SEED
 from sb3_cure.experiments.grid import Cell, Grid, load_grid, short_name
 from sb3_cure.experiments.results import NOT_RUN
@@ -86,6 +86,7 @@ def read_random(path: Path, grid: Grid) -> pd.DataFrame:
         ]
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, ("task", "seed", "return"), rows)
+        write_json(path.with_suffix(".json"), describe_run())
     return pd.read_csv(path)
 
 
