@@ -48,7 +48,8 @@ GROUPS = {
     "cure/mixers.py": """cure/test_mixers.py persistence/test_resume.py
         cure/test_training.py::test_schedules_follow_the_progress_of_the_call""",
     "cure/pretraining.py": "cure intrinsic -k 'pretrain or transfer'",
-    "srl/*.py": "cure/test_gradients.py srl intrinsic/test_contract.py cure/test_dictionaries.py",
+    "srl/*.py": """cure/test_gradients.py srl intrinsic/test_contract.py cure/test_dictionaries.py
+        evaluation/test_rollouts.py::test_negatives_are_taken_evenly_from_each_policy""",
     "intrinsic/*.py": "intrinsic cure/test_gradients.py cure/test_dictionaries.py",
     "data/buffers.py": "data/test_buffers.py persistence/test_frame_rows.py",
 }

@@ -244,6 +244,13 @@ def test_icm_is_the_forward_error_in_features_of_the_inverse_model(encoder: str)
     assert ("trunk" in moved(before, groups(model))) == (encoder == "shared")
 
 
+@pytest.mark.parametrize("encoder", ["shared", "own"])
+def test_icm_of_a_dictionary_is_one_model_of_shared_features_or_one_for_each_image(encoder: str) -> None:
+    reward = reward_of(sensor_model(intrinsic="icm", intrinsic_kwargs=dict(encoder=encoder)))
+    models = [each for each in reward.modules() if isinstance(each, INTRINSIC_REWARDS["icm"])]
+    assert len(models) == (1 if encoder == "shared" else 2)
+
+
 # ---------------------------------------------------------------- impact
 
 

@@ -86,6 +86,20 @@ def test_noise_of_the_vae_is_that_of_its_own_variance() -> None:
     assert th.equal(measured, latents)
 
 
+def test_vae_begins_with_noise_smaller_than_its_latents_and_pays_for_divergence() -> None:
+    """Latents lie in (-1, 1): more noise would hide them. A divergence never lowers the loss."""
+    head: Any = filled_model(srl="vae", curiosity=None).policy.srl
+    latents = th.linspace(-0.9, 0.9, 8).expand(16, 8)
+    assert float(head.log_variance(latents).detach().exp().max()) < 0.5
+    batch = Samples(th.zeros(16, 2), *[None] * 4)  # type: ignore[arg-type]
+    losses = []
+    for beta in (0.0, head.beta):
+        head.beta = beta
+        th.manual_seed(0)
+        losses.append(head.loss(batch, latents).loss.item())
+    assert losses[1] > losses[0]
+
+
 # ---------------------------------------------------------------- heads of transitions
 
 
@@ -122,6 +136,18 @@ def test_small_latents_are_no_easier_to_predict(srl: str, size: float) -> None:
     assert float(seen[0].var()) > 0.8
     head.error(batch, latents)
     th.testing.assert_close(seen[-1], seen[0], rtol=1e-3, atol=1e-3)
+
+
+def test_running_statistics_of_targets_follow_slowly() -> None:
+    """A batch moves them towards its own; it neither replaces them nor throws them beyond."""
+    head: Any = filled_model(srl="spr", curiosity=None).policy.srl
+    low, high = 1 + th.randn(64, 8), 50 + 9 * th.randn(64, 8)
+    for _ in range(50):
+        head._standardise(low, learns=True)
+    before = head.mean.clone(), head.variance.clone()
+    head._standardise(high, learns=True)
+    for old, new, goal in zip(before, (head.mean, head.variance), (high.mean(dim=0), high.var(dim=0)), strict=True):
+        assert ((old < new) & (new < goal)).all()
 
 
 # ---------------------------------------------------------------- what they learn
