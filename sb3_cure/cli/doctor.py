@@ -1,21 +1,27 @@
 """``sb3-cure doctor``: show this machine, the choices that follow from it, and what to install.
 
-The exit status is 0 if training can work, else 1; things that are only slow are warnings.
+The exit status is 0 if training can work, else 1; things that are only slow are warnings. With ``--env`` it shows
+instead how often random actions meet a reward there, on which it depends whether curiosity is worth its time.
 """
 
 import argparse
 import re
-from collections import defaultdict
+import time
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from importlib import metadata
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from torch.utils import collect_env
 
 from sb3_cure import __version__
-from sb3_cure.cli.usage import install_command
+from sb3_cure.cli.usage import UsageError, install_command
+from sb3_cure.cli.zoo_files import check_environment
+from sb3_cure.envs.dmc import DMCPixels
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
 from sb3_cure.networks.precision import resolve_precision
 
@@ -29,6 +35,12 @@ EXTRAS = {
     "experiments": "grids of experiments and their report",
     "cluster": "the same on several machines",
     "notebooks": "running the notebooks",
+}
+#: What to do, by the share of random episodes that meet a reward at most
+ADVICE = {
+    0.05: "Hardly ever: exploration decides. Try curiosity; whether it learns such a task is not known yet.",
+    0.5: "Seldom: try it with and without curiosity. It found rewards more often; returns were not shown to be higher.",
+    1.0: "Often: leave curiosity out (curiosity=None). It was not shown to learn faster, and its updates take longer.",
 }
 
 
@@ -69,13 +81,88 @@ def check_packages(names: Sequence[str]) -> tuple[str, list[str]]:
     return line, [name for name, version in versions.items() if version is None]
 
 
+def play_randomly(env: gym.Env, episodes: int = 60, seconds: float = 60) -> np.ndarray:
+    """Play episodes of random actions.
+
+    :param env: An environment
+    :param episodes: Episodes at most
+    :param seconds: Seconds at most; an episode that they cut does not count
+    :return: Return of each episode
+    """
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    returns: list[float] = []
+    total, end = 0.0, time.monotonic() + seconds
+    while len(returns) < episodes and time.monotonic() < end:
+        _, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        total += float(reward)
+        if terminated or truncated:
+            returns.append(total)
+            total = 0.0
+            env.reset()
+    return np.array(returns)
+
+
+def count_rewarded(returns: np.ndarray) -> int:
+    """Count the episodes that met a reward: more than what random actions commonly get.
+
+    :param returns: Return of each episode
+    :return: Episodes above the commonest return; all of them if no two are equal, as with a dense reward
+    """
+    if len(returns) == 0:
+        return 0
+    ((common, times),) = Counter(returns.tolist()).most_common(1)
+    return int((returns > common).sum()) if times > 1 else len(returns)
+
+
+def check_rewards(task: str) -> int:
+    """Show how often random actions meet a reward, and what that says of curiosity.
+
+    :param task: Gymnasium id
+    :return: Exit status 0
+    :raises UsageError: if no episode ended within a minute
+    """
+    check_environment(task)
+    print(f"{task}: episodes of random actions, for at most a minute", flush=True)
+    env = gym.make(task)
+    returns = play_randomly(_without_images(env))
+    env.close()
+    if len(returns) == 0:
+        raise UsageError(f"no episode of {task} ended within a minute: give it a time limit (max_episode_steps).")
+    met = count_rewarded(returns)
+    print(f"A reward was met in {met} of {len(returns)} episodes; returns {returns.min():.4g} to {returns.max():.4g}.")
+    print(next(advice for share, advice in ADVICE.items() if met <= share * len(returns)))
+    print("What is known of each case: docs/guide/mixing.md, 'Should I switch curiosity on?'")
+    return 0
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure doctor``.
 
     :param argv: Command line, ``sys.argv[1:]`` by default
     :return: 0 if training can work, else 1
     """
-    argparse.ArgumentParser("sb3-cure doctor", description=__doc__).parse_args(argv)
+    parser = argparse.ArgumentParser("sb3-cure doctor", description=__doc__)
+    parser.add_argument("--env", metavar="ID", help="show how often random actions meet a reward in this environment")
+    task = parser.parse_args(argv).env
+    return check_machine() if task is None else check_rewards(task)
+
+
+def _without_images(env: gym.Env) -> gym.Env:
+    """Return the environment below the camera of a DMC task, whose images nobody looks at."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, DMCPixels):
+            return inner.env
+        inner = inner.env
+    return env
+
+
+def check_machine() -> int:
+    """Show what this machine has, and what is missing.
+
+    :return: 0 if training can work, else 1
+    """
     errors, warnings = [], []
     print(collect_env.get_pretty_env_info())
 

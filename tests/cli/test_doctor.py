@@ -1,7 +1,10 @@
 """``sb3-cure doctor``: what is shown, and when the exit status says that training cannot work."""
 
 from importlib import metadata
+from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
 from sb3_cure.cli import doctor
@@ -52,3 +55,53 @@ def test_doctor_warns_of_unused_gpus(monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(doctor, "try_rendering", lambda: WORKS)
     assert main(["doctor"]) == 0
     assert capsys.readouterr().out.count("WARNING") == 2
+
+
+class Walk(gym.Env):
+    """Twenty steps along a line; ``reward_of`` gives the reward of a place."""
+
+    observation_space = gym.spaces.Box(-20, 20, (1,))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, reward_of: Any, length: float = 20):
+        self.reward_of, self.length = reward_of, length
+
+    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict]:
+        super().reset(**kwargs)
+        self.place, self.n = np.zeros(1, np.float32), 0
+        return self.place, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.place, self.n = self.place + action, self.n + 1
+        return self.place, self.reward_of(self.place[0]), False, self.n >= self.length, {}
+
+
+@pytest.mark.parametrize(
+    ("reward_of", "advice"),
+    [
+        (lambda place: 0.0, "in 0 of 60 episodes; returns 0 to 0.\nHardly"),
+        (lambda place: -1.0 if place < 15 else 0.0, "in 0 of 60 episodes; returns -20 to -20.\nHardly"),
+        (lambda place: float(place > 3), "Seldom"),
+        (lambda place: float(place > 3) - float(place < -3), "Seldom"),  # falls are no rewards
+        (lambda place: float(place), "in 60 of 60 episodes"),
+    ],
+)
+def test_doctor_counts_the_random_episodes_that_meet_a_reward(
+    reward_of: Any, advice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gym.register("Walk-v0", Walk, kwargs=dict(reward_of=reward_of))
+    try:
+        assert main(["doctor", "--env", "Walk-v0"]) == 0
+    finally:
+        del gym.registry["Walk-v0"]
+    assert advice in capsys.readouterr().out
+
+
+def test_doctor_needs_episodes_that_end(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    gym.register("Walk-v0", Walk, kwargs=dict(reward_of=float, length=np.inf))
+    monkeypatch.setattr(doctor.play_randomly, "__defaults__", (60, 0.05))
+    try:
+        assert main(["doctor", "--env", "Walk-v0"]) == 2
+    finally:
+        del gym.registry["Walk-v0"]
+    assert "time limit" in capsys.readouterr().err

@@ -54,6 +54,7 @@ TYPOS = {
     "experiment fast/curves --tasks cartpole-swingpu": "did you mean cartpole-swingup",
     "experiment fast/curves --methods sac_ea": "did you mean sac_ae?",
     "report my_reslts": "did you mean my_results?",
+    "doctor --env dmc_pixels/pendulum-swignup-v0": "did you mean dmc_pixels/pendulum-swingup-v0",
     "doctor --vebrose": "unrecognized arguments: --vebrose",
 }
 
