@@ -65,8 +65,7 @@ class Dot(gym.Env[np.ndarray, np.ndarray]):
 
 
 class Faults(gym.Wrapper):
-    """
-    Fails at random, in one of five ways.
+    """Fails at random, in one of five ways.
 
     :param env: Environment that observes stacked frames
     :param rate: Probability of a fault in a step
@@ -137,8 +136,7 @@ def state(env: gym.Env) -> np.ndarray:
 
 
 class Watch(BaseCallback):
-    """
-    Writes down what the processes hold.
+    """Writes down what the processes hold.
 
     :param path: CSV file
     :param every: Agent steps between two rows

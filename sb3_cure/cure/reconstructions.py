@@ -12,8 +12,7 @@ from sb3_cure.data.samples import Samples
 def reconstruction_strips(
     policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8
 ) -> dict[str, np.ndarray]:
-    """
-    Newest frames of a few observations above their reconstructions.
+    """Newest frames of a few observations above their reconstructions.
 
     :param policy: The policy
     :param batch: Samples
@@ -36,8 +35,7 @@ def reconstruction_strips(
 
 
 def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
-    """
-    The (first) image of ``reconstruction_strips``, or None if there is none.
+    """The (first) image of ``reconstruction_strips``, or None if there is none.
 
     :param policy: The policy
     :param batch: Samples
@@ -49,8 +47,7 @@ def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, c
 
 
 def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
-    """
-    Newest frame of each stack.
+    """Newest frame of each stack.
 
     :param images: Stacks of frames, oldest first, 0-255, [B, C, H, W]
     :param frame_stack: Frames per stack

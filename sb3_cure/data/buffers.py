@@ -21,8 +21,7 @@ Infos = list[dict[str, Any]]
 
 
 class FrameStackReplayBuffer(ReplayBuffer):
-    """
-    SB3's ``ReplayBuffer`` and ``DictReplayBuffer`` in about a sixth of their memory for three stacked frames.
+    """SB3's ``ReplayBuffer`` and ``DictReplayBuffer`` in about a sixth of their memory for three stacked frames.
 
     Consecutive observations share all their frames but one, and so do an observation and its successor. The buffer
     keeps each frame of an image once, in a ring of frames per image, and per transition the slots of its frames there;
@@ -123,8 +122,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.n_added, self._n_valid, self._breaks, self.last_sampled = 0, 0, False, None
 
     def size(self) -> int:
-        """
-        Number of rows that can be sampled.
+        """Number of rows that can be sampled.
 
         :return: SB3's value, or less where streams broke so often that the oldest rows lost their frames
         """
@@ -135,8 +133,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self._breaks = True
 
     def add(self, obs: Any, next_obs: Any, action: ndarray, reward: ndarray, done: ndarray, infos: Infos) -> None:
-        """
-        Store copies of one transition per environment: all of it or, with any exception, nothing.
+        """Store copies of one transition per environment: all of it or, with any exception, nothing.
 
         :param obs: Observations, [n_envs, *shape], or such by key
         :param next_obs: Successors of the same shape; of an episode's last step the terminal observation
@@ -215,8 +212,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
             )
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> Any:
-        """
-        Sample uniformly, with replacement, from the valid rows and the environments.
+        """Sample uniformly, with replacement, from the valid rows and the environments.
 
         :param batch_size: Number of transitions to sample
         :param env: VecEnv to normalize the observations and rewards with
@@ -233,8 +229,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return transitions(self, *self.last_sampled, env)
 
     def observations_at(self, rows: ndarray, env_inds: ndarray, which: slice = slice(None)) -> list[Any]:
-        """
-        Look up observations and their successors.
+        """Look up observations and their successors.
 
         :param rows: Row positions, [n]
         :param env_inds: Environment of each, [n]
@@ -256,8 +251,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return [dict(zip(parts, each, strict=True)) for each in zip(*parts.values(), strict=True)]
 
     def n_step(self, n_steps: int, gamma: float, env: VecNormalize | None = None) -> NStep:
-        """
-        Returns of n steps for the batch sampled last, with the numbers of SB3's ``NStepReplayBuffer``.
+        """Returns of n steps for the batch sampled last, with the numbers of SB3's ``NStepReplayBuffer``.
 
         A sum ends with the episode, with the newest row, and where the stored stream breaks without an end (another
         ``learn()``, ``set_env``, a step that was not stored).
@@ -287,8 +281,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         )
 
     def state_dict(self, frames: bool = True) -> dict[str, Any]:
-        """
-        State as counters and views of the used part of all arrays.
+        """State as counters and views of the used part of all arrays.
 
         :param frames: Whether the frames are among the arrays, as ``frames/<key>``
         :return: ``counters`` and ``arrays`` by name
@@ -299,8 +292,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return {"counters": {name: getattr(self, name) for name in _COUNTERS}, "arrays": arrays}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """
-        Take over the state of another buffer; frames that are not among its arrays are left to be written.
+        """Take over the state of another buffer; frames that are not among its arrays are left to be written.
 
         :param state: From ``state_dict`` of a buffer with equal arguments
         :raises ValueError: If it is of another buffer
@@ -330,8 +322,7 @@ _COUNTERS = ("pos", "full", "counts", "n_added", "_n_valid", "_breaks")
 
 
 def copy_arrays(target: dict[str, ndarray], source: dict[str, ndarray]) -> None:
-    """
-    Copy arrays into others of the same names, shapes and types.
+    """Copy arrays into others of the same names, shapes and types.
 
     :param target: Arrays to write to, by name
     :param source: Arrays to read, by name
@@ -348,8 +339,7 @@ def copy_arrays(target: dict[str, ndarray], source: dict[str, ndarray]) -> None:
 
 
 def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
-    """
-    Places of all transitions that can be sampled, for ``transitions``.
+    """Places of all transitions that can be sampled, for ``transitions``.
 
     :param buffer: SB3's ``ReplayBuffer``, ``DictReplayBuffer`` or a ``FrameStackReplayBuffer``
     :return: Rows, environments and ages (in rows), newest first, [n] each
@@ -361,8 +351,7 @@ def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
 def transitions(
     buffer: ReplayBuffer, rows: ndarray, env_inds: ndarray, env: VecNormalize | None = None
 ) -> ReplayBufferSamples:
-    """
-    Look up transitions by their place, where ``sample`` draws them.
+    """Look up transitions by their place, where ``sample`` draws them.
 
     :param buffer: SB3's ``ReplayBuffer``, ``DictReplayBuffer`` or a ``FrameStackReplayBuffer``
     :param rows: Row positions in [0, buffer_size): the row that ``add`` wrote when ``pos`` had this value, [n]
@@ -396,8 +385,7 @@ def _to_torch(buffer: ReplayBuffer, array: Any) -> Any:
 
 
 def stacks_by_key(space: spaces.Space, frame_stack: int | Mapping[str, int]) -> dict[str, int]:
-    """
-    Frames per observation of each image.
+    """Frames per observation of each image.
 
     :param space: Space of observations
     :param frame_stack: By key (1 for other images), or one number for all (in dictionaries 1 where it does not divide
@@ -411,8 +399,7 @@ def stacks_by_key(space: spaces.Space, frame_stack: int | Mapping[str, int]) -> 
 
 
 def infer_frame_stack(env: VecEnv | None) -> int:
-    """
-    Frames per observation, as SB3's ``VecFrameStack`` or the attribute ``frame_stack`` of the environments says.
+    """Frames per observation, as SB3's ``VecFrameStack`` or the attribute ``frame_stack`` of the environments says.
 
     :param env: Environments, channels first, or None
     :return: The number; 1 where nothing says it, or the channels are no multiple of it

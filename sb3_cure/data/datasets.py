@@ -27,8 +27,7 @@ Arrays = Any
 
 
 class RecordedEpisode(NamedTuple):
-    """
-    An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
+    """An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
 
     :param observations: [T + 1, ...], or a dictionary of such arrays
     :param actions: In the bounds of the action space, [T, ...]
@@ -45,8 +44,7 @@ class RecordedEpisode(NamedTuple):
 
 
 def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
-    """
-    Write an episode to a file.
+    """Write an episode to a file.
 
     :param path: The ``.npz`` file to write
     :param episode: The episode
@@ -58,8 +56,7 @@ def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
 
 
 def load_episode(path: str | Path) -> RecordedEpisode:
-    """
-    Read an episode from a file.
+    """Read an episode from a file.
 
     :param path: A ``.npz`` file
     :return: The episode
@@ -71,8 +68,7 @@ def load_episode(path: str | Path) -> RecordedEpisode:
 
 
 def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
-    """
-    Read episodes one after the other.
+    """Read episodes one after the other.
 
     :param source: A folder of ``.npz`` files, read in the order of their names, one such file, or episodes
     :return: The episodes
@@ -88,8 +84,7 @@ def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
 
 
 class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
-    """
-    Write each episode of an environment into a folder, when it ends, or when the environment is reset or closed.
+    """Write each episode of an environment into a folder, when it ends, or when the environment is reset or closed.
 
     :param env: The environment as the agent sees it
     :param folder: Folder for the files; it is made if it is missing
@@ -107,8 +102,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         self._number, self._token = len(list(Path(folder).glob("*.npz"))), uuid.uuid4().hex[:8]
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """
-        Reset the environment and write the episode before.
+        """Reset the environment and write the episode before.
 
         :param kwargs: As in Gymnasium
         :return: The first observation and the info
@@ -119,8 +113,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """
-        Step the environment and record the step.
+        """Step the environment and record the step.
 
         :param action: The action
         :return: Observation, reward, terminated, truncated and info of the environment
@@ -148,8 +141,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 
 
 def fill(buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]) -> int:
-    """
-    Add episodes to a replay buffer as if they had been collected, those of several environments side by side.
+    """Add episodes to a replay buffer as if they had been collected, those of several environments side by side.
 
     Where no episode is left for an environment, it repeats the transitions of another one.
 

@@ -16,8 +16,7 @@ SPARE_FRAMES = 0.04
 
 
 class FrameRing:
-    """
-    Memory for the frames of one image, each kept once; the newest frame replaces the oldest one.
+    """Memory for the frames of one image, each kept once; the newest frame replaces the oldest one.
 
     Frame number i, counted from the first one, lies in slot ``i % capacity``. A stack is given by the slots of its
     frames. The ring does not know how many frames it holds: its buffer keeps that count.
@@ -60,8 +59,7 @@ class FrameRing:
             self.frames = np.memmap(file, np.uint8, "w+", shape=(self.capacity, *self.frame_shape))
 
     def store(self, obs: ndarray, next_obs: ndarray, tails: ndarray | None, count: int) -> tuple[ndarray, ndarray, int]:
-        """
-        Store what is new in the stacks of one row, in slots that no row reads.
+        """Store what is new in the stacks of one row, in slots that no row reads.
 
         :param obs: Stacks, uint8 [n_envs, *shape]
         :param next_obs: Their successors
@@ -106,8 +104,7 @@ class FrameRing:
         return (count - 1 - int(slot)) % self.capacity
 
     def is_lost(self, slots: ndarray, count: int) -> bool:
-        """
-        Whether the next ``add`` may overwrite a frame of a row.
+        """Whether the next ``add`` may overwrite a frame of a row.
 
         :param slots: Slots of the row, [n_envs, 2, frame_stack]
         :param count: Frames stored so far
@@ -116,8 +113,7 @@ class FrameRing:
         return max(self._age(slot, count) for slot in slots[:, 0, 0]) >= self.capacity - self.max_new
 
     def stacks(self, slots: ndarray) -> ndarray:
-        """
-        Stacks by the slots of their frames.
+        """Stacks by the slots of their frames.
 
         :param slots: [..., frame_stack]
         :return: uint8 [..., *shape]
@@ -127,8 +123,7 @@ class FrameRing:
         return frames.view(*slots.shape[:-1], *self.shape).numpy()
 
     def pieces(self, first: int, last: int, max_bytes: int = 2**22) -> Iterator[memoryview]:
-        """
-        Memory of the frames with the numbers ``first`` to ``last - 1``, to be read or written.
+        """Memory of the frames with the numbers ``first`` to ``last - 1``, to be read or written.
 
         :param first: Number of the first frame
         :param last: Number after the last frame

@@ -13,8 +13,7 @@ Observations = th.Tensor | dict[str, th.Tensor]
 
 
 def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
-    """
-    Find the images in a space of observations.
+    """Find the images in a space of observations.
 
     :param space: Space of observations
     :return: Spaces of the images among them by key; an observation that is itself an image has the key ``""``
@@ -24,8 +23,7 @@ def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
 
 
 def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
-    """
-    Pick the images out of observations.
+    """Pick the images out of observations.
 
     :param observations: Arrays or tensors, or dictionaries of them
     :param space: Their space
@@ -35,8 +33,7 @@ def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
 
 
 def by_key(images: Any) -> dict[str, Any]:
-    """
-    Name the parts of an observation.
+    """Name the parts of an observation.
 
     :param images: Images, or a dictionary of them
     :return: The dictionary; a single image has the key ``""``, as in ``image_spaces``
@@ -45,8 +42,7 @@ def by_key(images: Any) -> dict[str, Any]:
 
 
 def copied(observation: Any) -> Any:
-    """
-    Copy an observation, which the environment may write the next one into.
+    """Copy an observation, which the environment may write the next one into.
 
     :param observation: An observation
     :return: A copy
@@ -57,8 +53,7 @@ def copied(observation: Any) -> Any:
 
 
 def stacked(observations: Sequence[Any]) -> Any:
-    """
-    Stack observations along a new first axis.
+    """Stack observations along a new first axis.
 
     :param observations: n observations
     :return: [n, *shape], or a dictionary of such
@@ -70,8 +65,7 @@ def stacked(observations: Sequence[Any]) -> Any:
 
 
 def rows_of(observations: Any, rows: Any) -> Any:
-    """
-    Index observations along their first axis.
+    """Index observations along their first axis.
 
     :param observations: [n, *shape], or a dictionary of such
     :param rows: An index, a slice or a mask
@@ -83,8 +77,7 @@ def rows_of(observations: Any, rows: Any) -> Any:
 
 
 def len_of(observations: Any) -> int:
-    """
-    Count observations.
+    """Count observations.
 
     :param observations: [n, *shape], or a dictionary of such
     :return: n
@@ -93,8 +86,7 @@ def len_of(observations: Any) -> int:
 
 
 def sensed_space(space: spaces.Space) -> spaces.Space:
-    """
-    Space of observations as encoder, head and rewards get them: a dictionary without images is one vector.
+    """Space of observations as encoder, head and rewards get them: a dictionary without images is one vector.
 
     :param space: Space of observations as they are stored
     :return: The space
@@ -105,8 +97,7 @@ def sensed_space(space: spaces.Space) -> spaces.Space:
 
 
 def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
-    """
-    Join a dictionary without images to one vector.
+    """Join a dictionary without images to one vector.
 
     :param observations: Observations by key, as stored
     :param space: Their space
@@ -117,8 +108,7 @@ def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
 
 
 def detached(features: Any) -> Any:
-    """
-    Detach features from the graph.
+    """Detach features from the graph.
 
     :param features: A tensor, or a tuple of tensors
     :return: The same without a graph

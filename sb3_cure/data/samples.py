@@ -6,8 +6,7 @@ import torch as th
 
 
 class NStep(NamedTuple):
-    """
-    Returns of n steps for the transitions of a batch, under the names that ``Samples`` has for one step.
+    """Returns of n steps for the transitions of a batch, under the names that ``Samples`` has for one step.
 
     :param rewards: Discounted sum of n rewards, fewer where the episode or the stored stream ends, float32 [B, 1]
     :param next_observations: What the agent saw after these, [B, *shape]
@@ -22,8 +21,7 @@ class NStep(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """
-    A batch of B transitions, as heads, intrinsic rewards and critics get it.
+    """A batch of B transitions, as heads, intrinsic rewards and critics get it.
 
     The first fields are those of SB3's ``ReplayBufferSamples``. Observations are as stored: images uint8 in 0-255,
     channels first; vectors float32; dictionaries of both by key (those without images are one vector here). Images lie
@@ -50,8 +48,7 @@ class Samples(NamedTuple):
     n_step: NStep | None = None
 
     def of(self, key: str) -> "Samples":
-        """
-        The batch as an agent sees it that has this image alone.
+        """The batch as an agent sees it that has this image alone.
 
         :param key: Key of an image in dictionaries of observations
         :return: The batch with the observations of that image, without ``n_step``

@@ -39,8 +39,7 @@ def dmc_env_id(domain: str, task: str) -> str:
 
 
 def register_dmc_envs() -> None:
-    """
-    Register ``dmc_pixels/<domain>-<task>-v0`` for every task of the DeepMind Control suite; a second call does nothing.
+    """Register ``dmc_pixels/<domain>-<task>-v0`` for every task of the DeepMind Control suite, unless that is done.
 
     The keyword arguments of ``gymnasium.make`` are those of :func:`~sb3_cure.envs.make_dmc_env`. Neither a time limit
     nor an order check is registered, because the environment underneath has both.

@@ -53,8 +53,7 @@ def choose_backend() -> None:
 
 
 def load_gl() -> None:
-    """
-    Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
+    """Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
     Mesa's software renderer gets no extra threads, as by ``choose_backend``, and SDL's windows to do without
     OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is set. No rendering context is made, so a process that has only
@@ -83,8 +82,7 @@ def load_gl() -> None:
 
 
 def check_gl() -> str:
-    """
-    Render an empty scene.
+    """Render an empty scene.
 
     :return: The name that OpenGL gives its renderer, such as ``"llvmpipe (LLVM 15.0.6, 256 bits)"``
     :raises GLUnavailableError: If that fails

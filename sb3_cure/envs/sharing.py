@@ -4,8 +4,7 @@ from typing import Any
 
 
 def share_environment(first: Any, second: Any) -> bool:
-    """
-    Check whether two environments wrap or hold the same environment or simulator.
+    """Check whether two environments wrap or hold the same environment or simulator.
 
     :param first: An environment or VecEnv; those in worker processes are copies
     :param second: Another one, or None

@@ -87,8 +87,7 @@ def draw_fast(env: gym.Env, image_size: int) -> None:
 
 
 class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
-    """
-    Takes float32 actions in [-1, 1], clips them to that range and scales them to the bounds of the environment.
+    """Takes float32 actions in [-1, 1], clips them to that range and scales them to the bounds of the environment.
 
     Actions without bounds are clipped and not scaled; with one bound, they are what lies within 2 of it. Unlike
     :class:`gymnasium.wrappers.RescaleAction`, this accepts them, does not take the float64 of the environment's space
@@ -121,8 +120,7 @@ class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordCon
 
 
 class ActionRepeat(RepeatAction):
-    """
-    Repeats each action, sums the rewards, and stops early where the episode ends.
+    """Repeats each action, sums the rewards, and stops early where the episode ends.
 
     Unlike Gymnasium's wrapper, it has an attribute ``action_repeat``, and videos have fewer frames per second.
 

@@ -59,8 +59,7 @@ PRINTED_NAME = 33
 
 
 class PeriodicCallback(BaseCallback):
-    """
-    Base class for callbacks that do something every so many agent steps: implement ``on_period``.
+    """Base class for callbacks that do something every so many agent steps: implement ``on_period``.
 
     It is due whenever the number of agent steps reaches or passes a multiple of ``every``. The random number generators
     of Python, NumPy and PyTorch are restored afterwards, so that training is the same with and without the callback.
@@ -99,8 +98,7 @@ class PeriodicCallback(BaseCallback):
 
 @contextlib.contextmanager
 def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator[None]:
-    """
-    Restore the random number generators of Python, NumPy and PyTorch afterwards.
+    """Restore the random number generators of Python, NumPy and PyTorch afterwards.
 
     :param device: Device whose generator is restored besides the CPU's
     :param seed: Seed of all of them meanwhile; None: they continue from their state
@@ -117,8 +115,7 @@ def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator
 
 
 class RolloutCallback(PeriodicCallback):
-    """
-    Base class for callbacks that roll out policies alone, in an environment of its own, every so many agent steps.
+    """Base class for callbacks that roll out policies alone, in an environment of its own, every so many agent steps.
 
     :param eval_env: One (not vectorised) environment made as the training environment, but not that one itself. If
         SB3's ``VecFrameStack`` stacks frames for training, wrap it in
@@ -164,8 +161,7 @@ class RolloutCallback(PeriodicCallback):
             raise ValueError(f"actors must be of {', '.join([*trained, 'random'])} for this model, not {self.actors}.")
 
     def run(self, actor: str, **kwargs: Any) -> Iterator[Episode]:
-        """
-        Roll out one policy.
+        """Roll out one policy.
 
         :param actor: Who acts
         :param kwargs: Further arguments of ``run_episodes``
@@ -180,8 +176,7 @@ class RolloutCallback(PeriodicCallback):
 
 
 class EvalBothCallback(RolloutCallback):
-    """
-    Evaluate the task policy and the curious policy in separate rollouts.
+    """Evaluate the task policy and the curious policy in separate rollouts.
 
     Logs, for each of them, ``eval/<actor>_reward`` (mean return) and ``eval/<actor>_srl_error`` (mean noise-free SRL
     error per step). SB3's ``EvalCallback`` also works; it evaluates the task policy and keeps the best model.
@@ -203,8 +198,7 @@ class EvalBothCallback(RolloutCallback):
         self.evaluate()
 
     def evaluate(self) -> dict[str, float]:
-        """
-        Evaluate now.
+        """Evaluate now.
 
         :return: Agent steps and the logged values
         """
@@ -227,8 +221,7 @@ class EvalBothCallback(RolloutCallback):
 
 
 class PolicyVideoCallback(RolloutCallback):
-    """
-    Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
+    """Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
 
     Below the camera's picture stand the return so far and, if the model has an SRL head, the SRL error of the
     observation as a number and as a curve.
@@ -264,8 +257,7 @@ class PolicyVideoCallback(RolloutCallback):
 
 
 class ReconstructionCallback(PeriodicCallback):
-    """
-    Draw reconstructions of the same observations over training: ``reconstructions.png``, one row per time.
+    """Draw reconstructions of the same observations over training: ``reconstructions.png``, one row per time.
 
     Each image of dictionaries has a picture ``reconstructions_<key>.png``. If neither head nor intrinsic reward
     reconstructs, and for SB3's own off-policy algorithms, a new decoder is fitted to latents of the replay buffer for
@@ -353,8 +345,7 @@ class ReconstructionCallback(PeriodicCallback):
             )
 
     def draw(self, model: BaseAlgorithm) -> None:
-        """
-        Add a row now, outside of training.
+        """Add a row now, outside of training.
 
         :param model: A trained model, or one loaded with a replay buffer
         """
@@ -406,8 +397,7 @@ def _true_state(
 
 
 class CuriosityMapCallback(RolloutCallback):
-    """
-    Map where each policy goes and its SRL error there: ``curiosity_map_<steps>_steps.png``.
+    """Map where each policy goes and its SRL error there: ``curiosity_map_<steps>_steps.png``.
 
     Each policy acts alone for some episodes; the map is drawn over two coordinates of the environment's true state,
     which the agent does not see. Without an SRL head only visits are drawn. CURL's error is measured against an even
@@ -469,8 +459,7 @@ class CuriosityMapCallback(RolloutCallback):
 
 
 class StateProbeCallback(RolloutCallback):
-    """
-    Measure how well a linear map of the latents predicts the true state, which the agent does not see.
+    """Measure how well a linear map of the latents predicts the true state, which the agent does not see.
 
     Logs R² of each coordinate, ``probe/<name>`` (``sb3_cure.evaluation.rollouts.state_probe``), and their mean,
     ``probe/mean``; long names are not printed. Writes ``state_probe.csv``, a row per time, and ``state_probe.png``,
@@ -535,8 +524,7 @@ class StateProbeCallback(RolloutCallback):
 
 
 class DiagnosticsCallback(PeriodicCallback):
-    """
-    Warn, once each, of problems that spoil training from pixels without an error.
+    """Warn, once each, of problems that spoil training from pixels without an error.
 
     ========================  ============================================================================
     ``constant_image``        All recent observations of an environment are equal

@@ -15,8 +15,7 @@ from sb3_cure.networks.decoders import PixelDecoder
 
 
 def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int = 1000, key: str = "") -> nn.Module:
-    """
-    Fit a decoder of the encoder's inputs to its latents; the encoder is not trained.
+    """Fit a decoder of the encoder's inputs to its latents; the encoder is not trained.
 
     :param model: A model of any SB3 algorithm that learns from images with an encoder (``encoder_of``)
     :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W] or such by key, on the
@@ -44,8 +43,7 @@ def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int
 def draw_latents(
     model: BaseAlgorithm, decoder: nn.Module, observations: Any, key: str = ""
 ) -> tuple[th.Tensor, th.Tensor]:
-    """
-    Reconstruct observations from their latents.
+    """Reconstruct observations from their latents.
 
     :param model: The model that makes the latents
     :param decoder: Its decoder, of ``fit_decoder``

@@ -12,8 +12,7 @@ from sb3_cure.evaluation.rollouts import trained_actors
 
 
 class DeterministicActor(nn.Module):
-    """
-    The deterministic policy of a model, from a batch of observations to actions of the environment.
+    """The deterministic policy of a model, from a batch of observations to actions of the environment.
 
     Computes what ``predict(observation, deterministic=True)`` does without random numbers and branches, so that
     ``torch.onnx.export``, ``torch.export`` and ``torch.jit.trace`` can follow it. It shares the model's networks, and
@@ -46,8 +45,7 @@ class DeterministicActor(nn.Module):
 
     @th.no_grad()
     def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
-        """
-        Compute actions.
+        """Compute actions.
 
         :param observations: As the agent sees them, [B, *shape], or a dictionary: images uint8, channels first
         :return: Actions within the environment's bounds, [B, *action shape]

@@ -40,8 +40,7 @@ CURIOUS_SHARE = 0.01
 
 
 class Finding(NamedTuple):
-    """
-    Result of a check.
+    """Result of a check.
 
     :param name: Name of the check
     :param value: The number that was measured
@@ -54,8 +53,7 @@ class Finding(NamedTuple):
 
 
 class Temperature(NamedTuple):
-    """
-    Temperature of an agent.
+    """Temperature of an agent.
 
     :param agent: ``"task"`` or ``"curious"``
     :param value: The entropy coefficient
@@ -73,8 +71,7 @@ class Temperature(NamedTuple):
 def look(
     model: Any, reward_std: Any, n_samples: int, min_updates: int, autoencoder_updates: int, bounds: Sequence[float]
 ) -> Iterator[Finding | None]:
-    """
-    Look at a model in training, from cause to effect: a problem may explain those that follow.
+    """Look at a model in training, from cause to effect: a problem may explain those that follow.
 
     Behind a constant image all latents are alike, and next to a huge temperature no reward counts.
 
@@ -107,8 +104,7 @@ def look(
 
 
 def constant_image(model: Any, n_samples: int) -> Finding | None:
-    """
-    Environments whose latest images are all equal, as nothing moves or the camera sees nothing.
+    """Environments whose latest images are all equal, as nothing moves or the camera sees nothing.
 
     Value: number of such environments, or of their images for dictionaries. Expected: 0.
 
@@ -136,8 +132,7 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
 
 
 def dead_units(silent: dict[str, float]) -> Finding:
-    """
-    ReLUs of the encoder (channels of convolutions) that are 0 for all observations and hence get no gradient.
+    """ReLUs of the encoder (channels of convolutions) that are 0 for all observations and hence get no gradient.
 
     Value: the largest share of such units in a layer. Expected: below ``DEAD_SHARE``.
 
@@ -152,8 +147,7 @@ def dead_units(silent: dict[str, float]) -> Finding:
 
 
 def collapsed_latents(latents: th.Tensor) -> Finding:
-    """
-    Latents that are the same for all observations.
+    """Latents that are the same for all observations.
 
     Value: standard deviation between observations over root mean square. Expected: at least ``LATENT_SPREAD``.
 
@@ -169,8 +163,7 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
 
 
 def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
-    """
-    An autoencoder no better than the mean image, which is the best constant reconstruction.
+    """An autoencoder no better than the mean image, which is the best constant reconstruction.
 
     Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` after some
     thousand updates; early on it is below 0.
@@ -188,8 +181,7 @@ def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
 
 
 def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds: Sequence[float]) -> Finding | None:
-    """
-    Temperatures that no longer weigh entropy against reward.
+    """Temperatures that no longer weigh entropy against reward.
 
     SAC's temperature falls towards 0 if the policy stays more random than the target entropy at any temperature (say,
     without any reward), and rises without limit if the policy cannot become as random as the target. So a learned one
@@ -222,8 +214,7 @@ def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds
 
 
 def curious_reward(deviation: float, temperatures: Sequence[Temperature]) -> Finding | None:
-    """
-    A curious reward so small compared with the entropy term that its agent acts at random.
+    """A curious reward so small compared with the entropy term that its agent acts at random.
 
     Value: standard deviation of the curious reward over the mean of |temperature * log-probability| (what all
     observations earn alike has no effect). Expected: at least ``CURIOUS_SHARE``.
@@ -270,8 +261,7 @@ def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
-    """
-    Share of the targets' variance that the autoencoder explains; the least share if there are several images.
+    """Share of the targets' variance that the autoencoder explains; the least share if there are several images.
 
     :param model: The model
     :param batch: Transitions

@@ -37,8 +37,7 @@ in_style = style.context(STYLE)
 
 
 def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) -> None:
-    """
-    Save a figure as PNG of 256 colours, a quarter of the size of all colours.
+    """Save a figure as PNG of 256 colours, a quarter of the size of all colours.
 
     :param figure: A figure
     :param path: File to write
@@ -61,8 +60,7 @@ def _plain(text: str) -> str:
 
 
 def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
-    """
-    Choose a colour for each arm.
+    """Choose a colour for each arm.
 
     :param methods: Arms of an experiment
     :param baseline: The one that the others are compared with: grey
@@ -73,8 +71,7 @@ def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """
-    Return (deterministic actions) over environment steps, with a line for the random policy.
+    """Return (deterministic actions) over environment steps, with a line for the random policy.
 
     :param path: File to write
     :param rows: Evaluations with ``environment_steps`` and ``task_return``
@@ -96,8 +93,7 @@ def learning_curves(
     ylabel: str,
     logarithmic: bool = False,
 ) -> None:
-    """
-    One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
+    """One panel per task: mean over seeds, with a band of one standard deviation on each side (paper, Figures 3 and 4).
 
     :param path: File to write
     :param curves: By task and arm: environment steps [n] and values [seeds, n]
@@ -134,8 +130,7 @@ def paired_differences(
     colors: Mapping[str, str],
     xlabel: str,
 ) -> None:
-    """
-    Differences from the baseline, one line each, with every pair of seeds as a dot.
+    """Differences from the baseline, one line each, with every pair of seeds as a dot.
 
     :param path: File to write
     :param rows: Arm, label of the line, differences by pair, and their mean with its interval
@@ -164,8 +159,7 @@ def paired_differences(
 def visitation_bars(
     path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
 ) -> None:
-    """
-    SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
+    """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
     :param panels: By title: its bars
@@ -181,8 +175,7 @@ def actor_bars(
     ylabel: str,
     lines: Mapping[str, Mapping[str, float]] | None = None,
 ) -> None:
-    """
-    Policies in groups of arms, coloured by actor.
+    """Policies in groups of arms, coloured by actor.
 
     Bars show means. With lines to compare with, the axis is logarithmic, without a zero for bars to begin at: marks
     show the means.
@@ -230,8 +223,7 @@ def actor_bars(
 
 @in_style
 def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]], title: str) -> None:
-    """
-    R² of each coordinate of the true state, a bar for each probe.
+    """R² of each coordinate of the true state, a bar for each probe.
 
     Bars end at -0.1, as it does not matter how much worse than the mean a prediction is; numbers are written next to
     them.
@@ -301,8 +293,7 @@ def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
 def reconstructions_over_training(
     path: Path, observed: np.ndarray, rows: Sequence[tuple[int, np.ndarray]], title: str
 ) -> None:
-    """
-    Reconstructions of the same observations at several times of training, one row each, below the observations.
+    """Reconstructions of the same observations at several times of training, one row each, below the observations.
 
     :param path: File to write
     :param observed: One frame of each observation, uint8 [n, C, H, W] with C = 1 or 3
@@ -327,8 +318,7 @@ def reconstructions_over_training(
 def highest_error_frames(
     path: Path, found: HighestErrors, frame_stack: int, title: str, drawn: np.ndarray | None = None
 ) -> None:
-    """
-    The observations with the highest SRL error, highest first, each with its error and age.
+    """The observations with the highest SRL error, highest first, each with its error and age.
 
     :param path: File to write
     :param found: Result of ``sb3_cure.evaluation.highest_errors`` for images
@@ -364,8 +354,7 @@ def curiosity_map(
     units: Sequence[str] | None = None,
     bins: int = 24,
 ) -> None:
-    """
-    Where each policy goes and its SRL error there, over two coordinates of the true state.
+    """Where each policy goes and its SRL error there, over two coordinates of the true state.
 
     One row per policy: on the left the number of steps in each bin, on the right their mean SRL error (left out if no
     policy has errors). Axes and colours are the same for all policies.

@@ -22,8 +22,7 @@ _DEPENDENCIES = ("stable_baselines3", "sb3_contrib", "torch", "numpy", "gymnasiu
 
 
 def describe_run() -> dict[str, Any]:
-    """
-    Describe what makes a result.
+    """Describe what makes a result.
 
     :return: Versions, machine, GPU and commit
     """
@@ -40,8 +39,7 @@ def describe_run() -> dict[str, Any]:
 
 
 def cpu_info() -> dict[str, str]:
-    """
-    Read Linux's description of the first processor.
+    """Read Linux's description of the first processor.
 
     :return: Values by field; empty on other systems
     """
@@ -51,8 +49,7 @@ def cpu_info() -> dict[str, str]:
 
 
 def processor() -> str:
-    """
-    Name the processor, with its family and model: several generations may have one name.
+    """Name the processor, with its family and model: several generations may have one name.
 
     :return: The name
     """
@@ -64,8 +61,7 @@ def processor() -> str:
 
 
 def code_commit() -> str | None:
-    """
-    Find the commit of the running code.
+    """Find the commit of the running code.
 
     :return: ``SB3_CURE_COMMIT`` (set in images without a checkout), else the commit of the package's checkout, marked
         if it has changes; None if unknown
@@ -74,8 +70,7 @@ def code_commit() -> str | None:
 
 
 def checkout_commit(folder: Path) -> str | None:
-    """
-    Find the commit of a checkout.
+    """Find the commit of a checkout.
 
     :param folder: Its uppermost folder
     :return: Its commit, marked if it has changes; None if it is no checkout
@@ -94,8 +89,7 @@ _COMMIT = code_commit()
 
 
 def read_rows(path: Path, needed: Sequence[str] = ()) -> list[Row]:
-    """
-    Read a CSV file.
+    """Read a CSV file.
 
     :param path: The file
     :param needed: Columns that it must have
@@ -124,8 +118,7 @@ def _number(text: str) -> Any:
 
 
 def write_text(path: Path, text: str) -> None:
-    """
-    Write a text file, whole or not at all.
+    """Write a text file, whole or not at all.
 
     :param path: File to write
     :param text: Its content
@@ -135,8 +128,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """
-    Write a JSON file, whole or not at all.
+    """Write a JSON file, whole or not at all.
 
     :param path: File to write
     :param content: Its content; values unknown to JSON are written as strings
@@ -145,8 +137,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
-    """
-    Write a CSV file, whole or not at all.
+    """Write a CSV file, whole or not at all.
 
     :param path: File to write
     :param columns: The header, and the order of the values

@@ -26,8 +26,7 @@ ACTORS = ("task", "curious", "random")
 
 @dataclass
 class Episode:
-    """
-    One episode of T agent steps.
+    """One episode of T agent steps.
 
     :param rewards: Reward of each step, [T]
     :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty without a head
@@ -50,8 +49,7 @@ class Episode:
 
 
 def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk: int = 128) -> np.ndarray:
-    """
-    Errors of transitions without training noise or augmentation.
+    """Errors of transitions without training noise or augmentation.
 
     They are the SRL head's, or those of an intrinsic reward that measures errors itself, such as ``"reconstruction"``.
 
@@ -71,8 +69,7 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk
 
 
 def trained_actors(model: BaseAlgorithm) -> list[str]:
-    """
-    Policies that a model trains.
+    """Policies that a model trains.
 
     :param model: A model, also of SB3's own algorithms
     :return: ``"task"``, ``"curious"``, or both
@@ -82,8 +79,7 @@ def trained_actors(model: BaseAlgorithm) -> list[str]:
 
 
 def balance_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> None:
-    """
-    Fill CURL's negatives evenly from what each policy sees, before policies are compared by CURL's error.
+    """Fill CURL's negatives evenly from what each policy sees, before policies are compared by CURL's error.
 
     Rolls out an episode of each policy of the model. Otherwise the negatives are those of the random warm-up, which
     the random policy's observations resemble most. Heads without negatives stay unchanged.
@@ -111,8 +107,7 @@ def _heads_with_negatives(model: BaseAlgorithm) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> Iterator[None]:
-    """
-    Measure errors within ``balance_negatives``, and restore the head afterwards.
+    """Measure errors within ``balance_negatives``, and restore the head afterwards.
 
     :param model: A model, also of SB3's own algorithms
     :param env: One (not vectorised) environment
@@ -132,8 +127,7 @@ def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None)
 
 
 def as_trained(model: BaseAlgorithm, observations: Any) -> Any:
-    """
-    Normalize observations as in training.
+    """Normalize observations as in training.
 
     :param model: A model
     :param observations: As its environments return them
@@ -154,8 +148,7 @@ def run_episodes(
     render: bool = False,
     states: bool | Callable[[gym.Env], np.ndarray] = False,
 ) -> Iterator[Episode]:
-    """
-    Roll out one policy alone, episode by episode (one is in memory at a time).
+    """Roll out one policy alone, episode by episode (one is in memory at a time).
 
     :param model: A trained model
     :param env: One (not vectorised) environment
@@ -232,8 +225,7 @@ def _as_batch(
 
 
 class HighestErrors(NamedTuple):
-    """
-    Observations with the highest SRL error.
+    """Observations with the highest SRL error.
 
     :param observations: The observations, highest error first, [k, *shape], or such by key
     :param errors: Their SRL errors, [k]
@@ -248,8 +240,7 @@ class HighestErrors(NamedTuple):
 
 
 def as_arrays(observations: Any) -> Any:
-    """
-    Convert tensors to arrays.
+    """Convert tensors to arrays.
 
     :param observations: Tensor, or a dictionary of such
     :return: NumPy arrays
@@ -260,8 +251,7 @@ def as_arrays(observations: Any) -> Any:
 
 
 def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: int = 128) -> HighestErrors:
-    """
-    Find the observations of the replay buffer with the highest noise-free SRL error.
+    """Find the observations of the replay buffer with the highest noise-free SRL error.
 
     Reads the whole buffer, a chunk at a time. Two observations of one environment are at least ``gap`` steps apart:
     else the result would be one moment k times.
@@ -294,8 +284,7 @@ def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: i
 def binned_errors(
     states: np.ndarray, errors: np.ndarray, edges: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Visits and mean SRL error on a grid over two coordinates of the state.
+    """Visits and mean SRL error on a grid over two coordinates of the state.
 
     :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
     :param errors: SRL error of each visited state, [n], or empty
@@ -317,8 +306,7 @@ def state_probe(
     units: Sequence[str] | None = None,
     ridge: float = 1e-3,
 ) -> dict[str, float]:
-    """
-    R² of each coordinate of the true state, predicted from the latents by ridge regression.
+    """R² of each coordinate of the true state, predicted from the latents by ridge regression.
 
     Each episode is predicted by the regression on all others, as its neighbours in time would give it away. An angle
     is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect

@@ -19,8 +19,7 @@ RED, GREY = "#d62728", "#bbbbbb"
 
 
 def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
-    """
-    Write episodes side by side as MP4: above the camera's pictures, below the SRL errors so far, with one scale.
+    """Write episodes side by side as MP4: above the camera's pictures, below the SRL errors so far, with one scale.
 
     :param path: File to write, ``*.mp4``
     :param episodes: Episodes with ``frames`` (rendered with ``render=True``) by title; all end with the shortest.
@@ -39,8 +38,7 @@ def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_re
 
 
 def annotated_frames(episode: Episode, action_repeat: int, title: str, top: float) -> Iterator[np.ndarray]:
-    """
-    Draw the pictures of ``write_video``.
+    """Draw the pictures of ``write_video``.
 
     :param episode: Episode with ``frames``
     :param action_repeat: Environment steps per agent step

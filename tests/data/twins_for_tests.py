@@ -80,7 +80,8 @@ class Twins:
         return parts[self.kind]
 
     def step(self, events: list[tuple[str, int, int]]) -> None:
-        """
+        """Take one step in each environment.
+
         :param events: Per environment what happens, and two codes for the numbers that come next
         """
         obs = self.render(self.stacks, self.goals)
