@@ -28,7 +28,8 @@ STYLE = """
 
 
 def text(x: float, y: float, words: str, kind: str = "note", anchor: str = "middle", turned: bool = False) -> str:
-    """
+    """Draw a line of text.
+
     :param x: Where it is anchored, as all lengths in units of the drawing
     :param y: Of its baseline
     :param words: What it says; ``_`` begins a subscript that ends with the word
@@ -44,7 +45,8 @@ def text(x: float, y: float, words: str, kind: str = "note", anchor: str = "midd
 
 
 def box(x: float, y: float, width: float, height: float, color: str, title: str, *notes: str) -> str:
-    """
+    """Draw a rounded box.
+
     :param x: Its left edge
     :param y: Its upper edge
     :param width: Its width
@@ -66,7 +68,8 @@ def box(x: float, y: float, width: float, height: float, color: str, title: str,
 
 
 def arrow(points: str, color: str = "line", gradient: bool = False, stop: tuple[float, float] | None = None) -> str:
-    """
+    """Draw an arrow.
+
     :param points: Corners as SVG's path data, such as ``"M0 0 V10"``
     :param color: Name of its colour in ``STYLE``
     :param gradient: Whether it is dashed
@@ -81,7 +84,8 @@ def arrow(points: str, color: str = "line", gradient: bool = False, stop: tuple[
 
 
 def head(color: str) -> str:
-    """
+    """Draw the head of arrows of a colour.
+
     :param color: Name of a colour in ``STYLE``
     :return: The head of its arrows, whose tip is the end of the line
     """
@@ -93,7 +97,8 @@ def head(color: str) -> str:
 
 
 def draw() -> str:
-    """
+    """Draw everything.
+
     :return: The drawing as SVG
     """
     colors = ("line", "task", "srl", "curious")
