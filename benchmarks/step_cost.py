@@ -50,7 +50,9 @@ class TimedArm:
         self.seconds += time.process_time() - start
 
     def measure(self, steps: int) -> dict[str, float]:
-        """:param steps: Agent steps
+        """Measure the CPU time of agent steps.
+
+        :param steps: Agent steps
         :return: CPU milliseconds of an agent step without its updates, and of an update; and updates per step
         """
         self.seconds, updates, start = 0.0, self.model._n_updates, time.process_time()
@@ -64,7 +66,9 @@ class TimedArm:
 
 
 def step_costs(cells: Sequence[Cell], steps: int, rounds: int) -> dict[str, dict[str, float]]:
-    """:param cells: One of each arm, of one task
+    """Measure arms in turn.
+
+    :param cells: One of each arm, of one task
     :param steps: Agent steps in a round
     :param rounds: How many
     :return: By arm the CPU milliseconds of the fastest tenth of its rounds, by part and together, and the median

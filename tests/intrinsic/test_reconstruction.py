@@ -45,3 +45,5 @@ def test_pictures_are_what_the_decoder_draws(size: int, n_layers: int) -> None:
     assert drawn.dtype == th.uint8 and drawn.shape == observations.shape
     error = ((drawn.float() - observations.float()) / 255).square().flatten(1).mean(dim=1)
     th.testing.assert_close(error, reward.error(observations, latents), rtol=0.05, atol=1e-3)
+    reward.decoder.forward = lambda latents: th.linspace(-0.6, 0.6, observations.numel()).view(observations.shape)
+    assert [int(end) for end in th.aminmax(reward.reconstruct(latents))] == [0, 255]  # black and white are drawn, too
