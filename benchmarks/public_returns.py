@@ -22,10 +22,11 @@ import numpy as np
 import torch as th
 
 from benchmarks.public_sac_ae import ARGUMENTS, Log, checkout_argument, import_public, public_agent
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.result_files import Row, checkout_commit, describe_run, write_csv, write_json, write_text
 from sb3_cure.experiments.cells import EVAL_SEED, alone_in, check_cell, is_evaluation_due, run_cell
-from sb3_cure.experiments.grid import DONE, Cell, GridError, load_grid
+from sb3_cure.experiments.grid import DONE, Cell, load_grid
 from sb3_cure.networks.allocator import tune_allocator
 
 GRID = Path(__file__).parent.parent / "zoo_configs" / "experiments" / "fast" / "public_sac_ae.yml"
@@ -211,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 process.submit(run_public, options.checkout, public_cell(cells[0]), options.out).result()
             for cell in cells:
                 run_cell(cell, options.out)
-        except GridError as error:
+        except UsageError as error:
             parser.error(str(error))
 
 

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from benchmarks.peers import is_trial, trial_arms
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.plots import arm_colors, in_style, save
 from sb3_cure.evaluation.result_files import Row, read_rows, write_csv, write_text
-from sb3_cure.experiments.grid import GridError, read_kept
+from sb3_cure.experiments.grid import read_kept
 from sb3_cure.experiments.statistics import area_under_curve
 from sb3_cure.experiments.tables import NONE, Table
 
@@ -94,7 +95,7 @@ def read_runs(out: Path) -> Runs:
 
     :param out: Folder of all results
     :return: Runs by task, arm and seed
-    :raises GridError: if they come from several kinds of machine
+    :raises UsageError: if they come from several kinds of machine
     """
     runs: Runs = {}
     machines: dict[str, Path] = {}
@@ -104,7 +105,7 @@ def read_runs(out: Path) -> Runs:
         runs.setdefault(task, {}).setdefault(arm, {})[details["seed"]] = run
         machines[details["machine"]] = path
     if len(machines) > 1:
-        raise GridError(f"{out} mixes minutes of several machines, as in {' and '.join(map(str, machines.values()))}.")
+        raise UsageError(f"{out} mixes minutes of several machines, as in {' and '.join(map(str, machines.values()))}.")
     return runs
 
 
@@ -114,12 +115,12 @@ def best_trial(out: Path, peer: str) -> str:
     :param out: Folder of all results
     :param peer: A key of ``PEERS``
     :return: The trial with the highest mean return over the minutes of training
-    :raises GridError: if a trial is missing
+    :raises UsageError: if a trial is missing
     """
     runs = read_runs(out).get(TRIAL_TASK, {})
     trials = {arm: [runs.get(arm, {}).get(seed) for seed in TRIAL_SEEDS] for arm in trial_arms(peer)}
     if missing := [arm for arm, seeds in trials.items() if None in seeds]:
-        raise GridError(
+        raise UsageError(
             f"{peer} is the best of its trials, of which {', '.join(missing)} are missing: run these first on "
             f"{TRIAL_TASK} with seeds {' '.join(map(str, TRIAL_SEEDS))}."
         )

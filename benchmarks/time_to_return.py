@@ -50,6 +50,7 @@ from benchmarks.peers import PEERS, CurlTraining, DrQv2Training, peer_of, trial_
 from benchmarks.public_returns import PublicTraining, episode_return, public_cell
 from benchmarks.public_sac_ae import checkout_folder
 from benchmarks.time_summary import COLUMNS, OURS, best_trial, read_runs, write_summary
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import (
@@ -60,7 +61,7 @@ from sb3_cure.evaluation.result_files import (
     write_json,
 )
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings
-from sb3_cure.experiments.grid import Cell, GridError, GridFile, Method, arm_cell, load_grid, short_name
+from sb3_cure.experiments.grid import Cell, GridFile, Method, arm_cell, load_grid, short_name
 from sb3_cure.networks.allocator import tune_allocator
 
 PUBLIC = public_returns.ARM
@@ -82,7 +83,7 @@ def make_cell(arm: str, task: str, seed: int, out: Path) -> Cell:
     :param seed: Seed of weights, warm-up and environment
     :param out: Folder of all results, whose trials decide on a peer's settings
     :return: What to run
-    :raises GridError: if the arm is unknown, or trials are missing
+    :raises UsageError: if the arm is unknown, or trials are missing
     """
     peer = peer_of(arm)
     zoo = "sac_ae" if peer or arm in (PUBLIC, *SB3) else arm
@@ -107,7 +108,7 @@ def _peer_cell(cell: Cell, name: str, out: Path) -> Cell:
     peer, arm = PEERS[name], best_trial(out, name) if cell.method == name else cell.method
     known = {f"{name}_own": peer.own, **dict(zip(trial_arms(name), peer.trials.values(), strict=True))}
     if arm not in known:
-        raise GridError(f"{arm!r} is no arm of {name}, which has {', '.join((name, *known))}.")
+        raise UsageError(f"{arm!r} is no arm of {name}, which has {', '.join((name, *known))}.")
     arguments = {"implementation": peer.source, "settings_of": arm, **known[arm]}
     if name == "drqv2":
         return replace(cell, arguments=arguments)
@@ -303,7 +304,7 @@ def run_missing(out: Path, cells: Sequence[Cell], minutes: float, jobs: int, clo
     :param jobs: Cells at a time
     :param clones: Folders of public code, by arm or peer
     :return: Names of the cells that failed
-    :raises GridError: if the folder holds cells of other settings
+    :raises UsageError: if the folder holds cells of other settings
     """
     for cell in cells:
         path = cell_path(out, cell).with_suffix(".json")
@@ -360,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ]
         failed = run_missing(options.out, cells, options.minutes, options.jobs, clones)
         runs = read_runs(options.out)
-    except GridError as error:
+    except UsageError as error:
         parser.error(str(error))
     if runs:
         print(write_summary(options.out, runs))

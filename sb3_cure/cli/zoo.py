@@ -28,7 +28,15 @@ from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 from sb3_cure.cli.progress import TimeLeft, time_text
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
-from sb3_cure.cli.zoo_files import ALGORITHMS, check_environment, find_class, import_module, packaged_files, zoo_file
+from sb3_cure.cli.zoo_files import (
+    ALGORITHMS,
+    check_environment,
+    find_class,
+    import_module,
+    packaged_files,
+    read_yaml,
+    zoo_file,
+)
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
@@ -84,7 +92,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
         env_name = self.env_name
         if self.config.endswith((".yml", ".yaml")):
             # rl-zoo3 looks for the environment's own id, then for "default".
-            self.env_name = EnvironmentName(self._entry(_read_yaml(Path(self.config))))
+            self.env_name = EnvironmentName(self._entry(read_yaml(Path(self.config))))
         try:
             return super().read_hyperparameters()
         finally:
@@ -274,17 +282,6 @@ def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[a
             f"{error.args[0]}: -params and --env-kwargs take name:value with values as in Python, and text in quotes "
             "for the shell, too ('srl:\"curl\"')."
         ) from None
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    """Entries of a settings file."""
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} is no YAML file: {one_sentence(error)}.") from None
-    if not isinstance(content, dict):
-        raise UsageError(f"{path} must have an entry for each task, or 'default:'.")
-    return content
 
 
 def optimize(arguments: Sequence[str]) -> None:

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import yaml
 
-from sb3_cure.cli.usage import UsageError, nearest
+from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
 from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 
 #: Algorithms by their name for ``--algo`` and in grids
@@ -45,6 +46,28 @@ def packaged_files(folder: Path = ZOO) -> dict[str, Path]:
     """
     files = [*sorted(folder.glob("*.yml")), *sorted(folder.glob("fast/*.yml"))]
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+
+
+def read_yaml(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[str, Any]:
+    """Read the mapping that a YAML file holds.
+
+    :param path: The file
+    :param loader: How scalars are read
+    :return: The mapping
+    :raises UsageError: with the nearest names of files if there is none, or if it holds something else
+    """
+    if not path.exists():
+        raise UsageError(missing_file(path, [*packaged_files(GRIDS), *packaged_files()]))
+    try:
+        content = yaml.load(path.read_text(), loader)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"{path} cannot be read ({one_sentence(error)}): "
+            "give the path of a YAML file, or a name of the package's without suffix."
+        ) from None
+    if not isinstance(content, dict):
+        raise UsageError(f"{path} holds {content!r:.60}, but it must be a mapping (key: value).")
+    return content
 
 
 def check_environment(task: str) -> None:

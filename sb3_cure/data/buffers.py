@@ -204,7 +204,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
             raise
         if n_valid < 0.9 * (super().size() - 1):
             warnings.warn(
-                f"Frames do not slide: only {n_valid} of {super().size()} rows fit into the replay buffer, because "
+                "Frames do not slide: fewer than 9 of 10 rows fit into the replay buffer, because "
                 f"observations are seldom frame_stack={self.frame_stack} frames of which all but the newest repeat the "
                 "ones before: give the right number in replay_buffer_kwargs=dict(frame_stack=...), by key in "
                 "dictionaries.",

@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_cure.cli.progress import TimeLeft
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.counting import TASK_REWARD
@@ -25,7 +26,7 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, GridError, read_kept
+from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_kept
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -55,7 +56,7 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     :param checkpoint_minutes: Minutes between two checkpoints, the most that an interruption loses
     :param pictures: Whether to draw and to film as well
     :return: The cell's folder
-    :raises GridError: if the folder holds the same cell with other settings
+    :raises UsageError: if the folder holds the same cell with other settings
     :raises CellIsRunning: if another process is running it
     """
     folder = Path(results) / cell.folder
@@ -74,7 +75,7 @@ def check_cell(folder: Path, cell: Cell) -> None:
 
     :param folder: The cell's folder, whether it exists or not
     :param cell: The cell
-    :raises GridError: if they differ
+    :raises UsageError: if they differ
     """
     keys = ("kind", "budget", "eval_every", "eval_episodes", "coverage", "stop_at_return", *SETTINGS)
     check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in keys})
@@ -85,12 +86,12 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
 
     :param path: A JSON file, which may be missing
     :param settings: Settings of this run; keys that the file lacks are not compared
-    :raises GridError: if they differ
+    :raises UsageError: if they differ
     """
     before = read_kept(path) if path.exists() else {}
     for key, now in json.loads(json.dumps(settings, default=str)).items():
         if before.get(key, now) != now:
-            raise GridError(
+            raise UsageError(
                 f"{path.parent} was run with other settings: {key} was {before[key]!r} and is {now!r} now. Choose "
                 "another --out, or remove that folder."
             )
@@ -383,7 +384,7 @@ def is_evaluation_due(evaluations: Sequence[Row], steps: int, every: int, finish
     return steps > last and (finished or steps // every > last // every)
 
 
-class CellIsRunning(GridError):
+class CellIsRunning(UsageError):
     """Another process runs this cell."""
 
 

@@ -16,8 +16,8 @@ import torch as th
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
-from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
-from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, packaged_files, zoo_file
+from sb3_cure.cli.usage import UsageError, nearest, one_sentence
+from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, read_yaml, zoo_file
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.counting import CellInfo, TaskReward
@@ -30,10 +30,6 @@ DONE = "DONE"
 SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
 #: Arguments that may name a class of the user's, as ``"my_module.MyClass"``
 _CLASSES = ("srl", "intrinsic", "replay_buffer_class")
-
-
-class GridError(UsageError):
-    """A grid file or a choice from it that cannot be run; the message is for its author."""
 
 
 def short_name(task: str) -> str:
@@ -319,12 +315,12 @@ def read_kept(path: Path) -> dict[str, Any]:
 
     :param path: The file
     :return: Its content
-    :raises GridError: if it is damaged
+    :raises UsageError: if it is damaged
     """
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):
-        raise GridError(f"{path} is damaged: remove {path.parent}, which is then made anew.") from None
+        raise UsageError(f"{path} is damaged: remove {path.parent}, which is then made anew.") from None
 
 
 def seed_of(folder: Path) -> int | None:
@@ -358,16 +354,16 @@ def load_grid(
     :param methods: Only these arms
     :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
     :return: The grid
-    :raises GridError: with one sentence about what is wrong
+    :raises UsageError: with one sentence about what is wrong
     """
     path = _find(path, GRIDS)
-    content = _read_yaml(path)
+    content = read_yaml(path, _Loader)
     file = _validated(path, content)
     if budget is not None and budget != file.budget:
         _scale(file, budget, path)
     if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
         if seeds > len(file.seeds):
-            raise GridError(f"--seeds is {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
+            raise UsageError(f"--seeds is {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds
     file.seeds = sorted({*file.seeds, *chosen})
@@ -389,7 +385,7 @@ def _find(name: str | Path, folder: Path) -> Path:
     try:
         return zoo_file(name, folder)
     except UsageError as error:
-        raise GridError(str(error)) from None
+        raise UsageError(str(error)) from None
 
 
 def _validated(path: Path, content: Any) -> GridFile:
@@ -397,7 +393,7 @@ def _validated(path: Path, content: Any) -> GridFile:
         return GridFile.model_validate(content)
     except pydantic.ValidationError as error:
         wrong = "; ".join(_validation_message(each) for each in error.errors())
-        raise GridError(f"{path} is no grid: {wrong}.") from None
+        raise UsageError(f"{path} is no grid: {wrong}.") from None
 
 
 def _validation_message(error: Any) -> str:
@@ -415,7 +411,7 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
     for method in file.methods.values():
         if method.pretrain is not None:
             if file.budget == 0:
-                raise GridError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
+                raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
             method.pretrain = replace(method.pretrain, budget=steps)
     file.budget = budget
@@ -429,14 +425,14 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
     :param task: Gymnasium id
     :param name: Name of the method
     :return: The cell, with the file's first seed
-    :raises GridError: if there is no such zoo file or entry
+    :raises UsageError: if there is no such zoo file or entry
     """
     method = file.methods[name]
     config = path.parent / _find(method.config, ZOO)
-    entries, own = _read_yaml(config), task.rpartition(":")[2]
+    entries, own = read_yaml(config, _Loader), task.rpartition(":")[2]
     found = [key for key in (task, own, own.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
     if not found:
-        raise GridError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
+        raise UsageError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
     entry = {"policy": "CnnPolicy", **entries[found[0]]}
     for key, value in method.overrides.items():
         entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
@@ -472,7 +468,7 @@ def _check_pixels(arms: Sequence[Cell], path: Path) -> None:
     first: dict[str, dict[str, Any]] = {}
     for cell in arms:
         if first.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
-            raise GridError(
+            raise UsageError(
                 f"methods in {path} differ in env_kwargs on {cell.task}, but common heads judge all alike: give them "
                 "the same, or write a grid for each."
             )
@@ -487,25 +483,10 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise GridError(missing_file(path, [*packaged_files(GRIDS), *packaged_files(ZOO)]))
-    try:
-        content = yaml.load(path.read_text(), _Loader)  # a SafeLoader
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GridError(
-            f"{path} cannot be read ({' '.join(str(error).split())}): "
-            "give the path of a YAML file, or a name of the package's without suffix."
-        ) from None
-    if not isinstance(content, dict):
-        raise GridError(f"{path} holds {content!r:.60}, but it must be a mapping (key: value).")
-    return content
-
-
 def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> set[str]:
     for name in names or ():
         if name not in known:
-            raise GridError(f"{name!r} is not in {path}, which has {', '.join(known)}{nearest(name, known)}")
+            raise UsageError(f"{name!r} is not in {path}, which has {', '.join(known)}{nearest(name, known)}")
     return {known[name] for name in (known if names is None else names)}
 
 
@@ -515,7 +496,7 @@ def check_arms(cells: Iterable[Cell]) -> None:
     On the CPU, as the cells may run on another machine, and with the smallest replay buffer, which may fill the memory.
 
     :param cells: Cells that are to be run
-    :raises GridError: for the first that cannot be built
+    :raises UsageError: for the first that cannot be built
     """
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
         try:
@@ -527,4 +508,4 @@ def check_arms(cells: Iterable[Cell]) -> None:
             return
         except Exception as error:
             reason = f"{type(error).__name__}: {one_sentence(error, ALGORITHMS[cell.algo], make_dmc_env)}"
-            raise GridError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error
+            raise UsageError(f"method {cell.method!r} on {cell.task} cannot be built: {reason}") from error

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from sb3_cure.cli.progress import time_text
-from sb3_cure.cli.usage import install_command
+from sb3_cure.cli.usage import UsageError, install_command
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
-from sb3_cure.experiments.grid import Grid, GridError, check_arms, load_grid, read_kept
+from sb3_cure.experiments.grid import Grid, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 from sb3_cure.networks.allocator import tune_allocator
 
@@ -53,10 +53,10 @@ def run_grid(
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU
     :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
     :return: The cells and common heads that failed; each has its traceback in ``error.txt``
-    :raises GridError: with one sentence, before anything is written, if the grid cannot be run
+    :raises UsageError: with one sentence, before anything is written, if the grid cannot be run
     """
     if engine not in ENGINES:
-        raise GridError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
+        raise UsageError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
     settings = (results, checkpoint_minutes, pictures)
@@ -79,7 +79,7 @@ def check_grid(grid: Grid, results: Path) -> None:
 
     :param grid: A grid
     :param results: Folder of all results, whether it exists or not
-    :raises GridError: with one sentence
+    :raises UsageError: with one sentence
     """
     shared = {key: grid.description.get(key) for key in ("kind", "budget", "evaluation", "coverage", "stop_at_return")}
     check_settings(results / grid.experiment / "grid.json", shared)
@@ -155,7 +155,7 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
         import ray
     except ImportError:
         needs = f'engine="ray" needs Ray, which is not installed: {install_command("cluster")}.'
-        raise GridError(needs) from None
+        raise UsageError(needs) from None
     own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
     ray.init(address=address or "local", **own)
     try:
@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join(status_lines([*grid.cells, *common_heads(grid, out)], out)), flush=True)
             return 0
         failed = run_grid(grid, out, **options)
-    except GridError as error:
+    except UsageError as error:
         print(f"{parser.prog}: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -17,11 +17,12 @@ from grids_for_tests import DMC_TASK, TASK, method, steps_of, write_grid
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure import CuReSAC
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, media, run, visitation
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.grid import Cell, Grid, GridError, load_grid
+from sb3_cure.experiments.grid import Cell, Grid, load_grid
 
 
 @pytest.fixture(autouse=True)
@@ -343,7 +344,7 @@ def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.M
     learn = CuReSAC.learn
 
     def learn_while_another_tries(self: CuReSAC, *args: Any, **kwargs: Any) -> CuReSAC:
-        with pytest.raises(GridError, match="is being run by another process") as refusal:
+        with pytest.raises(UsageError, match="is being run by another process") as refusal:
             run_cell(cell, tmp_path, pictures=False)
         refusals.append(refusal)
         assert ": running" in run.status_lines([cell], tmp_path)[0]

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from grids_for_tests import DMC_TASK, method, write_grid
 
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.envs import physics_state, physics_state_names, rendering
 from sb3_cure.envs.counting import TASK_REWARD, CellInfo
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments.cells import run_cell
-from sb3_cure.experiments.grid import GridError, check_arms, load_grid
+from sb3_cure.experiments.grid import check_arms, load_grid
 
 WIDTHS = {"slider": 0.1, "hinge_1": 0.2}
 ORACLE = {"sb3_cure.envs.counting.CountReward": {"widths": {"slider": 0.15, "hinge_1": 0.5}}}
@@ -107,7 +108,7 @@ def test_coverage_goes_on_after_a_kill(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_unknown_coordinates_are_found_before_anything_runs(tmp_path: Path) -> None:
-    with pytest.raises(GridError, match="widths must be > 0, for some of slider, hinge_1"):
+    with pytest.raises(UsageError, match="widths must be > 0, for some of slider, hinge_1"):
         check_arms(grid(tmp_path, coverage=dict(widths={"elbow": 1.0}, at=[400])).cells)
-    with pytest.raises(GridError, match=r"coverage\.at"):
+    with pytest.raises(UsageError, match=r"coverage\.at"):
         grid(tmp_path, coverage=dict(widths=WIDTHS, at=[]))

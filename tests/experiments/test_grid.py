@@ -13,8 +13,9 @@ import yaml
 from envs_for_tests import PixelBox
 from grids_for_tests import DMC_TASK, TASK, method, write_grid
 
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.experiments import run
-from sb3_cure.experiments.grid import Cell, GridError, check_arms, load_grid
+from sb3_cure.experiments.grid import Cell, check_arms, load_grid
 
 GRIDS = Path(__file__).parents[2] / "zoo_configs" / "experiments"
 
@@ -41,9 +42,9 @@ def test_grids_and_settings_of_the_package_by_name(tmp_path: Path) -> None:
     methods = {"a": {"config": "fast/sac_ae"}}
     (cell,) = load_grid(write_grid(tmp_path, methods=methods, tasks=[DMC_TASK], seeds=1)).cells
     assert (cell.arguments["policy"], cell.env_kwargs["renderer"]) == ("CnnPolicy", "fast")
-    with pytest.raises(GridError, match=r"'fast/curve' is neither .* did you mean fast/curves"):
+    with pytest.raises(UsageError, match=r"'fast/curve' is neither .* did you mean fast/curves"):
         load_grid("fast/curve")
-    with pytest.raises(GridError, match=r"'sac' is neither .* did you mean sac_ae"):
+    with pytest.raises(UsageError, match=r"'sac' is neither .* did you mean sac_ae"):
         load_grid(write_grid(tmp_path, methods={"a": {"config": "sac"}}))
 
 
@@ -120,7 +121,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", WRONG)
 def test_wrong_grid_is_one_sentence(tmp_path: Path, name: str) -> None:
     changes, sentence = WRONG[name]
-    with pytest.raises(GridError, match=sentence) as refusal:
+    with pytest.raises(UsageError, match=sentence) as refusal:
         load_grid(write_grid(tmp_path, **changes))
     assert "\n" not in str(refusal.value)
 
@@ -229,5 +230,5 @@ def test_folders_of_earlier_versions_are_continued(tmp_path: Path) -> None:
     (folder / "DONE").touch()
     run.check_grid(grid, tmp_path)
     (folder / "config.json").write_text(json.dumps(asdict(cell)))
-    with pytest.raises(GridError, match="stop_at_return was None and is 500"):
+    with pytest.raises(UsageError, match="stop_at_return was None and is 500"):
         run.check_grid(load_grid(write_grid(tmp_path, stop_at_return=500)), tmp_path)

@@ -14,9 +14,10 @@ import pytest
 from grids_for_tests import method, steps_of, write_grid
 
 from sb3_cure import CuReSAC
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.result_files import read_rows
 from sb3_cure.experiments import cells, heads, run
-from sb3_cure.experiments.grid import GridError, load_grid
+from sb3_cure.experiments.grid import load_grid
 
 QUICK: dict[str, Any] = dict(budget=40, evaluation=dict(every=40, episodes=1))
 
@@ -75,7 +76,7 @@ def test_other_settings_in_the_folder_are_refused(tmp_path: Path) -> None:
         (dict(kind="visitation", methods={"other": method()}), "kind was 'curves' and is 'visitation' now"),
         (dict(methods=changed), "seed7 was run with other settings: arguments was {"),
     ):
-        with pytest.raises(GridError, match=sentence):
+        with pytest.raises(UsageError, match=sentence):
             run.run_grid(load_grid(write_grid(tmp_path, **{**QUICK, **changes}), seeds=[8]), out, pictures=False)
     assert {file: file.read_bytes() for file in out.rglob("*") if file.is_file()} == files
     more = write_grid(tmp_path, **QUICK, methods={"further": method(curiosity=None)})
@@ -225,7 +226,7 @@ def open_files(pid: int) -> set[Path]:
 
 
 def test_unknown_engine_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(GridError, match="engine must be one of local, ray"):
+    with pytest.raises(UsageError, match="engine must be one of local, ray"):
         run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="rya")
     assert not (tmp_path / "out").exists()
 

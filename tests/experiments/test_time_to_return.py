@@ -19,8 +19,8 @@ from torch import nn
 from benchmarks import peers
 from benchmarks import time_summary as summary
 from benchmarks import time_to_return as ttr
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.result_files import read_rows, write_csv, write_json
-from sb3_cure.experiments.grid import GridError
 
 
 def make_run(
@@ -127,7 +127,7 @@ def test_minutes_of_several_machines_do_not_mix(tmp_path: Path) -> None:
     for seed, machine in enumerate(("one", "another")):
         run = make_run([20, 30])
         write_run(tmp_path, "curl", seed, summary.Run(run.rows, {**run.details, "machine": machine}))
-    with pytest.raises(GridError, match="several machines"):
+    with pytest.raises(UsageError, match="several machines"):
         summary.read_runs(tmp_path)
 
 
@@ -151,7 +151,7 @@ def test_arms_share_pixels_and_sizes(tmp_path: Path) -> None:
 def test_unknown_arms_are_refused(tmp_path: Path) -> None:
     """Also a recipe that has no file."""
     for arm in ("no_such_recipe", "drqv2_fast"):
-        with pytest.raises(GridError, match=arm):
+        with pytest.raises(UsageError, match=arm):
             ttr.make_cell(arm, "cartpole-swingup", 0, tmp_path)
 
 
@@ -163,7 +163,7 @@ def test_peer_takes_the_settings_of_its_best_trial(tmp_path: Path) -> None:
             if (arm, seed) != (arms[-1], 2):
                 curve = [0, 400, 400] if number == 1 else [0, 0, 700]
                 write_run(tmp_path, arm, seed, make_run(curve, minutes_each=10, limit=20))
-    with pytest.raises(GridError, match=f"{arms[-1]} are missing"):
+    with pytest.raises(UsageError, match=f"{arms[-1]} are missing"):
         ttr.make_cell("public_curl", "reacher-easy", 20, tmp_path)
     write_run(tmp_path, arms[-1], 2, make_run([0, 0, 700], minutes_each=10, limit=20))
     cell = ttr.make_cell("public_curl", "reacher-easy", 20, tmp_path)
@@ -304,7 +304,7 @@ def test_finished_cells_run_once_with_same_settings(tmp_path: Path, monkeypatch:
     assert processes.ran[2:] == [("curl", 1), ("sb3_sac", 1)]
     with pytest.raises(SystemExit):
         ttr.main([*arguments, "--seeds", "0", "--minutes", "5"])
-    with pytest.raises(GridError, match="budget"):
+    with pytest.raises(UsageError, match="budget"):
         ttr.run_missing(tmp_path, [ttr.make_cell("curl", "cartpole-swingup", 0, tmp_path)], 30, 1, {})
     assert len(processes.ran) == 4
 
