@@ -194,12 +194,15 @@ def test_zero_learning_rate_freezes_everything(srl: str, update: str) -> None:
     assert differences(before, dict(model.policy.named_parameters())) == []
 
 
-@pytest.mark.parametrize("intrinsic, reads_error", [("srl_error", True), ("rnd", False)])
+@pytest.mark.parametrize(
+    "intrinsic, per_pixel, reads_error", [("srl_error", False, True), ("srl_error", True, False), ("rnd", None, False)]
+)
 @pytest.mark.parametrize("kind", ["frozen", "alternating"])
-def test_head_without_reader_does_not_run(kind: str, intrinsic: str, reads_error: bool) -> None:
+def test_head_without_reader_does_not_run(kind: str, intrinsic: str, per_pixel: bool | None, reads_error: bool) -> None:
     """A head that does not learn, as it is frozen or the agents have their turn, runs for the reward's sake alone."""
-    settings = dict(srl_schedule="alternating", srl_period=1) if kind == "alternating" else {}
-    model = tiny_model("CnnPolicy", PixelBox(), intrinsic=intrinsic, **settings).learn(10)
+    settings: dict[str, Any] = dict(srl_schedule="alternating", srl_period=1) if kind == "alternating" else {}
+    kwargs = {} if per_pixel is None else dict(per_pixel=per_pixel)
+    model = tiny_model("CnnPolicy", PixelBox(), intrinsic=intrinsic, intrinsic_kwargs=kwargs, **settings).learn(10)
     srl, modes = model.policy.srl, []
 
     def loss(*arguments: Any) -> SRLOutput:

@@ -225,22 +225,6 @@ def test_error_that_a_reward_reads_leaves_the_shared_graph(update: str) -> None:
     assert not equal(before["trunk"], groups(model)["trunk"]) and equal(before["head"], groups(model)["head"])
 
 
-@pytest.mark.parametrize("intrinsic_kwargs", [{}, {"per_pixel": True}])
-def test_frozen_head_is_computed_only_for_a_reward_that_reads_it(intrinsic_kwargs: dict[str, Any]) -> None:
-    """Neither for a metric, nor for a reward that draws by itself."""
-    calls: list[Any] = []
-
-    class Spy(RAE):
-        def loss(self, batch: Any, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
-            calls.append(batch)
-            return super().loss(batch, latents)
-
-    model = filled_model(srl=Spy, curiosity_target="next_observation", intrinsic_kwargs=intrinsic_kwargs)
-    model.policy.representation_frozen = True
-    model.train(1, 8)
-    assert len(calls) == (0 if intrinsic_kwargs else 1)
-
-
 @pytest.mark.parametrize(
     ("srl", "expected"),
     [("rae", SRLError), ("vae", SRLError), *((srl, RND) for srl in ("curl", "spr", "forward", "inverse", None))],
