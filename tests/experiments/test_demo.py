@@ -57,9 +57,21 @@ def test_demo_draws_pictures_and_a_video(written: Path) -> None:
         assert red[1] > red[0]
 
 
+def test_demo_draws_the_agent_beside_what_it_sees(written: Path) -> None:
+    """A step of 8 environment steps lasts .08 s; the camera's picture is in colour, the agent's of 36 grey pixels."""
+    with Image.open(written / "agent.gif") as gif:
+        assert (gif.n_frames, gif.info["duration"]) == (125, 80)  # type: ignore[attr-defined]
+        picture = np.asarray(gif.convert("RGB"))
+    camera, seen = picture[:, :128], picture[:, -128:]
+    colourful = [np.ptp(half.astype(int), axis=2).mean() for half in (camera, seen)]
+    assert colourful[0] > 20 and colourful[1] < 10
+    assert len(np.unique(seen, axis=0)) <= 36 and seen.std() > 5 and (written / "agent.gif").stat().st_size < 1e6
+
+
 def test_demo_ends_at_the_time_limit() -> None:
-    """Training stops when its share of the minutes is over."""
+    """Training and schedules stop when its share of the minutes is over."""
     model = tiny_model("CnnPolicy", PixelBox())
     progress = demo.Progress(demo.make_dmc_env(demo.DOMAIN, demo.TASK, **demo.ENV_KWARGS), 10_000, seconds=1.0)
     model.learn(10_000, callback=progress)
     assert 0 < model.num_timesteps < 10_000
+    assert 0 <= model._current_progress_remaining < 0.1
