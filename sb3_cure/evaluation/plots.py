@@ -71,7 +71,7 @@ def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """Return (deterministic actions) over environment steps, with a line for the random policy.
+    """Return on a task of the DeepMind Control suite over environment steps, with a line for the random policy.
 
     :param path: File to write
     :param rows: Evaluations with ``environment_steps`` and ``task_return``
@@ -82,7 +82,7 @@ def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_retur
     returns = np.array([[row["task_return"] for row in rows]])
     curves = {"task policy": (steps, returns), "random policy": (steps, np.full(returns.shape, random_return))}
     colors = {f"{actor} policy": color for actor, color in COLORS.items()}
-    learning_curves(path, {title: curves}, colors, "episode return\n(deterministic actions)")
+    learning_curves(path, {title: curves}, colors, "return of an episode\n(at most 1000)")
 
 
 @in_style
@@ -107,7 +107,7 @@ def learning_curves(
         for arm, (steps, values) in lines.items():
             seeds.setdefault(arm, set()).add(len(values))
             mean = values.mean(axis=0)
-            axes.plot(steps, mean, color=colors[arm])
+            axes.plot(steps, mean, ".-", color=colors[arm])
             if len(values) > 1:
                 std = values.std(axis=0, ddof=1)
                 low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
@@ -137,7 +137,7 @@ def paired_differences(
     :param colors: By arm
     :param xlabel: What the differences are of
     """
-    figure = Figure(figsize=(8.5, 1.1 + 0.34 * len(rows)))
+    figure = Figure(figsize=(8.5, 1.3 + 0.34 * len(rows)))
     axes = figure.subplots()
     axes.axvline(0, color="#333333", linewidth=1)
     for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
@@ -146,7 +146,8 @@ def paired_differences(
             axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
         axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
     axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
-    axes.set(xlabel=xlabel, ylim=(len(rows) - 0.5, -0.5))
+    marks = "dots: pairs of seeds; diamond and line: their mean with its 95 % interval"
+    axes.set(xlabel=f"{xlabel}\n({marks})", ylim=(len(rows) - 0.5, -0.5))
     # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
     reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
     axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
@@ -217,7 +218,8 @@ def actor_bars(
             axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
-    _shared_legend(figure, places)
+    if lines is not None or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
+        _shared_legend(figure, places)
     save(figure, path)
 
 
@@ -279,8 +281,9 @@ def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
 
 
 def _show(axes: Axes, images: Iterable[np.ndarray]) -> None:
-    """Show images [C, H, W] of one or three channels in a row."""
-    strip = np.concatenate([np.moveaxis(image, 0, -1) for image in images], axis=1)
+    """Show images [C, H, W] of one or three channels in a row, with a white line between them."""
+    gap = ((0, 0), (0, 0), (0, 1))
+    strip = np.concatenate([np.moveaxis(np.pad(each, gap, constant_values=255), 0, -1) for each in images], axis=1)
     axes.imshow(
         strip.squeeze(-1) if strip.shape[-1] == 1 else strip, cmap="gray", vmin=0, vmax=255, interpolation="nearest"
     )
@@ -300,10 +303,10 @@ def reconstructions_over_training(
     :param rows: Agent steps of training, and the reconstructions then, of the same shape
     :param title: Title of the figure
     """
-    strips = {"seen by the agent": observed}
+    strips = {"what the camera shows": observed}
     for steps, drawn in rows:
         error = np.square((drawn.astype(np.float32) - observed) / 255).mean()
-        strips[f"{steps:,} agent steps\nMSE {error:.2g}"] = drawn
+        strips[f"drawn from the latents\nafter {steps:,} agent steps\n(MSE {error:.2g})"] = drawn
     (n, _, height, width), inches = observed.shape, 10.0
     figure = Figure(figsize=(inches, 0.4 + len(strips) * (inches - 1.2) * height / (n * width)))
     figure.get_layout_engine().set(h_pad=0.02, hspace=0)  # type: ignore[union-attr, call-arg]
@@ -335,8 +338,7 @@ def highest_error_frames(
     for axes in grid:
         axes.set_axis_off()
     for index, (error, age) in enumerate(zip(found.errors, found.ages, strict=True)):
-        # A white column on the right of each frame
-        _show(grid[index], [np.pad(images[index], ((0, 0), (0, 0), (0, 1)), constant_values=255) for images in pairs])
+        _show(grid[index], [images[index] for images in pairs])
         grid[index].set_title(f"{error:.3g} ({error / found.mean_error:.1f}x mean)\n{age:,} steps ago", fontsize=8)
     note = "SRL error" if drawn is None else "left: observed, right: reconstructed; SRL error"
     note += f", and its multiple of the buffer's mean of {found.mean_error:.3g}; ages in agent steps"
@@ -378,7 +380,7 @@ def curiosity_map(
     binned = {actor: binned_errors(states[:, columns], errors, edges) for actor, (states, errors) in visits.items()}
 
     means = np.concatenate([mean[np.isfinite(mean)] for _, mean in binned.values()])
-    kinds = ["steps in bin"] + (["mean error"] if len(means) else [])
+    kinds = ["steps in the cell"] + (["mean SRL error in the cell"] if len(means) else [])
     most = max(2, max(counts.max() for counts, _ in binned.values()))
     norms: list[Normalize] = [LogNorm(1, most)]
     if len(means):
@@ -391,7 +393,8 @@ def curiosity_map(
             shown = np.ma.masked_where(counts == 0, values).T
             meshes.append(place.pcolormesh(*edges, shown, norm=norm, cmap=map_name))
             place.set_facecolor("0.92")
-            place.set_title(f"{actor} policy", color=COLORS[actor])
+            what = "where it goes" if values is counts else "error there"
+            place.set_title(f"{actor} policy: {what}", color=COLORS[actor])
             place.grid(False)
             _name_axes(place, coordinates, both, edges)
     for kind, column, mesh in zip(kinds, grid.T, meshes, strict=False):  # the meshes of the first row

@@ -139,22 +139,27 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
 
 
 def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
-    """Draw cells reached, return, SRL loss and SRL error of the policies over training.
+    """Draw cells reached, return and SRL error of the policies over training.
 
     :param experiment: An experiment
     :param colors: By arm
     :return: Figures of those that were recorded
     """
+    error = "error of the representation (SRL)\nof what the {} policy sees"
     for column, name, label, logarithmic in (
         ("cells", "cells_reached", "cells of the true state\nreached in training", False),
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
-        ("srl_loss", "srl_loss", "SRL loss", True),
-        ("task_srl_error", "task_srl_error", "SRL error\n(deterministic actions)", True),
-        ("curious_srl_error", "curious_srl_error", "SRL error\n(deterministic actions)", True),
+        ("task_srl_error", "task_srl_error", error.format("task"), True),
+        (
+            "curious_srl_error",
+            "curious_srl_error",
+            "error of the representation (SRL)\nof what the curious policy sees",
+            True,
+        ),
     ):
         if curves := _stacked(experiment, column):
             if "srl" in column:
-                curves = _one_head_each(experiment, curves)
+                curves = _one_unit_each(experiment, curves)
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
 
@@ -169,16 +174,21 @@ def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str
     return curves
 
 
-def _one_head_each(experiment: Experiment, curves: Mapping[str, Mapping[str, Curves]]) -> dict[str, dict[str, Curves]]:
-    """Panels of one SRL head each, as losses and errors of different heads have different units."""
+def _one_unit_each(experiment: Experiment, curves: Mapping[str, Mapping[str, Curves]]) -> dict[str, dict[str, Curves]]:
+    """Panels of errors of one unit each: those of different heads, and errors per pixel, differ in it."""
     panels: dict[str, dict[str, Curves]] = {}
     for task, arms in curves.items():
-        done = {method: next(iter(experiment.done(task, method).values())) for method in arms}
-        heads = {method: cell.config["arguments"].get("srl", "rae") for method, cell in done.items()}
-        for method, found in arms.items():
-            name = f"{task}, {heads[method]}" if len(set(heads.values())) > 1 else task
-            panels.setdefault(name, {})[method] = found
+        settings = {arm: next(iter(experiment.done(task, arm).values())).config["arguments"] for arm in arms}
+        units = {arm: _unit_of_errors(each) for arm, each in settings.items()}
+        for arm, found in arms.items():
+            name = f"{task}, {units[arm]}" if len(set(units.values())) > 1 else task
+            panels.setdefault(name, {})[arm] = found
     return panels
+
+
+def _unit_of_errors(arguments: Mapping[str, Any]) -> str:
+    per_pixel = arguments.get("intrinsic_kwargs", {}).get("per_pixel")
+    return f"{arguments.get('srl', 'rae')}{', per pixel' if per_pixel else ''}"
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
@@ -272,7 +282,7 @@ def _difference_parts(
         for row in differences
     ]
     caption = render_text("paired_difference", tables.compared_with(differences, experiment))
-    label = "difference in area under the curve (return)"
+    label = "mean return over training: difference from the baseline"
     yield _figure("paired_difference", caption, plots.paired_differences, lines, colors, label)
     yield tables.difference_table(experiment, differences)
     finals = statistics.paired_differences(experiment, "finals")

@@ -156,11 +156,13 @@ def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> Non
     assert rows_of(tmp_path / "table.md", "Learning curves")[1][2:] == ["0", NONE, NONE]
 
 
-def test_losses_of_different_heads_do_not_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A panel for each head, but one of returns."""
-    write_grid(tmp_path, seeds=1)
+def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A panel for each head, and for errors per pixel, but one of returns."""
+    others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
+    write_grid(tmp_path, seeds=1, methods={"sac_ae": {}, **dict.fromkeys(others, {})}, baseline="sac_ae")
     write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1, 2))
-    write_cell(tmp_path, TASK, "cure_sac_ae", 0, curve(0, 1, 2), arguments={**CURE, "srl": "curl"})
+    for arm, arguments in others.items():
+        write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2), arguments={**CURE, **arguments})
     drawn = {}
     monkeypatch.setattr(
         report.plots, "learning_curves", lambda file, curves, colors, label, *how: drawn.update({label: list(curves)})
@@ -168,7 +170,9 @@ def test_losses_of_different_heads_do_not_share_an_axis(tmp_path: Path, monkeypa
     monkeypatch.setattr(report.plots, "paired_differences", lambda *drawing: None)
     (experiment,) = report.read_results(tmp_path)
     report.describe(experiment, [100])
-    assert drawn["SRL loss"] == [f"{TASK}, rae", f"{TASK}, curl"]
+    assert drawn["error of the representation (SRL)\nof what the task policy sees"] == [
+        f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel")
+    ]
     assert drawn["episode return\n(deterministic actions)"] == [TASK]
 
 
