@@ -159,7 +159,7 @@ def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> Non
 def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A panel for each head, and for errors per pixel, but one of returns."""
     others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
-    write_grid(tmp_path, seeds=1, methods={"sac_ae": {}, **dict.fromkeys(others, {})}, baseline="sac_ae")
+    write_grid(tmp_path, seeds=1, methods={"sac_ae": {}, **{arm: {} for arm in others}}, baseline="sac_ae")
     write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1, 2))
     for arm, arguments in others.items():
         write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2), arguments={**CURE, **arguments})
