@@ -44,6 +44,13 @@ ADVICE = {
 }
 
 
+DENSE = (
+    "The reward is dense, or a cost of actions hides a sparse one, which returns cannot tell. If it is dense, leave "
+    "curiosity out (curiosity=None): it was not shown to learn faster, and its updates take longer."
+)
+MIN_EPISODES = 10
+
+
 def needed_packages() -> dict[str, list[str]]:
     """Names of the packages that sb3-cure needs.
 
@@ -103,16 +110,14 @@ def play_randomly(env: gym.Env, episodes: int = 60, seconds: float = 60) -> np.n
     return np.array(returns)
 
 
-def count_rewarded(returns: np.ndarray) -> int:
+def count_rewarded(returns: np.ndarray) -> int | None:
     """Count the episodes that met a reward: more than what random actions commonly get.
 
     :param returns: Return of each episode
-    :return: Episodes above the commonest return; all of them if no two are equal, as with a dense reward
+    :return: Episodes above the commonest return, or above 0 if that is positive; None if no two are equal
     """
-    if len(returns) == 0:
-        return 0
     ((common, times),) = Counter(returns.tolist()).most_common(1)
-    return int((returns > common).sum()) if times > 1 else len(returns)
+    return int((returns > min(common, 0)).sum()) if times > 1 else None
 
 
 def check_rewards(task: str) -> int:
@@ -127,11 +132,16 @@ def check_rewards(task: str) -> int:
     env = gym.make(task)
     returns = play_randomly(_without_images(env))
     env.close()
-    if len(returns) == 0:
-        raise UsageError(f"no episode of {task} ended within a minute: give it a time limit (max_episode_steps).")
-    met = count_rewarded(returns)
-    print(f"A reward was met in {met} of {len(returns)} episodes; returns {returns.min():.4g} to {returns.max():.4g}.")
-    print(next(advice for share, advice in ADVICE.items() if met <= share * len(returns)))
+    if len(returns) < MIN_EPISODES:
+        raise UsageError(
+            f"{len(returns)} episodes of {task} ended within a minute, too few to say: give it a lower time limit."
+        )
+    met, ends = count_rewarded(returns), f"returns {returns.min():.4g} to {returns.max():.4g}"
+    if met is None:
+        print(f"No two of {len(returns)} episodes have the same return; {ends}.\n{DENSE}")
+    else:
+        print(f"A reward was met in {met} of {len(returns)} episodes; {ends}.")
+        print(next(advice for share, advice in ADVICE.items() if met <= share * len(returns)))
     print("What is known of each case: docs/guide/mixing.md, 'Should I switch curiosity on?'")
     return 0
 

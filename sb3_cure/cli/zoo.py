@@ -122,6 +122,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"Stopped at step {model.num_timesteps:,} of {self.n_timesteps:,}: {path} keeps the model, and "
                 f"the same command with -i {path} begins a new training from its weights."
             )
+        elif isinstance(model, OffPolicyAlgorithm) and model._n_updates == 0:
+            print(f"Nothing was learned: no update is made before step learning_starts={model.learning_starts:,}.")
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
         for name in ("policy", "n_timesteps"):

@@ -193,7 +193,8 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
             given = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
             raise ValueError(
                 f"Frames must be uint8 [height, width, 3], but {self.env} with render_mode={self.env.render_mode!r} "
-                f"rendered {given}: make it with render_mode='rgb_array', and let its render() return such frames."
+                f"rendered {given}: make it with render_mode='rgb_array' (env_kwargs in YAML), and let its render() "
+                "return such frames."
             )
         return to_image(frame, self.image_size, self.grayscale)
 

@@ -189,7 +189,10 @@ def make_augmentation(
 
 def _image_space(space: spaces.Space, name: str) -> spaces.Space:
     if not is_image_space(space):
-        raise ValueError(f"augmentation={name!r} needs images, but observations are {space}: set augmentation=None.")
+        raise ValueError(
+            f"augmentation={name!r} needs images, but observations are {space}: make pixels of the environment with "
+            "make_pixel_env, or set augmentation=None."
+        )
     return space
 
 

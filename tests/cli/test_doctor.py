@@ -83,7 +83,9 @@ class Walk(gym.Env):
         (lambda place: -1.0 if place < 15 else 0.0, "in 0 of 60 episodes; returns -20 to -20.\nHardly"),
         (lambda place: float(place > 3), "Seldom"),
         (lambda place: float(place > 3) - float(place < -3), "Seldom"),  # falls are no rewards
-        (lambda place: float(place), "in 60 of 60 episodes"),
+        (lambda place: float(place), "No two of 60 episodes"),
+        (lambda place: float(place > 15) - 0.01 * float(place) ** 2, "a cost of actions hides"),
+        (lambda place: float(place > 0), "Often"),
     ],
 )
 def test_doctor_counts_the_random_episodes_that_meet_a_reward(
@@ -104,4 +106,4 @@ def test_doctor_needs_episodes_that_end(monkeypatch: pytest.MonkeyPatch, capsys:
         assert main(["doctor", "--env", "Walk-v0"]) == 2
     finally:
         del gym.registry["Walk-v0"]
-    assert "time limit" in capsys.readouterr().err
+    assert "0 episodes" in capsys.readouterr().err

@@ -361,11 +361,14 @@ def test_statistics_of_a_run_need_trust(folder: Path, played: list[Any]) -> None
     np.testing.assert_array_equal(statistics.obs_rms.mean, trained.obs_rms.mean)
 
 
-def test_environment_that_only_renders_is_wrapped_by_its_settings(folder: Path) -> None:
-    """As the guide's example does; what was trained so can be filmed."""
+def test_environment_that_only_renders_is_wrapped_by_its_settings(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the guide's example does; it can be filmed, though so few steps are told to have taught nothing."""
     guide = (Path(__file__).parents[2] / "docs" / "guide" / "environments.md").read_text()
     example = next(block for block in re.findall(r"```yaml\n(.*?)```", guide, re.S) if "env_wrapper" in block)
     train("--eval-freq", "-1", "-n", "14", task="Pendulum-v1", **yaml.safe_load(example)["default"])
+    assert "Nothing was learned: no update is made before step learning_starts=500." in capsys.readouterr().out
     assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
     (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
     assert video.stat().st_size > 1000
