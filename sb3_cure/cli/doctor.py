@@ -42,12 +42,12 @@ ADVICE = {
     0.5: "Seldom: try it with and without curiosity. It found rewards more often; returns were not shown to be higher.",
     1.0: "Often: leave curiosity out (curiosity=None). It was not shown to learn faster, and its updates take longer.",
 }
-
-
+#: What to do where no two returns are equal
 DENSE = (
     "The reward is dense, or a cost of actions hides a sparse one, which returns cannot tell. If it is dense, leave "
     "curiosity out (curiosity=None): it was not shown to learn faster, and its updates take longer."
 )
+#: Fewer random episodes say nothing
 MIN_EPISODES = 10
 
 
@@ -125,7 +125,7 @@ def check_rewards(task: str) -> int:
 
     :param task: Gymnasium id
     :return: Exit status 0
-    :raises UsageError: if no episode ended within a minute
+    :raises UsageError: if too few episodes end within a minute
     """
     check_environment(task)
     print(f"{task}: episodes of random actions, for at most a minute", flush=True)

@@ -150,12 +150,7 @@ def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator
         ("cells", "cells_reached", "cells of the true state\nreached in training", False),
         ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
         ("task_srl_error", "task_srl_error", error.format("task"), True),
-        (
-            "curious_srl_error",
-            "curious_srl_error",
-            "error of the representation (SRL)\nof what the curious policy sees",
-            True,
-        ),
+        ("curious_srl_error", "curious_srl_error", error.format("curious"), True),
     ):
         if curves := _stacked(experiment, column):
             if "srl" in column:
