@@ -55,7 +55,7 @@ def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3, size: i
         picture.paste(Image.fromarray(seen).resize((size, size), Image.Resampling.NEAREST), (size + 4, 0))
         pictures.append(picture)
     # Few colours, the same in all pictures: else the file is larger, and grounds flicker.
-    palette = pictures[len(pictures) // 2].quantize(64, dither=Image.Dither.NONE)
+    palette = pictures[len(pictures) // 2].quantize(40, dither=Image.Dither.NONE)
     first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     first.save(path, save_all=True, append_images=rest, duration=1000 // fps, loop=0)
 

@@ -62,7 +62,7 @@ SETTINGS: dict[str, Any] = dict(
 TOTAL_STEPS = 22_000
 EVALUATIONS, ROWS = 8, 4
 #: Episodes of each policy in the end, and the share of the time that is kept for them and for the pictures
-EPISODES, MEASURING = 10, 0.1
+EPISODES, MEASURING = 10, 0.12
 #: A mean return below this many times the random policy's is warned of
 EXPECTED_RATIO = 3
 
