@@ -18,6 +18,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from updates_for_tests import filled_model
 
 from sb3_cure import CuReSAC
 from sb3_cure.cure.actor_critic import TrunkActor
@@ -217,6 +218,18 @@ def test_head_without_reader_does_not_run(kind: str, intrinsic: str, per_pixel: 
     else:
         model.train(2, batch_size=8)  # two updates in a phase of the head, then two in one of the agents
         assert modes == [True, True] + [False, False] * reads_error
+
+
+@pytest.mark.parametrize("per_pixel, runs", [(False, 1), (True, 0)])
+def test_frozen_head_runs_once_for_the_error_of_the_next_observation(per_pixel: bool, runs: int) -> None:
+    arguments: dict[str, Any] = dict(curiosity_target="next_observation", intrinsic_kwargs=dict(per_pixel=per_pixel))
+    model = filled_model(srl="rae", **arguments)
+    srl: Any = model.policy.srl
+    calls: list[Any] = []
+    srl.loss = lambda *given: (calls.append(given), type(srl).loss(srl, *given))[1]
+    model.policy.representation_frozen = True
+    model.train(1, 8)
+    assert len(calls) == runs
 
 
 # ------------------------------------------------------------------ who acts
