@@ -146,6 +146,16 @@ def check_rewards(task: str) -> int:
     return 0
 
 
+def _without_images(env: gym.Env) -> gym.Env:
+    """Return the environment below the camera of a DMC task, whose images nobody looks at."""
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, DMCPixels):
+            return inner.env
+        inner = inner.env
+    return env
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure doctor``.
 
@@ -156,16 +166,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--env", metavar="ID", help="show how often random actions meet a reward in this environment")
     task = parser.parse_args(argv).env
     return check_machine() if task is None else check_rewards(task)
-
-
-def _without_images(env: gym.Env) -> gym.Env:
-    """Return the environment below the camera of a DMC task, whose images nobody looks at."""
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, DMCPixels):
-            return inner.env
-        inner = inner.env
-    return env
 
 
 def check_machine() -> int:

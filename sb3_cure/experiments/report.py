@@ -173,15 +173,15 @@ def _one_unit_each(experiment: Experiment, curves: Mapping[str, Mapping[str, Cur
     """Panels of errors of one unit each: those of different heads, and errors per pixel, differ in it."""
     panels: dict[str, dict[str, Curves]] = {}
     for task, arms in curves.items():
-        settings = {arm: next(iter(experiment.done(task, arm).values())).config["arguments"] for arm in arms}
-        units = {arm: _unit_of_errors(each) for arm, each in settings.items()}
+        units = {arm: _unit_of_errors(next(iter(experiment.done(task, arm).values()))) for arm in arms}
         for arm, found in arms.items():
             name = f"{task}, {units[arm]}" if len(set(units.values())) > 1 else task
             panels.setdefault(name, {})[arm] = found
     return panels
 
 
-def _unit_of_errors(arguments: Mapping[str, Any]) -> str:
+def _unit_of_errors(cell: CellResult) -> str:
+    arguments = cell.config["arguments"]
     per_pixel = arguments.get("intrinsic_kwargs", {}).get("per_pixel")
     return f"{arguments.get('srl', 'rae')}{', per pixel' if per_pixel else ''}"
 

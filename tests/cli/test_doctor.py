@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_cure.cli import doctor
 from sb3_cure.cli.main import main
@@ -89,21 +90,17 @@ class Walk(gym.Env):
     ],
 )
 def test_doctor_counts_the_random_episodes_that_meet_a_reward(
-    reward_of: Any, advice: str, capsys: pytest.CaptureFixture[str]
+    reward_of: Any, advice: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    gym.register("Walk-v0", Walk, kwargs=dict(reward_of=reward_of))
-    try:
-        assert main(["doctor", "--env", "Walk-v0"]) == 0
-    finally:
-        del gym.registry["Walk-v0"]
+    spec = EnvSpec("Walk-v0", entry_point=Walk, kwargs=dict(reward_of=reward_of))
+    monkeypatch.setitem(gym.registry, "Walk-v0", spec)
+    assert main(["doctor", "--env", "Walk-v0"]) == 0
     assert advice in capsys.readouterr().out
 
 
 def test_doctor_needs_episodes_that_end(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    gym.register("Walk-v0", Walk, kwargs=dict(reward_of=float, length=np.inf))
+    spec = EnvSpec("Walk-v0", entry_point=Walk, kwargs=dict(reward_of=float, length=np.inf))
+    monkeypatch.setitem(gym.registry, "Walk-v0", spec)
     monkeypatch.setattr(doctor.play_randomly, "__defaults__", (60, 0.05))
-    try:
-        assert main(["doctor", "--env", "Walk-v0"]) == 2
-    finally:
-        del gym.registry["Walk-v0"]
+    assert main(["doctor", "--env", "Walk-v0"]) == 2
     assert "0 episodes" in capsys.readouterr().err
