@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 import yaml
 from packaging.version import Version
+from stable_baselines3.common.envs import FakeImageEnv
 
-from sb3_cure import __version__
+from sb3_cure import CuReSAC, __version__, recipe
 from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
 
 ROOT = Path(__file__).parent.parent
@@ -85,6 +86,19 @@ def test_files_are_found_by_name_or_path(tmp_path: Path) -> None:
         zoo_file("fast/sac")
     with pytest.raises(ValueError, match=r"; did you mean .*curves_curl"):
         zoo_file("curve_curl", GRIDS)
+
+
+def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
+    own = tmp_path / "mine.yml"
+    entry = {"n_timesteps": 9, "policy": "CnnPolicy", "n_envs": 4, "env_kwargs": {"image_size": 48}, "srl": None}
+    own.write_text(yaml.safe_dump({"default": {**entry, "gamma": 0.9}, "dmc_pixels": {**entry, "gamma": 0.8}}))
+    assert recipe(own) == {"srl": None, "gamma": 0.9}
+    assert recipe(own, "dmc_pixels/walker-walk-v0") == {"srl": None, "gamma": 0.8}
+    env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
+    model = CuReSAC("CnnPolicy", env, buffer_size=10, **recipe("fast/drq_single_view"))
+    assert (model.srl, model.curiosity, model.gamma) == (None, None, 0.98)
+    with pytest.raises(ValueError, match=r"did you mean fast/curl"):
+        recipe("fast/crul")
 
 
 def test_changelog_and_citation_name_the_version() -> None:

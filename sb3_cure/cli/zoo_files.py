@@ -1,6 +1,7 @@
 """Algorithms and YAML files of the package by name, such as ``fast/cure_sac_ae``."""
 
 import importlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +49,26 @@ def packaged_files(folder: Path = ZOO) -> dict[str, Path]:
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
 
 
-def read_yaml(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[str, Any]:
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads 1e-6 as a number, as YAML 1.2 does; YAML 1.1 reads it as text."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
     """Read the mapping that a YAML file holds.
 
     :param path: The file
-    :param loader: How scalars are read
     :return: The mapping
     :raises UsageError: with the nearest names of files if there is none, or if it holds something else
     """
     if not path.exists():
         raise UsageError(missing_file(path, [*packaged_files(GRIDS), *packaged_files()]))
     try:
-        content = yaml.load(path.read_text(), loader)
+        content = yaml.load(path.read_text(), _Loader)
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise UsageError(
             f"{path} cannot be read ({one_sentence(error)}): "
@@ -68,6 +77,40 @@ def read_yaml(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> di
     if not isinstance(content, dict):
         raise UsageError(f"{path} holds {content!r:.60}, but it must be a mapping (key: value).")
     return content
+
+
+def zoo_entry(path: Path, task: str) -> dict[str, Any]:
+    """Read the settings that a zoo file has for a task: of its id, of its namespace, or those of ``default``.
+
+    :param path: The file
+    :param task: Gymnasium id, or ``my_module:My-v0``
+    :return: The entry
+    :raises UsageError: if there is none
+    """
+    entries, own = read_yaml(path), task.rpartition(":")[2]
+    for key in (task, own, own.rpartition("/")[0], "default"):
+        if isinstance(entries.get(key), dict):
+            return entries[key]
+    raise UsageError(f"{path} has neither a mapping {task!r} nor 'default'.")
+
+
+#: Settings of a zoo file that are not arguments of the model
+_NOT_OF_MODEL = ("n_timesteps", "policy", "n_envs", "env_kwargs", "env_wrapper")
+
+
+def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
+    """Read the arguments of a model from a zoo file: ``CuReSAC("CnnPolicy", env, **recipe("fast/best"))``.
+
+    Left out is what the file says of the environment (``env_kwargs``, ``env_wrapper``, ``n_envs``), and so are
+    ``policy`` and ``n_timesteps``.
+
+    :param name: A file of the package, such as ``"fast/best"``, or the path of your own with suffix
+    :param task: Gymnasium id whose entry is read; by default that for any environment
+    :return: Keyword arguments of ``CuReSAC`` or ``CuReTQC``
+    :raises UsageError: if there is no such file or entry
+    """
+    entry = zoo_entry(zoo_file(name), task)
+    return {key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}
 
 
 def check_environment(task: str) -> None:

@@ -13,11 +13,10 @@ from typing import Annotated, Any, Literal
 import gymnasium as gym
 import pydantic
 import torch as th
-import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
 from sb3_cure.cli.usage import UsageError, nearest, one_sentence
-from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, read_yaml, zoo_file
+from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, read_yaml, zoo_entry, zoo_file
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.counting import CellInfo, TaskReward
@@ -356,8 +355,8 @@ def load_grid(
     :return: The grid
     :raises UsageError: with one sentence about what is wrong
     """
-    path = _find(path, GRIDS)
-    content = read_yaml(path, _Loader)
+    path = zoo_file(path, GRIDS)
+    content = read_yaml(path)
     file = _validated(path, content)
     if budget is not None and budget != file.budget:
         _scale(file, budget, path)
@@ -379,13 +378,6 @@ def load_grid(
     # Without None: `grid.json` of earlier versions lacks newer keys, and is compared
     description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump(exclude_none=True)}
     return Grid(file.experiment, file.kind, cells, arms, description)
-
-
-def _find(name: str | Path, folder: Path) -> Path:
-    try:
-        return zoo_file(name, folder)
-    except UsageError as error:
-        raise UsageError(str(error)) from None
 
 
 def _validated(path: Path, content: Any) -> GridFile:
@@ -428,12 +420,7 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
     :raises UsageError: if there is no such zoo file or entry
     """
     method = file.methods[name]
-    config = path.parent / _find(method.config, ZOO)
-    entries, own = read_yaml(config, _Loader), task.rpartition(":")[2]
-    found = [key for key in (task, own, own.rpartition("/")[0], "default") if isinstance(entries.get(key), dict)]
-    if not found:
-        raise UsageError(f"{config} has neither a mapping {task!r} nor 'default', but a method of {path} needs one.")
-    entry = {"policy": "CnnPolicy", **entries[found[0]]}
+    entry = {"policy": "CnnPolicy", **zoo_entry(path.parent / zoo_file(method.config, ZOO), task)}
     for key, value in method.overrides.items():
         entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
@@ -472,15 +459,6 @@ def _check_pixels(arms: Sequence[Cell], path: Path) -> None:
                 f"methods in {path} differ in env_kwargs on {cell.task}, but common heads judge all alike: give them "
                 "the same, or write a grid for each."
             )
-
-
-class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-6 as a number, as YAML 1.2 does; YAML 1.1 reads it as text."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
 
 
 def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> set[str]:
