@@ -91,8 +91,10 @@ class Particle(IntrinsicReward):
             features = self.encoder(scaled(inputs.batch.next_observations, self.observation_space))
         # Rows are counted from the first one that was ever added: positions come again after a round of the buffer.
         oldest, newest = buffer.n_added - buffer.size(), buffer.n_added - 1
-        known = np.flatnonzero(self.places[:, 0] >= oldest)
-        rows, env_inds = (buffer.pos - 1 - newest + self.places[known, 0]) % buffer.buffer_size, self.places[known, 1]
+        numbers, env_inds = self.places.T
+        # A model that was loaded without its buffer remembers rows of the former one.
+        known = np.flatnonzero((numbers >= oldest) & (numbers <= newest) & (env_inds < buffer.n_envs))
+        rows, env_inds = (buffer.pos - 1 - newest + numbers[known]) % buffer.buffer_size, env_inds[known]
         episodes = self._number_episodes(buffer)
         own, others = episodes[*buffer.last_sampled], episodes[rows, env_inds]
         is_candidate = own[:, None] != np.concatenate([own, others])

@@ -41,7 +41,7 @@ every_reward = pytest.mark.parametrize("arm", ARMS)
 def inputs_of(model: CuReSAC, batch: Any, latents: th.Tensor, next_latents: th.Tensor) -> RewardInputs:
     """What a reward reads, with given latents."""
     read = {"observations": latents, "next_observations": next_latents}
-    of_model = model._reward_inputs(batch, None, {})
+    of_model = model._reward_inputs(batch, None)
     return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, of_model.look_up, of_model.encode)  # type: ignore[arg-type]
 
 
@@ -382,6 +382,17 @@ def test_particle_forgets_rows_whose_frames_were_lost() -> None:
         buffer.add(*stacks, np.zeros((1, 2)), np.zeros(1), np.ones(1), [{}])
         model.train(1, 8)
     assert buffer.size() < 20 and len(found) == 12 and found[-1].min() > 0
+
+
+@pytest.mark.parametrize("space", ["random", "latents"])
+def test_particle_forgets_a_buffer_that_was_not_loaded(space: str, tmp_path: Path) -> None:
+    """Rows and environments of the former buffer are no neighbours: there is but one episode so far."""
+    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(space=space, memory=20), srl=None, task=False)
+    tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * 2), **kwargs).learn(24).save(tmp_path / "model")
+    model = CuReSAC.load(tmp_path / "model", PixelBox(episode_length=50))
+    found = captured(model)
+    model.learn(4, reset_num_timesteps=False)
+    assert len(found) == 4 and not th.stack(found).any()
 
 
 def test_particle_of_a_single_episode_earns_nothing() -> None:
