@@ -133,7 +133,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self._breaks = True
 
     def add(self, obs: Any, next_obs: Any, action: ndarray, reward: ndarray, done: ndarray, infos: Infos) -> None:
-        """Store copies of one transition per environment: all of it or, with any exception, nothing.
+        """Store copies of one transition per environment: all of it or, with any exception, nothing of it.
 
         :param obs: Observations, [n_envs, *shape], or such by key
         :param next_obs: Successors of the same shape; of an episode's last step the terminal observation
@@ -184,24 +184,16 @@ class FrameStackReplayBuffer(ReplayBuffer):
     def _commit(self, row: dict[str, Any], counts: dict[str, int]) -> None:
         """Write a row in place of the oldest one, then change position, size and counts at once."""
         pos, full = (self.pos + 1) % self.buffer_size, self.full or self.pos + 1 == self.buffer_size
-        n_valid = min(self._n_valid + 1, self.buffer_size)
-        replaced = {name: self.rows[name][self.pos].copy() for name in row}
-        written = self.pos
-        try:
-            for name, value in row.items():
-                self.rows[name][written] = value
-            for key, ring in self.rings.items():
-                slots = self.rows[f"slots/{key}"]
-                while n_valid > 1 and ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
-                    n_valid -= 1
-            vars(self).update(
-                pos=pos, full=full, counts=counts, n_added=self.n_added + 1, _n_valid=n_valid, _breaks=False
-            )
-        except BaseException:  # KeyboardInterrupt, too
-            if self.counts is not counts:
-                for name, value in replaced.items():
-                    self.rows[name][written] = value
-            raise
+        # An exception from here on, such as KeyboardInterrupt, loses no more than the row that is replaced.
+        self._n_valid = min(self._n_valid, self.buffer_size - 1)
+        for name, value in row.items():
+            self.rows[name][self.pos] = value
+        n_valid = self._n_valid + 1
+        for key, ring in self.rings.items():
+            slots = self.rows[f"slots/{key}"]
+            while n_valid > 1 and ring.is_lost(slots[(pos - n_valid) % self.buffer_size], counts[key]):
+                n_valid -= 1
+        vars(self).update(pos=pos, full=full, counts=counts, n_added=self.n_added + 1, _n_valid=n_valid, _breaks=False)
         if n_valid < 0.9 * (super().size() - 1):
             warnings.warn(
                 "Frames do not slide: fewer than 9 of 10 rows fit into the replay buffer, because "
