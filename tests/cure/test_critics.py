@@ -98,3 +98,8 @@ def test_quantile_critic_drops_the_largest(n_critics: int, dropped: int) -> None
     for kept, row in zip(critic.target_values(latents, actions), every, strict=True):
         assert kept.tolist() == sorted(row.tolist())[: (4 - dropped) * n_critics]
     th.testing.assert_close(critic.value(latents, actions), every.mean(dim=1, keepdim=True))
+
+
+def test_critic_without_quantiles_is_refused() -> None:
+    with pytest.raises(ValueError, match="leaves none of n_quantiles=2"):
+        QuantileCritic(3, 2, [8], nn.ReLU, 2, n_quantiles=2, top_quantiles_to_drop_per_net=3)
