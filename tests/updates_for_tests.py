@@ -1,6 +1,7 @@
 """Models with a filled buffer, one update of them, and that update written out from the papers."""
 
 import copy
+import functools
 from typing import Any
 
 import numpy as np
@@ -222,10 +223,9 @@ class StraightLine:
         """
         self.standardise_by(batch.views)
         obs = self.scaled(batch.views)
-        self.next_obs = next_obs = self.scaled(self.model.policy.augmentation(batch.next_observations))
-        with th.no_grad():
-            next_latents = self.encoder_target(next_obs)
-        shared, next_shared = self.encoder(obs), self.encoder(next_obs)
+        # Drawn where it is first read
+        self.next_obs = functools.cache(lambda: self.scaled(self.model.policy.augmentation(batch.next_observations)))
+        shared = self.encoder(obs)
         pulls: list[list[th.Tensor]] = []
 
         def learn(loss: th.Tensor, owner: nn.Module, *read: th.Tensor) -> None:
@@ -243,11 +243,13 @@ class StraightLine:
         found: dict[str, th.Tensor] = {}
         errors = th.zeros(len(obs))
         if self.head is not None:
-            read = (shared, next_shared) if self.head.needs_next_latents else (shared,)
+            read = (shared, self.encoder(self.next_obs())) if self.head.needs_next_latents else (shared,)
             loss, errors = self.srl(batch, *read)
             found["srl_loss"] = loss
             if self.model.curiosity_target == "next_observation":  # before the steps of head and encoder
-                _, errors = self.srl(batch._replace(observations=batch.next_observations), next_shared)
+                _, errors = self.srl(
+                    batch._replace(observations=batch.next_observations), self.encoder(self.next_obs())
+                )
             learn(loss, self.head, *read)
         if self.model.srl == "spr":
             self.follow(self.head.target_projection, self.head.projection, 0.05)
@@ -258,10 +260,10 @@ class StraightLine:
         rewards = batch.rewards[:, 0]
         if self.model.curiosity == "bonus":  # scaled, not centred
             rewards = rewards + self.model.curiosity_beta * errors / errors.square().mean().sqrt()
-        self.learn_agent("task", batch, rewards, self.model.gamma * (1 - ends), next_latents, learn, found)
+        self.learn_agent("task", batch, rewards, self.model.gamma * (1 - ends), learn, found)
         if self.model.curiosity == "separate":
             discounts = self.model.curiosity_gamma * (1 - curious_ends)
-            self.learn_agent("curious", batch, curious, discounts, next_latents, learn, found)
+            self.learn_agent("curious", batch, curious, discounts, learn, found)
         if not sequential:
             with th.no_grad():
                 for parameter, *steps in zip(self.encoder.parameters(), *pulls, strict=True):
@@ -277,17 +279,16 @@ class StraightLine:
         batch: Samples,
         rewards: th.Tensor,
         discounts: th.Tensor,
-        next_latents: th.Tensor,
         learn: Any,
         found: dict[str, th.Tensor],
     ) -> None:
         """Critic, actor and temperature, with the encoder as it is by now."""
         agent, prefix = self.agents[name], "" if name == "task" else "curious_"
-        obs, next_obs = self.scaled(batch.views), self.next_obs
+        obs, next_obs = self.scaled(batch.views), self.next_obs()
         alpha = agent.log_ent_coef.detach().exp()
         with th.no_grad():
             next_actions, next_log_prob = agent.actor.action_log_prob(self.encoder.trunk(next_obs))
-            next_values = self.values(agent.critic_target, next_latents, next_actions)
+            next_values = self.values(agent.critic_target, self.encoder_target(next_obs), next_actions)
             if self.quantiles:
                 kept = sum(v.shape[1] for v in next_values) - 2 * self.model.top_quantiles_to_drop_per_net
                 next_value = th.cat(next_values, dim=1).sort(dim=1).values[:, :kept]

@@ -76,26 +76,21 @@ class ActorCritic(nn.Module):
         self.ent_coef_tensor: th.Tensor | None = None
 
     def set_temperature(self, ent_coef: str | float, lr: float, device: th.device) -> None:
-        """Make a temperature, as SB3's SAC does.
+        """Make a temperature as SB3's SAC does; a learned one has the optimiser of SAC-AE (beta1 = 0.5).
 
         :param ent_coef: ``"auto"``, ``"auto_<initial value>"``, or a fixed number
         :param lr: Learning rate
         :param device: Device of the temperature
+        :raises ValueError: for an initial value of zero or below, whose logarithm would never change
         """
         if isinstance(ent_coef, str) and ent_coef.startswith("auto"):
             initial = float(ent_coef.split("_")[1]) if "_" in ent_coef else 1.0
-            self.adopt_temperature(th.full((1,), initial, device=device).log().requires_grad_(True), lr)
+            if initial <= 0:
+                raise ValueError(f"the temperature {ent_coef!r} must begin above 0.")
+            self.log_ent_coef = th.full((1,), initial, device=device).log().requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=lr, betas=(0.5, 0.999), fused=True)
         else:
             self.ent_coef_tensor = th.tensor(float(ent_coef), device=device)
-
-    def adopt_temperature(self, log_ent_coef: th.Tensor, lr: float) -> None:
-        """Take a learned temperature, with the optimiser of SAC-AE (beta1 = 0.5).
-
-        :param log_ent_coef: Logarithm of the temperature, [1]
-        :param lr: Learning rate
-        """
-        self.log_ent_coef = log_ent_coef
-        self.ent_coef_optimizer = th.optim.Adam([log_ent_coef], lr=lr, betas=(0.5, 0.999), fused=True)
 
     def temperature(self) -> th.Tensor:
         """Get the temperature alpha.

@@ -11,14 +11,19 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-from sb3_cure.intrinsic import IntrinsicReward
-from sb3_cure.srl import SRLHead
+from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.intrinsic.srl_error import SRLError
+from sb3_cure.srl import SRLHead, get_srl_class
 
 Rate = Annotated[float, Field(ge=0, le=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 # A schedule of the remaining progress
 Schedule = Callable[[float], float]
+
+#: Reward of ``intrinsic="auto"`` where the head's error does not tell novelty: of those that explored as far as the
+#: error of an autoencoder (docs/evidence.md) the cheapest
+AUTO_WITHOUT_NOVELTY = "rnd"
 
 
 class CuReArguments(BaseModel):
@@ -72,6 +77,24 @@ def check_arguments(model: Any) -> None:
             raise ValueError(sentence)
 
 
+def named_intrinsic(model: Any) -> str | type[IntrinsicReward]:
+    """Choose the intrinsic reward; of ``"auto"`` the head decides.
+
+    :param model: A CuRe model, its arguments set
+    :return: Name or class
+    """
+    if model.intrinsic != "auto":
+        return model.intrinsic  # type: ignore[no-any-return]
+    tells = model.srl is not None and get_srl_class(model.srl).error_tells_novelty
+    return "srl_error" if tells else AUTO_WITHOUT_NOVELTY
+
+
+def _judges_observation(model: Any) -> bool:
+    """Whether a transition's intrinsic reward depends on the observation that it begins with alone."""
+    is_error = issubclass(get_intrinsic_class(named_intrinsic(model)), SRLError) and model.srl is not None
+    return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
+
+
 def _conflicts(model: Any) -> list[tuple[bool, str]]:
     """Conditions that must not hold, each with what to do instead."""
     buffer: type = model.replay_buffer_class or FrameStackReplayBuffer
@@ -87,7 +110,7 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
             f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.",
         ),
         (
-            separate and model.curiosity_gamma == 0 and model.curiosity_target == "observation",
+            separate and model.curiosity_gamma == 0 and _judges_observation(model),
             "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
             "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0.",
         ),

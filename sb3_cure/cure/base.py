@@ -13,7 +13,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cure.arguments import check_arguments
+from sb3_cure.cure.actor_critic import ActorCritic
+from sb3_cure.cure.arguments import check_arguments, named_intrinsic
 from sb3_cure.cure.crash_report import FiniteGuard
 from sb3_cure.cure.critics import LatentCritic
 from sb3_cure.cure.mixers import CuriousMixer
@@ -22,15 +23,12 @@ from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.envs import check_observation_space
 from sb3_cure.envs.sharing import share_environment
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments, restarts_workers
 
 Self = TypeVar("Self", bound="CuReBase")
-
-#: Reward of ``intrinsic="auto"`` where the head's error does not tell novelty: of those that explored as far as the
-#: error of an autoencoder (docs/evidence.md) the cheapest
-AUTO_WITHOUT_NOVELTY = "rnd"
 
 
 class CuReBase(OffPolicyAlgorithm):
@@ -204,6 +202,8 @@ class CuReBase(OffPolicyAlgorithm):
         # Batches learned from, and those of them that trained actors and critics (`_n_updates` counts gradient steps)
         self._n_batches = self._n_rl_batches = 0
         self._warmed_up = self._in_burst = False
+        #: What the update that runs logs
+        self._metrics: dict[str, th.Tensor] = {}
         #: While ``learn`` runs with ``overlap=True``: the environments, which make updates as they step
         self._overlapped: OverlappedVecEnv | None = None
         self._action_repeat = 1
@@ -217,6 +217,7 @@ class CuReBase(OffPolicyAlgorithm):
         return self.curiosity == "separate"
 
     def _setup_model(self) -> None:
+        tune_allocator()
         check_arguments(self)
         check_observation_space(self.observation_space, self.policy_class)
         self._guard = FiniteGuard(deferred=self.device.type != "cpu")
@@ -224,6 +225,8 @@ class CuReBase(OffPolicyAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
             self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
+        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):  # else SB3's `learn` ends an episode in it
+            self.optimize_memory_usage = False
         user_kwargs, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self._policy_settings()}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`n_steps=")  # SB3 cannot know that our buffer has returns of n steps
@@ -257,28 +260,26 @@ class CuReBase(OffPolicyAlgorithm):
 
     def _intrinsic_class(self) -> type[IntrinsicReward]:
         """Class of the intrinsic reward; ``"auto"`` is resolved by the head."""
-        if self.intrinsic != "auto":
-            return get_intrinsic_class(self.intrinsic)
-        tells = self.srl is not None and get_srl_class(self.srl).error_tells_novelty
-        name = "srl_error" if tells else AUTO_WITHOUT_NOVELTY
-        if self.verbose >= 1:
-            print(f"The curious agent is rewarded by {name!r} (intrinsic='auto').")
-        return get_intrinsic_class(name)
+        named = named_intrinsic(self)
+        if self.intrinsic == "auto" and self.verbose >= 1:
+            print(f"The curious agent is rewarded by {named!r} (intrinsic='auto').")
+        return get_intrinsic_class(named)
 
     def _setup_temperatures(self) -> None:
-        """Let the task's agent adopt SB3's temperature, and give the curious one its own."""
-        if self.log_ent_coef is not None:
-            self.policy.task.adopt_temperature(self.log_ent_coef, self.lr_schedule(1) * self.ent_coef_lr_factor)
-            self.ent_coef_optimizer = self.policy.task.ent_coef_optimizer
-        else:
-            self.policy.task.ent_coef_tensor = self.ent_coef_tensor
+        """Give each agent a temperature; SB3's attributes are the task's."""
+        task = self.policy.task
+        self._set_temperature(task, self.ent_coef)
+        self.log_ent_coef, self.ent_coef_optimizer = task.log_ent_coef, task.ent_coef_optimizer
+        self.ent_coef_tensor = task.ent_coef_tensor  # type: ignore[assignment]
         self._setup_curious_temperature()
 
     def _setup_curious_temperature(self) -> None:
         if self.policy.curious is not None:
-            ent_coef = self.ent_coef if self.curiosity_ent_coef is None else self.curiosity_ent_coef
-            lr = self.lr_schedule(1) * self.ent_coef_lr_factor
-            self.policy.curious.set_temperature(ent_coef, lr, self.device)
+            given = self.curiosity_ent_coef
+            self._set_temperature(self.policy.curious, self.ent_coef if given is None else given)
+
+    def _set_temperature(self, agent: ActorCritic, ent_coef: str | float) -> None:
+        agent.set_temperature(ent_coef, self.lr_schedule(1) * self.ent_coef_lr_factor, self.device)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed all random streams, the mixer's included.
@@ -428,8 +429,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._before_save()
 
     def _excluded_save_params(self) -> list[str]:
-        made_anew = ["_guard", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]
-        return [*super()._excluded_save_params(), *made_anew]
+        made_anew = "_guard _metrics _mixer _overlapped _computed_precision ent_coef_tensor _initial_rng_state"
+        return [*super()._excluded_save_params(), *made_anew.split()]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

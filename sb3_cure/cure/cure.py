@@ -6,7 +6,7 @@ how several losses step the encoder that they share.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -112,6 +112,8 @@ class CuRe(CuReBase):
         if updates is None:
             updates = 0 if self.srl is None or self.learning_starts == 0 else get_srl_class(self.srl).warmup_updates
         self._in_burst = self.gradient_steps != 0
+        if self._in_burst and updates and self.verbose >= 1:
+            print(f"Making {updates} updates before the next step (warmup_updates).")
         try:
             if self._in_burst:
                 self._train(updates, self.batch_size)
@@ -157,7 +159,8 @@ class CuRe(CuReBase):
     @property
     def _alternates(self) -> bool:
         """Whether SRL and RL take turns, which takes one of each."""
-        return self.srl_schedule == "alternating" and self.srl is not None and (self.task or self._has_curious_agent)
+        takes_turns = self.srl_schedule == "alternating" and self.srl is not None
+        return takes_turns and not self.policy.representation_frozen and (self.task or self._has_curious_agent)
 
     def _phase(self) -> tuple[bool, bool]:
         """Whether the next update trains the representation, and whether it trains actors and critics."""
@@ -173,30 +176,39 @@ class CuRe(CuReBase):
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
         """UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1 on one batch."""
         policy, encoder = self.policy, self.policy.encoder_update
-        views = {"observations": batch.views, "next_observations": policy.augmentation(batch.next_observations)}
-        if batch.n_step is not None:
-            views["n_step"] = policy.augmentation(policy.sense(batch.n_step.next_observations))
-        encoder.begin(views, self._guard.check)
+        encoder.begin(self._views(batch), self._guard.check)
         if not policy.representation_frozen:
             for each in (policy.encoder, policy.encoder_target):
                 each.update_statistics(batch.views)
-
-        metrics: Metrics = {}
+        self._metrics = {}
         turns = self._turns() if learns_rl else {}
-        srl = self._srl_loss(batch, True, metrics) if learns_srl else None
+        srl = self._srl_loss(batch) if learns_srl else None
         reward = policy.intrinsic if "curious" in turns or (turns and self.curiosity == "bonus") else None
         curious_rewards = None
         if reward is not None and reward.needs_srl:  # the reward is of the head before its step
-            curious_rewards = self._curious_rewards(batch, srl, metrics)
+            curious_rewards = self._curious_rewards(batch, srl)
         if srl is not None:
             self._update_srl(srl.loss)
         if reward is not None and not reward.needs_srl:
-            curious_rewards = self._curious_rewards(batch, srl, metrics)
-        if learns_rl:
-            self._update_agents(batch, turns, curious_rewards, metrics)
+            curious_rewards = self._curious_rewards(batch, srl)
+        if "task" in turns:
+            self._update_task(batch, turns["task"], curious_rewards)
+        if "curious" in turns:
+            self._update_curious(batch, turns["curious"], curious_rewards)
         encoder.finish()
         self._update_targets(turns)
-        return {name: value.detach() for name, value in (metrics | encoder.metrics).items()}
+        return self._metrics | encoder.metrics
+
+    def _views(self, batch: Samples) -> dict[str, Callable[[], Any]]:
+        """Makers of all that the encoder may see in an update: random views and, for rewards, centred ones."""
+        policy, n_step = self.policy, batch.n_step
+        return {
+            "observations": lambda: batch.views,
+            "next_observations": lambda: policy.augmentation(batch.next_observations),
+            "n_step": lambda: policy.augmentation(policy.sense(n_step.next_observations)),  # type: ignore[union-attr]
+            "centred observations": lambda: policy.center(batch.observations),
+            "centred next_observations": lambda: policy.center(batch.next_observations),
+        }
 
     def _turns(self) -> dict[str, int]:
         """Agents that learn from this batch, and how many batches each of them has learned from."""
@@ -207,7 +219,7 @@ class CuRe(CuReBase):
             turns["curious"] = self._n_rl_batches // interval
         return turns
 
-    def _srl_loss(self, batch: Samples, learns: bool, metrics: Metrics) -> SRLOutput:
+    def _srl_loss(self, batch: Samples, learns: bool = True) -> SRLOutput:
         """Loss of the head, and the error of each sample, [B]."""
         srl: Any = self.policy.srl
         source = "srl" if learns else "measured"
@@ -221,14 +233,14 @@ class CuRe(CuReBase):
                 f"(requires_grad={error.requires_grad}), but it must be one number per sample, detached, in fp32."
             )
         variance = latents[0].detach().var(dim=0, correction=0).mean()
-        metrics |= {"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance}
+        self._note({"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance})
         return SRLOutput(loss.float(), error.float())
 
-    def _judged_error(self, batch: Samples, srl_output: SRLOutput | None, metrics: Metrics) -> th.Tensor:
+    def _judged_error(self, batch: Samples, srl_output: SRLOutput | None) -> th.Tensor:
         """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
         srl: Any = self.policy.srl
         if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
-            return (srl_output or self._srl_loss(batch, False, metrics)).error
+            return (srl_output or self._srl_loss(batch, learns=False)).error
         views = self.policy.augmentation(batch.next_observations)
         # With nothing else, so that no head takes (s', a, s') for a transition.
         alone = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
@@ -248,92 +260,80 @@ class CuRe(CuReBase):
             )
         srl.after_step()
 
-    def _curious_rewards(self, batch: Samples, srl: SRLOutput | None, metrics: Metrics) -> th.Tensor:
+    def _curious_rewards(self, batch: Samples, srl: SRLOutput | None) -> th.Tensor:
         """Scaled intrinsic reward of this batch, [B, 1], never stored, so never stale; and the step of its own loss."""
         reward: Any = self.policy.intrinsic
-        loss, raw = reward.loss(self._reward_inputs(batch, srl, metrics))
+        loss, raw = reward.loss(self._reward_inputs(batch, srl))
         raw = raw.detach().float()
         if loss is not None:
             self._learn("intrinsic", "intrinsic reward", loss.float(), reward.optimizer)
         scaled = self.policy.scale(raw, self.curiosity_beta, self.normalize_curiosity, self._has_curious_agent)
-        metrics |= {
-            "curious_reward_raw_mean": raw.mean(),
-            "curious_reward_raw_max": raw.max(),
-            "curious_reward_mean": scaled.mean(),
-            "curious_reward_max": scaled.max(),
-            "curious_reward_std": scaled.std(correction=0),
-        }
+        self._note(
+            {
+                "curious_reward_raw_mean": raw.mean(),
+                "curious_reward_raw_max": raw.max(),
+                "curious_reward_mean": scaled.mean(),
+                "curious_reward_max": scaled.max(),
+                "curious_reward_std": scaled.std(correction=0),
+            }
+        )
         return scaled
 
-    def _update_agents(
-        self, batch: Samples, turns: dict[str, int], curious_rewards: th.Tensor | None, metrics: Metrics
-    ) -> None:
-        """UpdateTaskAC and UpdateCuriousAC, each with its rewards and discounts."""
-        one_step = "next_observations"
-        several = one_step if batch.n_step is None else "n_step"
-        read = {"task": several, "curious": one_step}
-        with th.no_grad():
-            encoder_target, inputs = self.policy.encoder_target, self.policy.encoder_update.views
-            next_latents = {view: encoder_target(inputs[view]) for view in dict.fromkeys(read[name] for name in turns)}
-        if "task" in turns:
-            n_step = batch.n_step or batch
-            bonus = curious_rewards if self.curiosity == "bonus" else None
-            rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
-            discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
-            latents = next_latents[several]
-            self._update_actor_critic("task", turns["task"], batch, rewards, discounts, several, latents, metrics)
-        if "curious" in turns:
-            assert curious_rewards is not None
-            continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
-            discounts, latents = continues * self.curiosity_gamma, next_latents[one_step]
-            turn, rewards = turns["curious"], curious_rewards
-            self._update_actor_critic("curious", turn, batch, rewards, discounts, one_step, latents, metrics)
+    def _update_task(self, batch: Samples, turn: int, bonus: th.Tensor | None) -> None:
+        """UpdateTaskAC, with returns of one step or of several."""
+        n_step = batch.n_step or batch
+        rewards = n_step.rewards if self.curiosity != "bonus" else n_step.rewards + bonus  # type: ignore[operator]
+        discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
+        next_view = "next_observations" if batch.n_step is None else "n_step"
+        self._update_actor_critic("task", turn, batch.actions, rewards, discounts, next_view)
+
+    def _update_curious(self, batch: Samples, turn: int, rewards: Any) -> None:
+        """UpdateCuriousAC: episodes do not end, unless ``curiosity_episodic`` says so."""
+        continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
+        discounts = continues * self.curiosity_gamma
+        self._update_actor_critic("curious", turn, batch.actions, rewards, discounts, "next_observations")
 
     def _update_actor_critic(
         self,
         name: str,
         turn: int,
-        batch: Samples,
+        actions: th.Tensor,
         rewards: th.Tensor,
         discounts: th.Tensor,
         next_view: str,
-        next_latents: th.Tensor,
-        metrics: Metrics,
     ) -> None:
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
 
         :param name: ``"task"`` or ``"curious"``
         :param turn: Number of batches that this agent has learned from before
-        :param batch: Samples of the replay buffer
+        :param actions: The batch's, in [-1, 1], [B, action_dim]
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return continues, else 0, [B, 1]
         :param next_view: Name of the views that the return bootstraps from
-        :param next_latents: Latents of these by the target encoder, [B, features_dim]
-        :param metrics: Takes what is logged
         """
         agent, encoder, prefix = self.policy.agents[name], self.policy.encoder_update, PREFIXES[name]
         with th.no_grad():
             next_actions, next_log_prob = agent.actor.action_log_prob(encoder.features(next_view))
-            next_values = agent.critic_target.target_values(next_latents, next_actions)
+            next_values = agent.critic_target.target_values(encoder.target_latents(next_view), next_actions)
             target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
-        critic_loss = agent.critic.loss(encoder.latents(name), batch.actions, target)
+        critic_loss = agent.critic.loss(encoder.latents(name), actions, target)
         self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
-        metrics |= {f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()}
+        self._note({f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()})
         if self._in_burst or turn % self.actor_update_interval == 0:
-            self._update_actor(name, agent, metrics)
+            self._update_actor(name, agent)
 
-    def _update_actor(self, name: str, agent: ActorCritic, metrics: Metrics) -> None:
+    def _update_actor(self, name: str, agent: ActorCritic) -> None:
         """Policy improvement and the temperature's step; neither trains the encoder."""
         encoder, temperature, prefix = self.policy.encoder_update, agent.temperature(), PREFIXES[name]
         latents = encoder.latents("actor")
         actions, log_prob = agent.actor.action_log_prob(encoder.features())
         actor_loss = (temperature * log_prob - agent.critic.value(latents, actions)).mean()
         self._optimize(f"{name} actor", actor_loss, agent.actor.optimizer)
-        metrics |= {f"{prefix}actor_loss": actor_loss, f"{prefix}ent_coef": temperature.squeeze()}
+        self._note({f"{prefix}actor_loss": actor_loss, f"{prefix}ent_coef": temperature.squeeze()})
         if agent.log_ent_coef is not None:
             ent_coef_loss = -(agent.log_ent_coef * (log_prob + float(self.target_entropy)).detach()).mean()
             self._optimize(f"{name} temperature", ent_coef_loss, agent.ent_coef_optimizer)
-            metrics[f"{prefix}ent_coef_loss"] = ent_coef_loss
+            self._note({f"{prefix}ent_coef_loss": ent_coef_loss})
 
     def _update_targets(self, turns: dict[str, int]) -> None:
         """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
@@ -343,6 +343,10 @@ class CuRe(CuReBase):
         for name, turn in turns.items():
             if turn % interval == 0:
                 _polyak_step(policy.agents[name].critic, policy.agents[name].critic_target, self.tau)
+
+    def _note(self, metrics: Metrics) -> None:
+        """Keep what this update logs."""
+        self._metrics |= {name: value.detach() for name, value in metrics.items()}
 
     def _learn(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:
         """Step the loss's own parameters, and give the encoder its gradient at the latents."""
@@ -363,18 +367,16 @@ class CuRe(CuReBase):
         if optimizer is not None:
             optimizer.step()
 
-    def _reward_inputs(self, batch: Samples, srl: SRLOutput | None, metrics: Metrics) -> RewardInputs:
+    def _reward_inputs(self, batch: Samples, srl: SRLOutput | None) -> RewardInputs:
         """What an intrinsic reward may read of this batch, of the encoder and of the replay buffer."""
         policy, encoder = self.policy, self.policy.encoder_update
-        # Without augmentation the centred views are those that everyone else sees.
-        prefix = "" if type(policy.augmentation) is Augmentation else "centred "
+        # Without augmentation the centred views are those that everyone else sees, whose losses need the graph.
+        shared = type(policy.augmentation) is Augmentation
         trains = "intrinsic" in encoder.mean_squares
 
         def read(name: str) -> th.Tensor:
-            if prefix and prefix + name not in encoder.views:
-                encoder.views[prefix + name] = policy.center(getattr(batch, name))
-            with th.set_grad_enabled(trains or not prefix):
-                return encoder.latents("intrinsic", prefix + name)
+            with th.set_grad_enabled(shared or trains):
+                return encoder.latents("intrinsic", name if shared else f"centred {name}")
 
         @th.no_grad()
         def encode(observations: Any) -> th.Tensor:
@@ -384,7 +386,7 @@ class CuRe(CuReBase):
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]
             return policy.samples(sampled, random=False)
 
-        judge = partial(self._judged_error, batch, srl, metrics) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
+        judge = partial(self._judged_error, batch, srl) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
         return RewardInputs(batch, judge, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
 
 

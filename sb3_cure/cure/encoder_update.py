@@ -4,7 +4,7 @@ The SRL loss and the critics' losses all send gradients to the encoder, whose si
 plain sum under one Adam would let the critics drown the autoencoder: Adam divides by the running size of the sum.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -31,9 +31,10 @@ class EncoderUpdate:
     number of sources: Adam divides by the size of the sum, which for uncorrelated gradients of equal size is that root
     times the size of each.
 
-    The encoder runs when something reads it, and again only after it has been stepped.
+    Views are made, and the encoder runs, when something reads them; again only after it has been stepped.
 
     :param encoder: The shared encoder; it may have no parameters
+    :param target: Its moving average
     :param sources: Names of the losses that train it, e.g. ``("srl", "task", "curious")``
     :param mode: ``"sequential"`` or ``"joint"``
     :param optimizer_class: Class of the optimisers
@@ -47,13 +48,14 @@ class EncoderUpdate:
     def __init__(
         self,
         encoder: Encoder,
+        target: Encoder,
         sources: Sequence[str],
         mode: str,
         optimizer_class: type[th.optim.Optimizer],
         lr: float,
         **optimizer_kwargs: Any,
     ):
-        self.encoder, self.mode, self.learning_rate = encoder, mode, lr
+        self.encoder, self.target, self.mode, self.learning_rate = encoder, target, mode, lr
         self._parameters = list(encoder.parameters())
         self._make_optimizer = partial(optimizer_class, self._parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
@@ -63,7 +65,7 @@ class EncoderUpdate:
             self.add_source(source)
         self.metrics: dict[str, th.Tensor] = {}
         self._n_updates = 0
-        self._forget()
+        self._reset({})
 
     def add_source(self, source: str) -> None:
         """Let a further loss train the encoder.
@@ -86,17 +88,22 @@ class EncoderUpdate:
 
     # ------------------------------------------------------------ one update
 
-    def begin(self, views: dict[str, Any], check: Check) -> None:
+    def begin(self, views: Mapping[str, Callable[[], Any]], check: Check) -> None:
         """Begin an update.
 
-        :param views: Inputs of the encoder by name, of which ``"observations"`` is one, [B, *view shape] each
+        :param views: Makers of the encoder's inputs by name, of which ``"observations"`` is one, [B, *view shape] each
         :param check: Looks at gradients before each step
         """
-        self._forget()
-        self.views, self._check = views, check
+        self._reset(views)
+        self._check = check
         self._n_updates += 1
         # What was measured at the parameters is logged until it is measured again.
         self.metrics = {name: value for name, value in self.metrics.items() if not name.startswith("latent_")}
+
+    def _view(self, name: str) -> Any:
+        if name not in self._views:
+            self._views[name] = self._makers[name]()
+        return self._views[name]
 
     def features(self, name: str = "observations") -> Any:
         """Features of the trunk without their graph, which actors read.
@@ -106,7 +113,7 @@ class EncoderUpdate:
         """
         if name not in self._features:
             with th.no_grad():
-                self._features[name] = self.encoder.trunk(self.views[name])
+                self._features[name] = self.encoder.trunk(self._view(name))
         return self._features[name]
 
     def latents(self, source: str, name: str = "observations") -> th.Tensor:
@@ -117,12 +124,23 @@ class EncoderUpdate:
         :return: fp32, [B, features_dim]
         """
         if name not in self._latents:
-            features = self.encoder.trunk(self.views[name])
+            features = self.encoder.trunk(self._view(name))
             self._features[name], self._latents[name] = detached(features), self.encoder.projection(features).float()
         leaf = self._latents[name].detach()
         leaf.requires_grad_(source in self.mean_squares and self._latents[name].requires_grad)
         self._leaves.setdefault(source, {})[name] = leaf
         return leaf
+
+    @th.no_grad()
+    def target_latents(self, name: str) -> th.Tensor:
+        """Latents by the target encoder, from which returns bootstrap.
+
+        :param name: Name of the views
+        :return: [B, features_dim]
+        """
+        if name not in self._target_latents:
+            self._target_latents[name] = self.target(self._view(name))
+        return self._target_latents[name]
 
     def leaves(self, source: str) -> list[th.Tensor]:
         """Latents that a loss has read and that carry its gradient.
@@ -152,9 +170,14 @@ class EncoderUpdate:
             gradients = {name: gradient / size for name, gradient in gradients.items()}
         self._gradients[source] = gradients
         if self.mode == "sequential":
-            self.finish()
+            self._step()
 
     def finish(self) -> None:
+        """End the update: joint: step along the gradients that were collected; and drop what was computed."""
+        self._step()
+        self._reset({})
+
+    def _step(self) -> None:
         """Step along the gradients that were collected since the last step, if there are any, and drop all graphs."""
         if self._gradients:
             joint = self.mode == "joint"
@@ -192,11 +215,18 @@ class EncoderUpdate:
             self.metrics |= {f"encoder_grad_norm_{source}": norm, f"encoder_share_{source}": norm / total}
 
     def _forget(self) -> None:
-        """Drop what the encoder has computed: graphs would fill memory, and forbid copies of the model."""
+        """Drop what depends on the encoder's parameters."""
         self._features: dict[str, Any] = {}
         self._latents: dict[str, th.Tensor] = {}
         self._leaves: dict[str, dict[str, th.Tensor]] = {}
         self._gradients: dict[str, dict[str, th.Tensor]] = {}
+
+    def _reset(self, makers: Mapping[str, Callable[[], Any]]) -> None:
+        """Take the views of another update; between updates none, as graphs would forbid copies of the model."""
+        self._makers = makers
+        self._views: dict[str, Any] = {}
+        self._target_latents: dict[str, th.Tensor] = {}
+        self._forget()
 
     # ---------------------------------------------------------------- saving
 

@@ -19,7 +19,7 @@ RECONSTRUCTION_INTERVAL = 1000
 
 
 def means(updates: list[Metrics]) -> dict[str, float]:
-    """Average metrics over updates; the only place where a GPU is waited for.
+    """Average metrics over updates: one transfer from a GPU for all of them.
 
     :param updates: Metrics of each update
     :return: Means by name, over the updates that have the name

@@ -146,7 +146,13 @@ class CuRePolicy(BasePolicy):
         sources = {"srl": self.srl is not None, "task": task} | self._curious_sources()
         names = [name for name in ("srl", "intrinsic", "task", "curious") if sources.get(name)]
         self.encoder_update = EncoderUpdate(
-            self.encoder, names, update, optimizer_class, lr=self.learning_rate, **self.optimizer_kwargs
+            self.encoder,
+            self.encoder_target,
+            names,
+            update,
+            optimizer_class,
+            lr=self.learning_rate,
+            **self.optimizer_kwargs,
         )
 
     # -------------------------------------------------------------- building

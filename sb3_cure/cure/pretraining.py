@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import MaybeCallback
@@ -19,6 +20,9 @@ from sb3_cure.data.datasets import episodes_of, fill
 from sb3_cure.persistence.archive import archived_networks
 
 Self = TypeVar("Self", bound="Pretraining")
+
+#: How far training is
+_COUNTERS = ("num_timesteps", "_n_updates", "_n_batches", "_n_rl_batches", "_warmed_up", "_last_obs", "_is_pretrained")
 
 
 class Pretraining(CuRe):
@@ -38,16 +42,15 @@ class Pretraining(CuRe):
         #: Whether ``pretrain`` calls ``learn``; never of an archive
         self._pretrains = False
         before, self._before_pretraining = self._before_pretraining, None
-        if before is None:
-            super()._setup_model()
-            if self.representation_frozen:
-                self.policy.freeze_representation()
-            return
-        # Of an archive that was saved while pretraining: first the networks of before, then what pretraining added.
         collector = "curious" if self._has_curious_agent else "random"
-        self.task, self.curiosity = before["task"], before["curiosity"]
+        if before is not None:  # of an archive that was saved while pretraining: first the networks of before
+            self.task, self.curiosity = before["task"], before["curiosity"]
         super()._setup_model()
-        self._begin_pretraining(collector)
+        self._initial_rng_state = th.get_rng_state()
+        if self.representation_frozen:
+            self.policy.freeze_representation()
+        if before is not None:
+            self._begin_pretraining(collector)
 
     def load_transitions(self, source: str | Path | Iterable[Any]) -> int:
         """Fill the replay buffer from episodes on disk, see ``sb3_cure.datasets``.
@@ -69,7 +72,7 @@ class Pretraining(CuRe):
     def fit_representation(self: Self, updates: int, log_interval: int = 1000) -> Self:
         """Train the representation alone, on what the replay buffer holds: ``pretrain`` without collecting.
 
-        Keeps what ``pretrain`` keeps, and the replay buffer as well.
+        Keeps what ``pretrain`` keeps, and the replay buffer as well; of a model that was trained before, all of it.
 
         :param updates: Updates of encoder and head
         :param log_interval: Updates between two dumps of the logger
@@ -81,6 +84,7 @@ class Pretraining(CuRe):
             raise ValueError("fit_representation has no transitions to learn from: call load_transitions before it.")
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "fit_representation")
+        counters = {name: getattr(self, name) for name in _COUNTERS}
         self._begin_pretraining("random")
         try:
             for done in range(0, updates, log_interval):
@@ -89,6 +93,8 @@ class Pretraining(CuRe):
                 self.logger.dump(self._n_updates)
         finally:
             self._end_pretraining(keep_transitions=True)
+            if counters["num_timesteps"] > 0:  # training goes on where it was
+                vars(self).update(counters)
         return self
 
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
@@ -231,9 +237,7 @@ class Pretraining(CuRe):
         self._is_pretrained = False
         if self.seed is not None:
             self.set_random_seed(self.seed)
-            # Draw the initial weights once more, for the random numbers that they take.
-            arguments = {**self.policy_kwargs, **self._policy_settings()}
-            self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **arguments)
+            th.set_rng_state(self._initial_rng_state)
 
 
 def _empty(buffer: ReplayBuffer) -> None:

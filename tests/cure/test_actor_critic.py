@@ -35,7 +35,7 @@ def model_of(algorithm: Any = ALGORITHMS["sac"], **kwargs: Any) -> Any:
 def test_each_agent_has_a_temperature_of_its_own(
     algorithm: Any, ent_coef: Any, curious: Any, expected: tuple[float, float]
 ) -> None:
-    """Of its own kind and value, learned or fixed; the task's is the very object that SB3 made."""
+    """Of its own kind and value, learned or fixed; SB3's attributes are the task's."""
     model = model_of(algorithm, ent_coef=ent_coef, curiosity_ent_coef=curious)
     task, second = model.policy.task, model.policy.curious
     assert tuple(float(agent.temperature()) for agent in (task, second)) == pytest.approx(expected)

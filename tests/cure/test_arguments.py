@@ -73,6 +73,7 @@ def test_bad_values_are_named() -> None:
         (dict(replay_buffer_class=NStepReplayBuffer), "leave replay_buffer_class out, and set n_steps"),
         (dict(optimize_memory_usage=True, replay_buffer_class=ReplayBuffer), "optimize_memory_usage=True"),
         (dict(use_sde=True), "use_sde=True"),
+        (dict(curiosity_ent_coef="auto_0"), "'auto_0' must begin above 0"),
         (dict(policy_kwargs=dict(share_features_extractor=True)), "share_features_extractor"),
         (dict(srl="curl", augmentation=None), "augmentation is None"),
         (dict(augmentation="crop", augmentation_kwargs=dict(size=84)), "cannot cut 84 x 84 pixels out of images of 36"),
@@ -81,6 +82,14 @@ def test_bad_values_are_named() -> None:
 def test_combination_that_learns_something_else_is_refused(arguments: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         tiny_model("CnnPolicy", PixelBox(), **arguments)
+
+
+@pytest.mark.parametrize(
+    "reward", [dict(intrinsic="rnd"), dict(srl="curl"), dict(srl="forward", intrinsic="srl_error")]
+)
+def test_rewards_of_the_next_observation_need_no_future(reward: dict[str, Any]) -> None:
+    """Unlike the error of the observation itself."""
+    tiny_model("CnnPolicy", PixelBox(), curiosity_gamma=0, **reward)
 
 
 @pytest.mark.parametrize("policy, env", [(CnnPolicy, PixelBox), (MultiInputPolicy, Goal)])

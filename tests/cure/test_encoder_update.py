@@ -39,7 +39,8 @@ class Tiny(nn.Module):
 
 def make(mode: str, sources: tuple[str, ...] = SOURCES, encoder: Any = None, **kwargs: Any) -> tuple[Any, Any]:
     encoder = Tiny() if encoder is None else encoder
-    return encoder, EncoderUpdate(encoder, sources, mode, **{"optimizer_class": th.optim.Adam, "lr": LR, **kwargs})
+    arguments = {"optimizer_class": th.optim.Adam, "lr": LR, **kwargs}
+    return encoder, EncoderUpdate(encoder, copy.deepcopy(encoder), sources, mode, **arguments)
 
 
 def views(step: int) -> dict[str, th.Tensor]:
@@ -48,8 +49,12 @@ def views(step: int) -> dict[str, th.Tensor]:
     return {name: th.randn(5, 4, generator=generator) for name in names}
 
 
+def makers(step: int) -> dict[str, Callable[[], th.Tensor]]:
+    return {name: lambda view=view: view for name, view in views(step).items()}  # type: ignore[misc]
+
+
 def begin(update: EncoderUpdate, step: int) -> None:
-    update.begin(views(step), lambda name, gradients: None)
+    update.begin(makers(step), lambda name, gradients: None)
 
 
 def learn(update: EncoderUpdate, source: str, scale: float = 1.0) -> None:
@@ -214,7 +219,7 @@ def test_gradients_are_checked_before_the_step(mode: str) -> None:
         seen.append((name, [gradient.shape for gradient in gradients]))
         raise ArithmeticError
 
-    update.begin(views(0), check)
+    update.begin(makers(0), check)
     with pytest.raises(ArithmeticError):
         learn(update, "task")
         update.finish()

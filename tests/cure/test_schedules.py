@@ -65,6 +65,13 @@ def test_head_alone_makes_single_updates() -> None:
     assert steps(model) == {name: PERIOD if name == "srl" else 0 for name in steps(model)}
 
 
+def test_frozen_representation_takes_no_turns() -> None:
+    model = model_with_transitions(srl_schedule="alternating")
+    model.policy.freeze_representation()
+    model.train(PERIOD, batch_size=8)
+    assert steps(model)["task critic"] == model._n_batches == PERIOD
+
+
 def test_one_call_of_n_steps_equals_n_calls() -> None:
     models = [model_with_transitions(srl_schedule="alternating") for _ in range(2)]
     for model, calls in zip(models, ([7], [1] * 7), strict=True):

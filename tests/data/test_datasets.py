@@ -250,6 +250,16 @@ def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_pa
     assert model._n_updates == 4 and model.replay_buffer.size() == 74
 
 
+def test_training_goes_on_after_fitting() -> None:
+    """Neither a random warm-up nor a burst again, and its counters as they were."""
+    model = tiny_model("CnnPolicy", PixelBox(), warmup_updates=3).learn(14)
+    done = model.num_timesteps, model._n_updates, model._n_batches
+    model.fit_representation(5)
+    assert (model.num_timesteps, model._n_updates, model._n_batches) == done == (14, 7, 7)
+    model.learn(2, reset_num_timesteps=False)
+    assert (model.num_timesteps, model._n_updates) == (16, 9)
+
+
 def _changed(first: Any, second: Any) -> list[str]:
     return [name for name in first if differences(first[name], second[name])]
 
