@@ -21,7 +21,6 @@ import torch as th
 from stable_baselines3.common.logger import configure
 
 from benchmarks.harness import describe_machine
-from sb3_cure.allocator import tune_allocator
 from sb3_cure.evaluation.result_files import code_commit, write_json
 from sb3_cure.experiments.grid import Cell, load_grid, short_name
 
@@ -106,7 +105,6 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=60, help="rounds (default: 60)")
     options = parser.parse_args()
     th.set_num_threads(1)
-    tune_allocator()
     grid = load_grid(options.grid, tasks=options.task)
     report = json.loads(options.out.read_text()) if options.out.exists() else {"tasks": {}, "conditions": {}}
     for task in dict.fromkeys(cell.task for cell in grid.cells):

@@ -28,9 +28,7 @@ PAGES = [
     *(p for p in DOCS.rglob("*.md") if not {"_build", "notebooks", "results"} & set(p.relative_to(DOCS).parts)),
 ]
 #: Modules whose public names users write in their own code; what is not in them is internal
-PUBLIC = (
-    "allocator buffers callbacks datasets deployment envs evaluation intrinsic metrics persistence srl vec_env".split()
-)
+PUBLIC = "buffers callbacks datasets deployment envs evaluation intrinsic metrics persistence srl vec_env".split()
 
 
 def blocks(page: str | Path) -> list[str]:

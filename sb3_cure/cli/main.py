@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 from sb3_cure import __version__
 from sb3_cure.cli.usage import UsageError, install_command, nearest
-from sb3_cure.networks.allocator import tune_allocator
 
 
 class Command(NamedTuple):
@@ -71,7 +70,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         install = install_command(command.extra)
         print(f"sb3-cure {name} needs {error.name}, which is not installed: {install}.", file=sys.stderr)
         return 2
-    tune_allocator()
     if "" not in sys.path:
         sys.path.append("")  # the user may name classes and environments of the working directory
     try:

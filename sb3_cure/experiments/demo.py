@@ -24,7 +24,6 @@ from sb3_cure.evaluation.callbacks import ReconstructionCallback
 from sb3_cure.evaluation.result_files import describe_run, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, run_episodes
 from sb3_cure.evaluation.video import write_gif, write_video
-from sb3_cure.networks.allocator import tune_allocator
 
 DOMAIN, TASK = "cartpole", "swingup"
 # The camera that follows the cart: the usual one is far away, and the cart drives out of its view.
@@ -120,7 +119,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"--minutes is {options.minutes} and --steps {options.steps}, but both must be positive")
     out: Path = options.out
     out.mkdir(parents=True, exist_ok=True)
-    tune_allocator()
 
     env = make_dmc_env(DOMAIN, TASK, seed=options.seed, **ENV_KWARGS)
     eval_env = make_dmc_env(DOMAIN, TASK, render_mode="rgb_array", **ENV_KWARGS)

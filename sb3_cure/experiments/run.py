@@ -18,7 +18,6 @@ from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import Grid, check_arms, load_grid, read_kept
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
-from sb3_cure.networks.allocator import tune_allocator
 
 ENGINES = ("local", "ray")
 #: Folder of results, minutes between checkpoints, whether to draw
@@ -119,7 +118,6 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
 
     :return: Whether it succeeded
     """
-    tune_allocator()
     try:
         if isinstance(unit, CommonHeads):
             run_heads(unit, results)

@@ -1,6 +1,7 @@
 """Settings of the C library's allocator for large blocks, such as batches of images and activations."""
 
 import ctypes
+import os
 import sys
 
 # Parameters of mallopt (glibc's malloc.h), and the largest threshold that it accepts.
@@ -12,12 +13,14 @@ def tune_allocator() -> bool:
     """Keep freed blocks of up to 32 MiB in the process instead of returning each to the system.
 
     By default glibc maps every large block anew and unmaps it when it is freed, so that each batch of images and each
-    layer's activations cost page faults. Call it once, before training; ``MALLOC_MMAP_THRESHOLD_=33554432
-    MALLOC_TRIM_THRESHOLD_=2147483647`` in the environment does the same. The process's memory then stays at its peak.
+    layer's activations cost page faults, a sixth of the time of small updates. The process's memory then stays at its
+    peak. Each model calls it; whoever sets ``MALLOC_MMAP_THRESHOLD_`` or ``MALLOC_TRIM_THRESHOLD_`` in the environment
+    has chosen otherwise.
 
     :return: Whether it worked; it does nothing where the C library is not glibc
     """
-    if not sys.platform.startswith("linux"):
+    chosen = {"MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"} & os.environ.keys()
+    if chosen or not sys.platform.startswith("linux"):
         return False
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,4 +1,4 @@
-"""The allocator keeps large blocks when it is told to."""
+"""The allocator keeps large blocks once there is a model."""
 
 import subprocess
 import sys
@@ -8,8 +8,11 @@ import pytest
 COUNT_FAULTS = """
 import resource
 import torch as th
-from sb3_cure.networks.allocator import tune_allocator
-assert tune_allocator()
+from stable_baselines3.common.envs import FakeImageEnv
+from sb3_cure import CuReSAC
+small = dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=2))
+env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
+CuReSAC("CnnPolicy", env, buffer_size=10, policy_kwargs=small)
 def round():
     [th.ones(4_000_000) for _ in range(12)]
 for _ in range(10):
