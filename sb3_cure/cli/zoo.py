@@ -351,7 +351,7 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--env", required=True, help="Gymnasium's id of the environment, or my_module:My-v0")
     parser.add_argument("--algo", default=DEFAULT_ALGORITHM, choices=ALGORITHMS, help="Default: %(default)s")
     parser.add_argument("-f", "--folder", default="logs", help="Where it was trained into (default: %(default)s)")
-    parser.add_argument("--exp-id", type=int, default=0, help="Number of the run (default: the latest)")
+    parser.add_argument("--exp-id", type=int, default=0, help="Number of the run (default: the latest with a model)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="The model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", help="The checkpoint of this number of agent steps")
@@ -387,7 +387,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     name = EnvironmentName(task)
     flags = args.load_best, args.load_checkpoint, args.load_last_checkpoint
     try:
-        _, found, _ = get_model_path(args.exp_id, args.folder, args.algo, name, *flags)
+        _, found, _ = get_model_path(args.exp_id or _latest_run(args, name), args.folder, args.algo, name, *flags)
     except (AssertionError, ValueError) as error:
         runs = {path.parent.name.rpartition("_")[0] for path in Path(args.folder, args.algo).glob("*/*.zip")}
         trained = f"; trained there: {', '.join(sorted(runs))}" if runs else ""
@@ -416,6 +416,13 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
         )
         model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
     return model, model.get_env(), path
+
+
+def _latest_run(args: argparse.Namespace, name: str) -> int:
+    """Number of the latest run that holds a model, as a training that fails leaves a folder, too; 0 if none does."""
+    models = Path(args.folder, args.algo).glob(f"{name}_*/*.zip")
+    numbers = [path.parent.name.removeprefix(f"{name}_") for path in models]
+    return max((int(number) for number in numbers if number.isdecimal()), default=0)
 
 
 def _read_settings(path: Path) -> dict[str, Any]:

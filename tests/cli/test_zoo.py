@@ -299,6 +299,7 @@ def test_model_is_the_one_that_flags_name(
     for file in files:
         (runs / file).parent.mkdir(parents=True, exist_ok=True)
         (runs / f"{file}.zip").touch()
+    (runs / f"{RUN}_15" / RUN).mkdir(parents=True)  # as a training leaves it that fails before its first step
 
     def load(path: Path, *args: Any, **kwargs: Any) -> None:
         raise Found(str(path))
