@@ -28,15 +28,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 from sb3_cure.cli.progress import TimeLeft, time_text
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
-from sb3_cure.cli.zoo_files import (
-    ALGORITHMS,
-    check_environment,
-    find_class,
-    import_module,
-    packaged_files,
-    read_yaml,
-    zoo_file,
-)
+from sb3_cure.cli.zoo_files import ALGORITHMS, check_environment, find_class, import_module, read_yaml, zoo_file
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
@@ -87,8 +79,6 @@ class ExperimentManager(exp_manager.ExperimentManager):
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
         self.config = str(zoo_file(self.config))
-        if not Path(self.config).is_file():
-            raise UsageError(missing_file(Path(self.config), packaged_files()))
         env_name = self.env_name
         if self.config.endswith((".yml", ".yaml")):
             # rl-zoo3 looks for the environment's own id, then for "default".
