@@ -1,6 +1,7 @@
 """Lines about a training's progress, for a terminal or a log file."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
@@ -17,15 +18,16 @@ def time_text(seconds: float) -> str:
 
 
 class TimeLeft(BaseCallback):
-    """Print once a minute how far training is and how long the rest takes at the speed of that minute.
+    """Print once a minute how far training is, its speed in that minute, and how long the rest takes at that speed.
 
     :param name: What is trained, at the beginning of each line
     :param seconds: Seconds between two lines
+    :param best_return: Returns the best return so far, or None before there is one
     """
 
-    def __init__(self, name: str, seconds: float = 60):
+    def __init__(self, name: str, seconds: float = 60, best_return: Callable[[], float | None] = lambda: None):
         super().__init__()
-        self.label, self.seconds = name, seconds
+        self.label, self.seconds, self.best_return = name, seconds, best_return
         self._last_time, self._last_step = 0.0, 0
 
     def state_dict(self) -> dict[str, Any]:
@@ -48,7 +50,10 @@ class TimeLeft(BaseCallback):
         now = time.monotonic()
         if now - self._last_time >= self.seconds:
             steps, total = self.num_timesteps, self.model._total_timesteps
-            left = (total - steps) * (now - self._last_time) / (steps - self._last_step)
-            print(f"{self.label}: step {steps:,} of {total:,}, about {time_text(left)} left", flush=True)
+            speed = (steps - self._last_step) / (now - self._last_time)
+            line = f"{self.label}: step {steps:,} of {total:,}, {speed:,.1f} steps/s"
+            line += f", about {time_text((total - steps) / speed)} left"
+            best = self.best_return()
+            print(line if best is None else f"{line}, best return {best:.4g}", flush=True)
             self._last_time, self._last_step = now, steps
         return True

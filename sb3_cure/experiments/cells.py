@@ -121,10 +121,12 @@ class _CellRun:
     def _train(self) -> None:
         """Make the same calls in every attempt: a resumed model does what is left of them."""
         cell, record = self.cell, self.record
-        callbacks: list[BaseCallback] = [record, self.checkpoints, TimeLeft(str(cell.folder))]
         if cell.pretrain is not None and self.pretrains:
             steps = record.agent_steps(cell.pretrain.budget)
-            self.model.pretrain(steps, cell.pretrain.collector, callback=[*callbacks])
+            clock = TimeLeft(f"{cell.folder} (pretraining)")
+            self.model.pretrain(steps, cell.pretrain.collector, callback=[record, self.checkpoints, clock])
+        clock = TimeLeft(str(cell.folder), best_return=record.best_return)
+        callbacks: list[BaseCallback] = [record, self.checkpoints, clock]
         record.evaluates = True
         if cell.budget > 0:
             if cell.coverage is not None:
@@ -144,7 +146,7 @@ class _CellRun:
             try:
                 draw_cell(self.model, cell, self.folder)
             except Exception as error:  # the results are complete without them
-                print(f"{self.folder} lacks some of its pictures: {type(error).__name__}: {error}")
+                print(f"{cell.folder} lacks some of its pictures: {type(error).__name__}: {error}")
         record.write_tables()
         write_json(self.folder / "run.json", record.conditions(self.model))
         write_text(self.folder / DONE, "")
@@ -169,7 +171,7 @@ class _TimedCheckpoint(ExactCheckpoint):
     """
 
     def __init__(self, path: Path, minutes: float):
-        super().__init__(save_freq=1, path=path, keep=2, verbose=1)
+        super().__init__(save_freq=1, path=path, keep=2)
         self.seconds = 60 * minutes
         self._due_at = np.inf
 
@@ -274,6 +276,10 @@ class _Record(BaseCallback):
                 self.rewards_met_late += sum(episode[-(-len(episode) // 10) :])
                 episode.clear()
 
+    def best_return(self) -> float | None:
+        """Best mean return of the task policy in an evaluation; None before the first."""
+        return max((row["return_mean"] for row in self.evaluations if row["return_mean"] != ""), default=None)
+
     @property
     def has_reached_return(self) -> bool:
         """Whether the cell ends early: its last two evaluations have reached ``stop_at_return``."""
@@ -326,7 +332,6 @@ class _Record(BaseCallback):
         row.update(seconds=round(self.seconds, 1), cpu_seconds=self.cpu_seconds)
         row.update({name: round(getattr(self, name), 3) for name in _REWARDS_MET})
         self.write_tables()
-        print(f"{self.folder}: {row['environment_steps']:,} of {self.cell.budget:,} environment steps", flush=True)
 
     def _measure(self, actor: str, row: Row) -> None:
         """Evaluate one policy, and write its returns and SRL error into a row of ``eval.csv``."""

@@ -9,12 +9,12 @@ from sb3_cure.cli.progress import TimeLeft, time_text
 def test_time_left_is_printed_at_the_speed_of_late(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ten steps took no time; each of the others takes half a minute, at which speed the rest counts."""
+    """Ten steps took no time; each of the others takes a quarter of a minute, at which speed the rest counts."""
     model = tiny_model("MlpPolicy", VectorBox(), srl=None, curiosity=None)
-    monkeypatch.setattr("time.monotonic", lambda: 30.0 * max(model.num_timesteps - 10, 0))
-    model.learn(20, callback=TimeLeft("mine"))
+    monkeypatch.setattr("time.monotonic", lambda: 15.0 * max(model.num_timesteps - 10, 0))
+    model.learn(20, callback=TimeLeft("mine", seconds=30))
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1] == "mine: step 14 of 20, about 3 min left" and len(lines) == 5
+    assert lines[1] == "mine: step 14 of 20, 0.1 steps/s, about 2 min left" and len(lines) == 5
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(5, "1 min"), (3599, "1 h 00 min"), (12_000, "3 h 20 min")])

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import random
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -200,6 +201,23 @@ def test_infinite_returns_end_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(PixelBox, "step", step_or_nan)
     with pytest.raises(ValueError, match=r"gave an evaluation the returns \[nan, nan\]: correct its rewards"):
         run_cell(only_cell(tmp_path), tmp_path, pictures=False)
+
+
+def test_progress_names_the_cell_and_its_best_return(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line a time, without the folder of results; pretraining has no returns yet."""
+    monkeypatch.setattr(cells, "TimeLeft", partial(cells.TimeLeft, seconds=1e-9))
+    arm = {**method(), "pretrain": {"collector": "random", "budget": 40}}
+    cell = only_cell(tmp_path, methods={"cure": arm}, budget=80, evaluation=dict(every=40, episodes=1))
+    folder = run_cell(cell, tmp_path, pictures=False)
+    lines = capsys.readouterr().out.splitlines()
+    returns = [row["return_mean"] for row in read_rows(folder / "eval.csv")]
+    assert len(lines) == 10 + 20
+    assert all(line.startswith(f"{cell.folder} (pretraining): step") and "return" not in line for line in lines[:10])
+    assert all(line.startswith(f"{cell.folder}: step") for line in lines[10:])
+    assert lines[10].endswith(f"best return {returns[0]:.4g}")
+    assert lines[-1].endswith(f"best return {max(returns[:2]):.4g}")
 
 
 # --------------------------------------------------------------------- pairing
