@@ -1,9 +1,10 @@
 """Figures in one style. Each function takes numbers and writes one PNG of 256 colours."""
 
 import io
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 import torch as th
@@ -13,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 from sb3_cure.cure.reconstructions import newest_frames
@@ -22,13 +23,24 @@ from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 
 #: Matplotlib style file of all figures: ``plt.style.use(STYLE)``
 STYLE = Path(__file__).with_name("plots.mplstyle")
-#: Colour of each policy
-COLORS = {"random": "#888888", "task": "#1f77b4", "curious": "#d62728"}
-_ARM_COLORS = ["#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
+#: Colour of each policy, and of arms that several experiments share
+COLORS = {
+    "random": "#888888",
+    **dict.fromkeys(("task", "sac_ae"), "#1f77b4"),
+    **dict.fromkeys(("curious", "cure", "cure_sac_ae", "srl_error"), "#d62728"),
+    **{"curl": "#2ca02c", "drq": "#ff7f0e", "per_pixel": "#9467bd", "oracle": "#8c564b"},
+}
+_BASELINE_COLOR = "#222222"
+#: Colours of other arms
+_ARM_COLORS = ["#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
+#: By colour, so that policies differ in print, too
+_LOOKS = {COLORS["random"]: {"marker": "s", "linestyle": "--"}, COLORS["curious"]: {"marker": "^"}}
 
 #: Arm, actor, ends of the error bar or None, values whose mean is shown (one per seed), and text above
 Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
+#: By title of a panel: values to compare with, one or several, by name
+Lines: TypeAlias = Mapping[str, Mapping[str, np.ndarray | float]]
 PathOrFile: TypeAlias = Path | IO[bytes]
 
 
@@ -56,18 +68,28 @@ def _plain(text: str) -> str:
     return ("\u200b" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
+def _look(color: str) -> dict[str, Any]:
+    """Colour, marker and dashes of a line."""
+    return {"color": color, "marker": "o", **_LOOKS.get(color, {})}
+
+
 # Curves
 
 
 def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
-    """Choose a colour for each arm.
+    """Choose a colour for each arm: its own of ``COLORS``, or one that no other arm has.
 
     :param methods: Arms of an experiment
-    :param baseline: The one that the others are compared with: grey
-    :return: Colours by arm; after thirteen of them they repeat
+    :param baseline: The one that the others are compared with: black, unless it has a colour of its own
+    :return: Colours by arm; after eleven of the others they repeat
     """
-    names = [method for method in methods if method != baseline]
-    return {baseline: "#555555", **{name: _ARM_COLORS[index % 13] for index, name in enumerate(names)}}
+    chosen = {baseline: _BASELINE_COLOR}
+    for arm in (baseline, *methods):
+        if arm in COLORS and COLORS[arm] not in chosen.values():
+            chosen[arm] = COLORS[arm]
+    free = [color for color in _ARM_COLORS if color not in chosen.values()]
+    others = [arm for arm in methods if arm not in chosen]
+    return chosen | {arm: free[index % len(free)] for index, arm in enumerate(others)}
 
 
 def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
@@ -101,25 +123,28 @@ def learning_curves(
     :param ylabel: What the values are
     :param logarithmic: Whether the values have a logarithmic axis
     """
-    figure, panels = _panels(len(curves), height=2.9)
+    figure, panels = _panels(len(curves), height=2.9, ylabel=ylabel)
     seeds: dict[str, set[int]] = {}
     for axes, (task, lines) in zip(panels, curves.items(), strict=True):
         for arm, (steps, values) in lines.items():
             seeds.setdefault(arm, set()).add(len(values))
             mean = values.mean(axis=0)
-            axes.plot(steps, mean, ".-", color=colors[arm])
+            axes.plot(steps, mean, **_look(colors[arm]))
             if len(values) > 1:
                 std = values.std(axis=0, ddof=1)
                 low = np.maximum(mean - std, mean / 10) if logarithmic else mean - std
-                axes.fill_between(steps, low, mean + std, color=colors[arm], alpha=0.18, linewidth=0)
-        axes.set(title=_plain(task), xlabel="environment steps", ylabel=ylabel)
-        axes.set_yscale("log" if logarithmic else "linear")
+                where = mean > 0 if logarithmic else None
+                axes.fill_between(steps, low, mean + std, where, color=colors[arm], alpha=0.18, linewidth=0)
+        axes.set(title=_plain(task), xlabel="environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if logarithmic:
+            _use_logarithms(axes)
     handles = {}
     for arm, counts in seeds.items():
         n = " to ".join(map(str, sorted({min(counts), max(counts)})))
-        handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], color=colors[arm])
-    _legend(figure, handles)
+        handles[f"{_plain(arm)} ({n} seed{'' if n == '1' else 's'})"] = Line2D([], [], **_look(colors[arm]))
+    several = any(max(counts) > 1 for counts in seeds.values())
+    _legend(figure, handles, "lines: means over seeds; bands: one standard deviation on each side" if several else "")
     save(figure, path)
 
 
@@ -137,36 +162,38 @@ def paired_differences(
     :param colors: By arm
     :param xlabel: What the differences are of
     """
-    figure = Figure(figsize=(8.5, 1.3 + 0.34 * len(rows)))
+    figure = Figure(figsize=(8.5, 1.5 + 0.34 * len(rows)))
     axes = figure.subplots()
     axes.axvline(0, color="#333333", linewidth=1)
     for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
-        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5, markersize=3.5)
+        axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5)
         if low is not None and high is not None:
             axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
         axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
     axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
-    marks = "dots: pairs of seeds; diamond and line: their mean with its 95 % interval"
-    axes.set(xlabel=f"{xlabel}\n({marks})", ylim=(len(rows) - 0.5, -0.5))
+    axes.set(xlabel=_plain(xlabel), ylim=(len(rows) - 0.5, -0.5))
     # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
     reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
     axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
+    marks = {
+        "a pair of seeds": Line2D([], [], color="#555555", marker="o", linestyle=""),
+        "their mean with its 95 % interval": Line2D([], [], color="#555555", marker="D", markersize=6.5, linewidth=2.5),
+    }
+    _legend(figure, marks)
     save(figure, path)
 
 
 # Bars
 
 
-def visitation_bars(
-    path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Mapping[str, Mapping[str, float]]
-) -> None:
+def visitation_bars(path: PathOrFile, panels: Mapping[str, Sequence[Bar]], lines: Lines) -> None:
     """SRL error per step met by each policy: mean, with minimum and maximum as error bars (paper, Figure 2).
 
     :param path: File to write
     :param panels: By title: its bars
     :param lines: By title: values to compare with, by name
     """
-    actor_bars(path, panels, "SRL error per step (mean, min, max)", lines)
+    actor_bars(path, panels, "SRL error per step\n(\N{MULTIPLICATION SIGN}: times the random policy's)", lines, True)
 
 
 @in_style
@@ -174,53 +201,62 @@ def actor_bars(
     path: PathOrFile,
     panels: Mapping[str, Sequence[Bar]],
     ylabel: str,
-    lines: Mapping[str, Mapping[str, float]] | None = None,
+    lines: Lines | None = None,
+    logarithmic: bool = False,
 ) -> None:
     """Policies in groups of arms, coloured by actor.
 
-    Bars show means. With lines to compare with, the axis is logarithmic, without a zero for bars to begin at: marks
-    show the means.
+    Bars show means; on a logarithmic axis, without a zero for bars to begin at, marks do.
 
     :param path: File to write
     :param panels: By title: its bars
     :param ylabel: What is measured
-    :param lines: By title: values to compare with, by name; None: no lines, and a linear axis
+    :param lines: By title: values to compare with, by name; their mean is a line across, their range a band
+    :param logarithmic: Whether the axis is logarithmic
     """
-    figure, places = _panels(len(panels), height=3.3)
+    figure, places = _panels(len(panels), height=3.3, ylabel=ylabel)
     for axes, (title, rows) in zip(places, panels.items(), strict=True):
-        arms = list(dict.fromkeys(arm for arm, *_ in rows))
-        ticks, position = [], 0.0
-        for arm in arms:
+        ticks, position = {}, 0.0
+        for arm in dict.fromkeys(arm for arm, *_ in rows):
             group = [row for row in rows if row[0] == arm]
-            ticks.append(position + (len(group) - 1) / 2)
-            for _, actor, ends, values, text in group:
-                color, mean = COLORS.get(actor, "#2ca02c"), float(values.mean())
-                low, high = ends or (mean, float(values.max()))
-                if lines is None:
-                    axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=_plain(actor))
-                else:
-                    axes.plot([position, position], [low, high], color=color, linewidth=1.2)
-                    axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=_plain(actor))
-                axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
-                note = axes.annotate(text, (position, high), (0, 3), textcoords="offset points", fontsize=7)
-                note.set(ha="center", va="bottom")
+            ticks[_plain(arm)] = position + (len(group) - 1) / 2
+            for bar in group:
+                _draw_bar(axes, position, bar, logarithmic)
                 position += 1
             position += 0.7
-        axes.set_xticks(ticks, [_plain(arm) for arm in arms], rotation=15 if len(arms) > 3 else 0)
-        axes.set(title=_plain(title), ylabel=ylabel, xlim=(-0.7, position - 1))
-        for (label, value), dashes in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
-            axes.axhline(value, color="#333333", linewidth=1, linestyle=dashes, label=_plain(label))
+        axes.set_xticks(list(ticks.values()), list(ticks), rotation=15 if len(ticks) > 3 else 0)
+        axes.set(title=_plain(title), xlim=(-0.7, position - 1))
+        for (label, compared), dashes in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
+            color, known = COLORS.get(label, _BASELINE_COLOR), np.atleast_1d(compared)
+            name = f"{label} policy" if label in COLORS else _plain(label)
+            axes.axhline(known.mean(), color=color, linewidth=1.2, linestyle=dashes, label=name)
+            axes.axhspan(known.min(), known.max(), color=color, alpha=0.15, linewidth=0)
         means = [float(values.mean()) for *_, values, _ in rows]
-        if lines is not None and max(means) > 0:
-            axes.set_yscale("log")
+        if logarithmic and max(means) > 0:
+            _use_logarithms(axes)
             # The lowest contrastive error is often zero: keep the means in sight.
             least = min(mean for mean in means if mean > 0)
             axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
-    if lines is not None or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
-        _shared_legend(figure, places)
+    if lines or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
+        marks = "thick dashes (thin lines: least to greatest)" if logarithmic else "bars"
+        _shared_legend(figure, places, f"{marks} and lines across: means of the dots and bands")
     save(figure, path)
+
+
+def _draw_bar(axes: Axes, position: float, bar: Bar, logarithmic: bool) -> None:
+    _, actor, ends, values, text = bar
+    color, label, mean = COLORS.get(actor, _ARM_COLORS[0]), _plain(f"{actor} policy"), float(values.mean())
+    low, high = ends or (mean, float(values.max()))
+    if logarithmic:
+        axes.plot([position, position], [low, high], color=color, linewidth=1.2)
+        axes.plot(position, mean, "_", color=color, markersize=16, markeredgewidth=4, label=label)
+    else:
+        axes.bar(position, mean, 0.85, color=color, alpha=0.8, label=label)
+    axes.plot(np.full(len(values), position), values, "o", color="#222222", markersize=2.5)
+    note = axes.annotate(text, (position, high), (0, 3), textcoords="offset points", fontsize=7)
+    note.set(ha="center", va="bottom", bbox={"color": "white", "alpha": 0.8, "pad": 0.5})
 
 
 @in_style
@@ -254,27 +290,39 @@ def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]]
     save(figure, path)
 
 
-def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
+def _panels(count: int, height: float, ylabel: str) -> tuple[Figure, list[Axes]]:
     """Make a figure with a number of axes, at most three in a row, as wide as a page."""
     columns = min(count, 3)
     rows = -(-count // columns)
     figure = Figure(figsize=({1: 6.5, 2: 9.0, 3: 11.0}[columns], height * rows + 0.5))
     grid = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in grid[::columns]:
+        axes.set_ylabel(ylabel)
     for axes in grid[count:]:
         axes.set_axis_off()
     return figure, grid[:count]
 
 
-def _shared_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+def _use_logarithms(axes: Axes) -> None:
+    """Make an axis logarithmic, with plain numbers at its ticks; zeros have no place on it."""
+    axes.set_yscale("log", nonpositive="mask")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _shared_legend(figure: Figure, panels: Sequence[Axes], note: str = "") -> None:
     """Draw one legend of all panels below them."""
     shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    _legend(figure, shown)
+    _legend(figure, shown, note)
 
 
-def _legend(figure: Figure, handles: Mapping[str, Artist]) -> None:
-    columns = max(1, min(len(handles), int(figure.get_figwidth() // 2.4)))
-    figure.set_figheight(figure.get_figheight() + 0.21 * max(-(-len(handles) // columns) - 2, 0))  # two have room
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+def _legend(figure: Figure, handles: Mapping[str, Artist], note: str = "") -> None:
+    """Draw a legend below all panels, with a note on the marks above it."""
+    rows = max(1, math.ceil(len(handles) / (figure.get_figwidth() // 2.4)))
+    columns = max(1, math.ceil(len(handles) / rows))
+    figure.set_figheight(figure.get_figheight() + 0.21 * max(rows + bool(note) - 2, 0))  # two have room
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns, title=note or None)
 
 
 # Images

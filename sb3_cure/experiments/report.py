@@ -11,8 +11,8 @@ import io
 import itertools
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -40,9 +40,19 @@ from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured,
 THRESHOLDS = (250.0, 500.0, 750.0)
 #: Optional files of a cell
 MEDIA = ("task_policy.mp4", "curious_policy.mp4", "reconstructions.png", "uncomfortable.png", "curiosity_map.png")
+_ERROR = "state representation (SRL) error\nthat the {} policy meets\n({})".format
+#: Columns of evaluations, files of their pictures, names in tables and labels of axes
+_CURVES = (
+    ("cells", "cells_reached", "cells", "cells of the true state\nreached in training\n(more: explores wider)"),
+    ("return_mean", "learning_curves", "return", "episode return,\ndeterministic actions\n(higher: better)"),
+    ("task_srl_error", "task_srl_error", "SRL error, task policy", _ERROR("task", "lower: better")),
+    ("curious_srl_error", "curious_srl_error", "SRL error, curious policy", _ERROR("curious", "higher: unfamiliar")),
+)
+#: Evaluations with something to see, below which a table says it better than lines
+LEAST_POINTS = 4
 
-#: Environment steps [n] and values [seeds, n]
-Curves: TypeAlias = tuple[np.ndarray, np.ndarray]
+#: By task and arm: environment steps [n] and values [seeds, n]
+Curves: TypeAlias = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -123,8 +133,8 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
     if len(updates) and not updates.any():
         headlines.insert(0, render_text("untrained"))
-    parts += curve_figures(experiment, colors)
-    if explored := _stacked(experiment, "cells", at_least=1):
+    parts += curve_parts(experiment, colors)
+    if explored := _stacked(experiment, "cells"):
         parts.append(tables.cells_reached_table(experiment, explored))
         headlines += _exploration_headlines(experiment, list(explored))
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
@@ -138,50 +148,58 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
 
 
-def curve_figures(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Figure]:
-    """Draw cells reached, return and SRL error of the policies over training.
+def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Part]:
+    """Show cells reached, return and SRL error of the policies over training.
 
     :param experiment: An experiment
     :param colors: By arm
-    :return: Figures of those that were recorded
+    :return: Figures of those that were recorded, and a table of those with few evaluations
     """
-    error = "error of the representation (SRL)\nof what the {} policy sees"
-    for column, name, label, logarithmic in (
-        ("cells", "cells_reached", "cells of the true state\nreached in training", False),
-        ("return_mean", "learning_curves", "episode return\n(deterministic actions)", False),
-        ("task_srl_error", "task_srl_error", error.format("task"), True),
-        ("curious_srl_error", "curious_srl_error", error.format("curious"), True),
-    ):
-        if curves := _stacked(experiment, column):
-            if "srl" in column:
-                curves = _one_unit_each(experiment, curves)
+    few = {}
+    for column, name, measure, label in _CURVES:
+        curves, is_error = _stacked(experiment, column), "srl" in column
+        if is_error:
+            curves = _one_unit_each(experiment, curves)
+        means = [values.mean(axis=0) for arms in curves.values() for _, values in arms.values()]
+        # A logarithmic axis has no place for zeros, which contrastive errors begin with
+        visible = [(mean > 0).sum() if is_error else len(mean) for mean in means]
+        if max(visible, default=0) >= LEAST_POINTS:
             caption = render_text(name, list(curves))
-            yield _figure(name, caption, plots.learning_curves, curves, colors, label, logarithmic)
+            yield _figure(name, caption, plots.learning_curves, curves, colors, label, is_error)
+        elif curves and column != "cells":  # which have a table anyway
+            few[measure] = curves
+    if few:
+        yield tables.evaluations_table(few)
 
 
-def _stacked(experiment: Experiment, column: str, at_least: int = 2) -> dict[str, dict[str, Curves]]:
-    """Curves by task and arm, where there are at least so many evaluations with a value in the column."""
-    curves: dict[str, dict[str, Curves]] = {}
+def _stacked(experiment: Experiment, column: str) -> Curves:
+    """Curves by task and arm, of those with a value in the column."""
+    curves: Curves = {}
     for task, method in experiment.arms:
         steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
-        if len(steps) >= at_least:
+        if len(steps):
             curves.setdefault(task, {})[method] = steps, values
     return curves
 
 
-def _one_unit_each(experiment: Experiment, curves: Mapping[str, Mapping[str, Curves]]) -> dict[str, dict[str, Curves]]:
-    """Panels of errors of one unit each: those of different heads, and errors per pixel, differ in it."""
-    panels: dict[str, dict[str, Curves]] = {}
+def _one_unit_each(experiment: Experiment, curves: Curves) -> Curves:
+    """Panels of errors of one unit each."""
+    panels: Curves = {}
     for task, arms in curves.items():
-        units = {arm: _unit_of_errors(next(iter(experiment.done(task, arm).values()))) for arm in arms}
+        names = _panels_of_errors(experiment, task, arms)
         for arm, found in arms.items():
-            name = f"{task}, {units[arm]}" if len(set(units.values())) > 1 else task
-            panels.setdefault(name, {})[arm] = found
+            panels.setdefault(names[arm], {})[arm] = found
     return panels
 
 
-def _unit_of_errors(cell: CellResult) -> str:
-    arguments = cell.config["arguments"]
+def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) -> dict[str, str]:
+    """Titles by arm: errors of different heads, and errors per pixel, differ in their unit, and share no axis."""
+    units = {arm: _unit_of_errors(experiment, task, arm) for arm in arms}
+    return {arm: f"{task}, {unit}" if len(set(units.values())) > 1 else task for arm, unit in units.items()}
+
+
+def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
+    arguments = next(iter(experiment.done(task, arm).values())).config["arguments"]
     per_pixel = arguments.get("intrinsic_kwargs", {}).get("per_pixel")
     return f"{arguments.get('srl', 'rae')}{', per pixel' if per_pixel else ''}"
 
@@ -190,19 +208,12 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
     coverage, errors = state_coverage(experiment), summarise_errors(experiment)
     parts: list[Part] = []
     if coverage:
-        caption, label = render_text("coverage_bars"), "occupied cells of the true state"
-        parts.append(_figure("coverage", caption, plots.actor_bars, _bars(coverage), label))
-        parts.append(tables.coverage_table(experiment, coverage))
-    for head in HEADS:
-        bars = _bars([row for row in errors if row.head == head])
-        lines: dict[str, dict[str, float]] = {task: {} for task in bars}
-        for task, values in lines.items():
-            for other, label in (("zero", "always zero"), ("mean_image", "mean image")):
-                if means := [row.mean for row in errors if (row.task, row.head) == (task, other)]:
-                    values[label] = float(np.mean(means))
+        bars, lines = _bars(coverage)
         if bars:
-            caption = render_text("visitation_bars", head, {label for values in lines.values() for label in values})
-            parts.append(_figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines))
+            label = "occupied cells of the true state\n(more: goes wider; \N{MULTIPLICATION SIGN}: times random)"
+            parts.append(_figure("coverage", render_text("coverage_bars"), plots.actor_bars, bars, label, lines))
+        parts.append(tables.coverage_table(experiment, coverage))
+    parts += [*_error_figure(list(_by_unit(experiment, errors)), "own"), *_error_figure(errors, "common")]
     if errors:
         parts.append(tables.error_table(experiment, errors))
     measures: list[tuple[Measured, str]] = [(row, "as many cells of the true state space") for row in coverage]
@@ -210,15 +221,43 @@ def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
     return list(_visitation_headlines(experiment, measures)), parts
 
 
-def _bars(rows: Sequence[Measured]) -> dict[str, list[plots.Bar]]:
-    """Bars by task."""
-    panels: dict[str, list[plots.Bar]] = {}
+def _by_unit(experiment: Experiment, errors: Sequence[ErrorSummary]) -> Iterator[ErrorSummary]:
+    """Errors under own heads, with a panel of one unit as their task, and yardsticks where they have that unit."""
+    for task in experiment.tasks:
+        of_task = [row for row in errors if row.task == task]
+        titles = _panels_of_errors(experiment, task, [row.method for row in of_task if row.head == "own"])
+        for row in of_task:
+            if row.method in titles and (row.head == "own" or _unit_of_errors(experiment, task, row.method) == "rae"):
+                yield replace(row, task=titles[row.method])
+
+
+def _error_figure(errors: Sequence[ErrorSummary], head: str) -> Iterator[Figure]:
+    bars, lines = _bars([row for row in errors if row.head == head], shares_random=head != "own")
+    for task, values in lines.items():
+        for other, label in (("zero", "always drawing grey"), ("mean_image", "always drawing the mean image")):
+            if means := [row.mean for row in errors if (row.task, row.head) == (task, other)]:
+                values[label] = float(np.mean(means))
+    if bars:
+        caption = render_text("visitation_bars", head, {label for values in lines.values() for label in values})
+        yield _figure(f"visitation_{head}", caption, plots.visitation_bars, bars, lines)
+
+
+def _bars(
+    rows: Sequence[Measured], shares_random: bool = True
+) -> tuple[dict[str, list[plots.Bar]], dict[str, dict[str, np.ndarray | float]]]:
+    """Bars by task, and values to compare with: the random policy's, if they are the same for all arms."""
+    bars: dict[str, list[plots.Bar]] = {}
+    lines: dict[str, dict[str, Any]] = {}
     for row in rows:
+        compared = lines.setdefault(row.task, {})
+        if row.actor == "random" and shares_random:
+            compared["random"] = max(compared.get("random", row.values), row.values, key=len)  # of most seeds
+            continue
         text = f"{number_text(row.ratio.value, 2)}\N{MULTIPLICATION SIGN}" if math.isfinite(row.ratio.value) else ""
         text += "" if row.ratio.low is None else f"\n{interval_text(row.ratio, 1)}"
         ends = (row.error_min, row.error_max) if isinstance(row, ErrorSummary) else None
-        panels.setdefault(row.task, []).append((row.method, row.actor, ends, row.values, text))
-    return panels
+        bars.setdefault(row.task, []).append((row.method, row.actor, ends, row.values, text))
+    return bars, lines
 
 
 def _visitation_headlines(experiment: Experiment, measures: Sequence[tuple[Measured, str]]) -> Iterator[str]:
@@ -276,9 +315,11 @@ def _difference_parts(
         )
         for row in differences
     ]
-    caption = render_text("paired_difference", tables.compared_with(differences, experiment))
-    label = "mean return over training: difference from the baseline"
-    yield _figure("paired_difference", caption, plots.paired_differences, lines, colors, label)
+    if any(row.pairs > 1 for row in differences):  # else the table has every pair
+        compared = tables.compared_with(differences, experiment)
+        caption = render_text("paired_difference", compared)
+        label = f"mean return over training, minus that of {compared}\n(right of the line: better)"
+        yield _figure("paired_difference", caption, plots.paired_differences, lines, colors, label)
     yield tables.difference_table(experiment, differences)
     finals = statistics.paired_differences(experiment, "finals")
     yield tables.difference_table(experiment, finals, "final return", "As above.")

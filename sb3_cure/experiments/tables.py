@@ -119,8 +119,11 @@ def return_digits(experiment: Experiment, task: str | None = None) -> int:
     :return: Number of digits
     """
     cells = [cell for cell in experiment.cells.values() if task in (None, cell.task)]
-    highest = max((float(np.abs(cell.curve()[1]).max(initial=0)) for cell in cells), default=0.0)
-    return 2 - math.floor(math.log10(highest)) if 0 < highest < 10 else 0
+    return _digits(max((float(np.abs(cell.curve()[1]).max(initial=0)) for cell in cells), default=0.0))
+
+
+def _digits(value: float) -> int:
+    return 2 - math.floor(math.log10(value)) if 0 < value < 10 else 0
 
 
 def _mean_std(values: np.ndarray, digits: int = 0) -> str:
@@ -212,6 +215,24 @@ def curves_table(experiment: Experiment) -> Table:
         row = [_mean_std(values, digits) or missing for values in (arm.areas, arm.finals)]
         rows.append([task, method, str(len(arm.seeds)), *row])
     return _table("Learning curves", "task; arm; >seeds; >area under curve; >final return", rows, render_text("curves"))
+
+
+def evaluations_table(measured: Mapping[str, Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]]) -> Table:
+    """What a few evaluations have measured.
+
+    :param measured: By measure, task and arm: environment steps [n] and values [seeds, n]
+    :return: The table
+    """
+    rows = {}
+    for measure, tasks in measured.items():
+        for task, arms in tasks.items():
+            for method, (steps, values) in arms.items():
+                texts = [_mean_std(each, _digits(abs(each.mean()))) for each in values.T]
+                rows[measure, task, method, str(len(values))] = dict(zip(steps, texts, strict=True))
+    numbers = pd.DataFrame(list(rows.values())).sort_index(axis=1).fillna(NONE)
+    numbers.columns = [f">at {number_text(step)}" for step in numbers]
+    names = pd.DataFrame(list(rows), columns=["measure", "task", "arm", ">seeds"])
+    return Table("Evaluations", names.join(numbers), render_text("evaluations"))
 
 
 def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:

@@ -5,9 +5,11 @@ import json
 import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 from programs_for_tests import find_program
@@ -125,18 +127,21 @@ def test_tables_of_curves(results: Path) -> None:
 def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     """Also of arms without a task, which have no returns; a seed that only one arm has done does not count."""
     write_grid(tmp_path, seeds=[0, 1, 2])
-    reached = {"sac_ae": {0: (10, 100), 1: (20, 200)}, "cure_sac_ae": {0: (10, 400), 1: (20, 200), 2: (10, 999)}}
+    reached = {
+        "sac_ae": {0: (10, 60, 80, 100), 1: (20, 60, 80, 200)},
+        "cure_sac_ae": {0: (10, 60, 80, 400), 1: (20, 60, 80, 200), 2: (10, 60, 80, 999)},
+    }
     for method, seeds in reached.items():
         for seed, cells in seeds.items():
             cell = write_cell(tmp_path, TASK, method, seed, curve(0, 0))
-            rows = [(50_000 * (index + 1), 0, count, 1.0) for index, count in enumerate(cells)]
+            rows = [(25_000 * (index + 1), 0, count, 1.0) for index, count in enumerate(cells)]
             write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
     assert report.main([str(tmp_path)]) == 0
     header, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Cells of the true state")
-    assert header[3:] == ["at 50,000", "at 100,000", "/ baseline"]
-    assert baseline[2:] == ["2", "15 ± 7", "150 ± 71", NONE]
-    assert cure[2:5] == ["3", "13 ± 6", "533 ± 416"]
-    assert cure[5].startswith("2.00 [")  # of 4 and 1
+    assert header[3:] == ["at 25,000", "at 50,000", "at 75,000", "at 100,000", "/ baseline"]
+    assert baseline[2:] == ["2", "15 ± 7", "60 ± 0", "80 ± 0", "150 ± 71", NONE]
+    assert cure[2:7] == ["3", "13 ± 6", "60 ± 0", "80 ± 0", "533 ± 416"]
+    assert cure[7].startswith("2.00 [")  # of 4 and 1
     assert (tmp_path / "cells_reached.png").exists()
     text = (tmp_path / "table.md").read_text().replace("\\", "")
     assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in text
@@ -156,24 +161,86 @@ def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> Non
     assert rows_of(tmp_path / "table.md", "Learning curves")[1][2:] == ["0", NONE, NONE]
 
 
-def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A panel for each head, and for errors per pixel, but one of returns."""
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """Arguments of all curves and bars, which are not drawn."""
+    calls: list[tuple[Any, ...]] = []
+    for name in ("learning_curves", "actor_bars", "visitation_bars"):
+        monkeypatch.setattr(report.plots, name, lambda file, *arguments: calls.append(arguments))
+    return calls
+
+
+def describe(folder: Path, drawn: list[tuple[Any, ...]]) -> dict[str, tuple[Any, ...]]:
+    """Arguments of the figures of an experiment, by their file."""
+    (experiment,) = report.read_results(folder)
+    parts = report.describe(experiment, [100]).parts
+    names = [part.name for part in parts if isinstance(part, report.Figure) and part.name != "paired_difference.png"]
+    return dict(zip(names, drawn, strict=True))
+
+
+def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: list[tuple[Any, ...]]) -> None:
+    """A panel for each head, and for errors per pixel, but one of returns; constant images have errors of one unit."""
     others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
-    write_grid(tmp_path, seeds=1, methods={"sac_ae": {}, **{arm: {} for arm in others}}, baseline="sac_ae")
-    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1, 2))
-    for arm, arguments in others.items():
-        write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2), arguments={**CURE, **arguments})
-    drawn = {}
-    monkeypatch.setattr(
-        report.plots, "learning_curves", lambda file, curves, colors, label, *how: drawn.update({label: list(curves)})
-    )
-    monkeypatch.setattr(report.plots, "paired_differences", lambda *drawing: None)
-    (experiment,) = report.read_results(tmp_path)
-    report.describe(experiment, [100])
-    assert drawn["error of the representation (SRL)\nof what the task policy sees"] == [
-        f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel")
-    ]
-    assert drawn["episode return\n(deterministic actions)"] == [TASK]
+    arms: dict[str, dict[str, Any]] = {"sac_ae": {}, **others}
+    write_grid(tmp_path, seeds=1, methods={arm: {} for arm in arms}, baseline="sac_ae")
+    for arm, arguments in arms.items():
+        write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2, 3, 4), arguments={**CURE, **arguments})
+    figures = describe(tmp_path, drawn)
+    panels = [f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel")]
+    assert list(figures["task_srl_error.png"][0]) == panels
+    assert list(figures["learning_curves.png"][0]) == [TASK]
+
+    drawn.clear()
+    write_grid(tmp_path, kind="visitation", seeds=1, methods={arm: {} for arm in arms}, baseline="sac_ae")
+    rows = [("random", head, 0, 1, 2, 3, 10) for head in ("own", "zero", "mean_image")]
+    for arm, arguments in arms.items():
+        write_cell(tmp_path, TASK, arm, 0, {}, arguments={**CURE, **arguments}, visitation=rows)
+    bars, lines = describe(tmp_path, drawn)["visitation_own.png"]
+    assert list(bars) == panels
+    assert [len(lines.get(panel, ())) for panel in panels] == [2, 0, 0]
+
+
+def test_random_policy_is_drawn_once(tmp_path: Path, drawn: list[tuple[Any, ...]]) -> None:
+    """A line across, but where each arm judges it by its own head."""
+    write_visitation(tmp_path)
+    figures = describe(tmp_path, drawn)
+    for name in ("coverage.png", "visitation_common.png"):
+        bars, *_, lines = figures[name]
+        assert [actor for _, actor, *_ in bars[TASK]] == ["curious"]
+        assert len(lines[TASK]["random"]) == 3
+    bars, lines = figures["visitation_own.png"]
+    assert [actor for _, actor, *_ in bars[TASK]] == ["random", "curious"] and "random" not in lines[TASK]
+
+
+def test_few_evaluations_are_a_table(tmp_path: Path) -> None:
+    """Three points are no curve; a column that one arm lacks has a dash."""
+    write_grid(tmp_path, seeds=2)
+    for seed in (0, 1):
+        write_cell(tmp_path, TASK, "sac_ae", seed, curve(0, 50 * (seed + 1), 500), curious=True)
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, curve(0, 1.234))
+    assert report.main([str(tmp_path)]) == 0
+    assert not list(tmp_path.glob("*.png"))
+    header, baseline, cure, *errors = rows_of(tmp_path / "table.md", "Evaluations")
+    assert header[3:] == ["seeds", "at 0", "at 50,000", "at 100,000"]
+    assert baseline[1:] == [TASK, "sac_ae", "2", "0 ± 0", "75 ± 35", "500 ± 0"]
+    assert cure[1:] == [TASK, "cure_sac_ae", "1", "0", NONE, "1.23"]
+    assert [row[0] for row in errors] == ["SRL error, task policy"] * 2 + ["SRL error, curious policy"]
+    assert errors[2][2:] == ["sac_ae", "2", *["0.00200 ± 0.00000"] * 3]
+
+
+def test_no_picture_without_anything_to_see(tmp_path: Path) -> None:
+    """Errors of zero on a logarithmic axis, one pair of seeds, and a random policy without others to compare with."""
+    write_grid(tmp_path / "zero", seeds=1)
+    for arm in ("sac_ae", "cure_sac_ae"):
+        cell = write_cell(tmp_path / "zero", TASK, arm, 0, curve(0, 1, 2, 3, 4))
+        table = pd.read_csv(cell / "eval.csv")
+        table.assign(task_srl_error=0.0, curious_srl_error=np.nan).to_csv(cell / "eval.csv", index=False)
+    write_grid(tmp_path / "random", kind="visitation", seeds=1, methods={"random": {}}, baseline="random")
+    states = {"random": np.random.default_rng(0).normal(0, 1, (200, 4))}
+    rows = [("random", "common", 0, 1, 2, 3, 10)]
+    write_cell(tmp_path / "random", TASK, "random", 0, {}, visitation=rows, states=states)
+    assert report.main([str(tmp_path)]) == 0
+    assert [path.name for path in tmp_path.glob("*/*.png")] == ["learning_curves.png"]
 
 
 def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
@@ -243,7 +310,7 @@ def test_conditions_and_plots(results: Path) -> None:
     assert "Versions A: sb3\\_cure 0.1.0, torch 2.13.0." in text and "different commits" not in text
     rows = rows_of(results / "pretraining" / "table.md", "Run conditions")[1:]
     assert {row[1]: row[4] for row in rows} == {"vanilla": none, "cure_pretraining": "500,000 (curious)"}
-    for name in ("curves/learning_curves", "curves/paired_difference", "visitation/coverage"):
+    for name in ("curves/paired_difference", "visitation/coverage", "visitation/visitation_own"):
         with Image.open(results / f"{name}.png") as image:
             assert min(image.size) > 100
 
@@ -346,5 +413,5 @@ def test_nothing_is_broken_in_a_browser(chromium: str, results: Path, tmp_path: 
     page = (results / "report.html").read_text()
     sizes, console = look(chromium, page, tmp_path)
     assert console == []
-    assert len(sizes["images"]) == page.count("<img ") > 8 and min(sizes["images"]) > 0
+    assert len(sizes["images"]) == page.count("<img ") > 6 and min(sizes["images"]) > 0
     assert sizes["videos"] == [64, 64]
