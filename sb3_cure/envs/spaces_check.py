@@ -6,8 +6,6 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 #: Sides of fewer pixels are taken for those of tables and grids.
 MIN_SIDE = 8
-#: Bounds that float images usually have
-IMAGE_BOUNDS = ((0, 1), (-1, 1), (0, 255))
 
 
 def check_observation_space(space: spaces.Space, policy: str | type | None = None) -> None:
@@ -44,11 +42,11 @@ def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
         )
     if not isinstance(space, spaces.Box) or len(space.shape) < 2 or sorted(space.shape)[-2] < MIN_SIDE:
         return
-    rank, bounds = len(space.shape), (space.low.min(), space.high.max())
+    rank = len(space.shape)
     reads = (
         f"{name} is {space.dtype} of shape {space.shape}, which would be read as a vector of {space.low.size} numbers"
     )
-    if space.dtype == np.uint8 and bounds == (0, 255) and is_image:
+    if space.dtype == np.uint8 and space.low.min() == 0 and space.high.max() == 255 and is_image:
         if rank == 2:
             raise ValueError(f"{reads}: if it is an image, return it as [H, W, 1], else flatten it.")
         if rank == 4:
@@ -56,8 +54,8 @@ def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
                 f"{reads}: if it is an image, return the newest as [H, W, C] (StackFrames of sb3_cure.envs stacks "
                 "them), else flatten it."
             )
-    if rank == 3 and np.issubdtype(space.dtype, np.floating) and bounds in IMAGE_BOUNDS:
+    if rank == 3 and not is_image_space(space):
         raise ValueError(
             f"{reads}: if it is an image, return it as uint8 from 0 to 255, else flatten it (images are normalised "
-            "inside of the networks)."
+            "inside of the networks: VecNormalize with norm_obs=False, or with norm_obs_keys of vectors alone)."
         )

@@ -5,7 +5,6 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
 
-from sb3_cure.data.observations import image_spaces
 from sb3_cure.envs.copy_observations import CopyObservations
 from sb3_cure.vec_env.finite_check import FiniteCheck
 
@@ -31,19 +30,11 @@ def check_environments(venv: VecEnv) -> FiniteCheck:
 
 def _check_normalizer(venv: VecEnv) -> None:
     normalizer = unwrap_vec_wrapper(venv, VecNormalize)
-    if normalizer is None:
-        return
-    if _shapes(venv.observation_space) != _shapes(normalizer.observation_space):
+    if normalizer is not None and _shapes(venv.observation_space) != _shapes(normalizer.observation_space):
         raise ValueError(
             "VecNormalize is inside of a wrapper that changes the shape of observations, but the replay buffer stores "
             "what VecNormalize gets: put it outside, such as VecNormalize(VecTransposeImage(venv)) for images with the "
             "channels last."
-        )
-    lost = image_spaces(normalizer.venv.observation_space).keys() - image_spaces(normalizer.observation_space).keys()
-    if lost:
-        raise ValueError(
-            "VecNormalize would standardise images, which networks expect as uint8: pass norm_obs=False, or "
-            "norm_obs_keys with the vectors alone."
         )
 
 

@@ -98,6 +98,8 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
         (image(84, 84, 3, high=1, dtype=np.float32), "return it as uint8 from 0 to 255, else flatten it"),
         (image(3, 84, 84, low=-1, high=1, dtype=np.float32), "return it as uint8"),
         (image(3, 8, 8, dtype=np.float64), "float64 of shape .* vector of 192 numbers"),
+        (image(64, 64, 1, high=10, dtype=np.float32), "return it as uint8"),  # depth in metres
+        (image(64, 64, 1, high=65535, dtype=np.uint16), "return it as uint8"),  # and in millimetres
     ],
 )
 def test_image_that_would_be_a_vector_is_refused(part: spaces.Space, advice: str) -> None:
@@ -112,7 +114,6 @@ def test_image_that_would_be_a_vector_is_refused(part: spaces.Space, advice: str
         image(9, 84, 84),
         image(1, 6, 2, low=-1, high=1, dtype=np.float32),  # joints
         image(6, 2),  # a table
-        image(64, 64, 1, high=10, dtype=np.float32),  # depth in metres
         image(7, 7, 3, high=1, dtype=np.float32),  # a grid
         image(7, 7, 3, high=9),
         image(12, 12, low=-np.inf, high=np.inf, dtype=np.float32),  # an inertia matrix

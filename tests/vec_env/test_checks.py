@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from sb3_cure.vec_env import OverlappedVecEnv
 
 CHANNELS_LAST = partial(PixelBox, channels_last=True, frame_stack=1)
+SENSORS = partial(SensorBox, ("front", "joints"))
 
 
 @pytest.mark.parametrize(
@@ -23,12 +25,13 @@ CHANNELS_LAST = partial(PixelBox, channels_last=True, frame_stack=1)
             "inside of a wrapper that changes the shape",
         ),
         (lambda: VecNormalize(DummyVecEnv([CHANNELS_LAST]), norm_obs=False), r"VecNormalize\(VecTransposeImage\(venv"),
-        (lambda: VecNormalize(DummyVecEnv([PixelBox])), "would standardise images.*norm_obs=False"),
+        (lambda: VecNormalize(DummyVecEnv([PixelBox])), "vector of .* norm_obs=False"),
+        (lambda: VecNormalize(DummyVecEnv([SENSORS]), clip_obs=5), "vector of .* norm_obs=False"),
     ],
 )
 def test_normalizer_in_the_wrong_place_is_refused(venv: Any, sentence: str) -> None:
     made = venv()
-    policy = "MlpPolicy" if isinstance(made, VecFrameStack) else "CnnPolicy"
+    policy = "CnnPolicy" if len(made.observation_space.shape or ()) == 3 else "MultiInputPolicy"
     with pytest.raises(ValueError, match=sentence):
         tiny_model(policy, made)
 
