@@ -172,10 +172,10 @@ class CuRePolicy(BasePolicy):
         if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
             return {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
         if srl_class is not None and issubclass(self.features_extractor_class, DictEncoder):
-            own, by_key = kwargs.pop("by_key", {}), {}
+            by_key = dict(kwargs.pop("by_key", {}))
             for key in image_spaces(self.sensed_space):
                 defaults = srl_class.configure_encoder(self.augmentation.of(key), **srl_kwargs)
-                by_key[key] = {**defaults, **kwargs, **own.get(key, {})}
+                by_key[key] = {**defaults, **kwargs, **by_key.get(key, {})}
             return {"by_key": by_key}
         return kwargs
 

@@ -220,12 +220,15 @@ class DictEncoder(Encoder):
     :param observation_space: Dictionary with at least one image
     :param by_key: Further arguments of the encoders of some images, by key
     :param kwargs: Arguments of all encoders, as of ``PixelEncoder``; ``features_dim`` is that of each
+    :raises ValueError: If ``by_key`` names something that is no image
     """
 
     def __init__(
         self, observation_space: spaces.Dict, by_key: Mapping[str, Mapping[str, Any]] | None = None, **kwargs: Any
     ):
         found, own = image_spaces(observation_space), by_key or {}
+        if unknown := own.keys() - found.keys():
+            raise ValueError(f"by_key names {sorted(unknown)}, but the images are {sorted(found)}.")
         encoders = {key: PixelEncoder(space, **{**kwargs, **own.get(key, {})}) for key, space in found.items()}
         others = spaces.Dict([(key, space) for key, space in observation_space.spaces.items() if key not in found])
         vectors = RunningStandardize(others) if others.spaces else None

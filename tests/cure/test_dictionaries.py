@@ -250,3 +250,11 @@ def test_extractor_that_mixes_images_trains_without_head() -> None:
     with pytest.raises(ValueError, match="needs the latents of each image"):
         sensor_model(env, policy_kwargs=network)
     assert sensor_model(env, srl=None, curiosity=None, policy_kwargs=network).learn(14)._n_updates == 4
+
+
+@pytest.mark.parametrize("srl", ["rae", None])
+def test_arguments_of_an_unknown_image_are_refused(srl: str | None) -> None:
+    """They would be left out, and another encoder trained."""
+    network = {"features_extractor_kwargs": {"n_layers": 2, "by_key": {"writs": {"n_filters": 2}}}}
+    with pytest.raises(ValueError, match=r"by_key names \['writs'\], but the images are \['front', 'wrist'\]"):
+        sensor_model(srl=srl, policy_kwargs=network)
