@@ -379,9 +379,9 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     try:
         _, found, _ = get_model_path(args.exp_id or _latest_run(args, name), args.folder, args.algo, name, *flags)
     except (AssertionError, ValueError) as error:
-        runs = {path.parent.name.rpartition("_")[0] for path in Path(args.folder, args.algo).glob("*/*.zip")}
-        trained = f"; trained there: {', '.join(sorted(runs))}" if runs else ""
-        raise UsageError(f"{one_sentence(error).rstrip('.')}{trained}.") from None
+        runs = {path.parent.name for path in Path(args.folder, args.algo).glob("*/*.zip")}
+        models = f"; there are models in {', '.join(sorted(runs))}" if runs else ""
+        raise UsageError(f"{one_sentence(error).rstrip('.')}{models}.") from None
     path = Path(found)
     print(f"Loading {path}")
     folder = path.parent / name

@@ -288,7 +288,11 @@ def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
     ],
 )
 def test_model_is_the_one_that_flags_name(
-    flags: list[str], model: str | None, folder: Path, monkeypatch: pytest.MonkeyPatch
+    flags: list[str],
+    model: str | None,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     class Found(Exception):
         pass
@@ -308,6 +312,7 @@ def test_model_is_the_one_that_flags_name(
     arguments = ["enjoy", "--env", TASK, "--no-render", *flags]
     if model is None:
         assert main(arguments) == 2
+        assert f", {RUN}_12, {RUN}_3." in capsys.readouterr().err
     else:
         with pytest.raises(Found, match=f"^{runs / model}$"):
             main(arguments)
