@@ -18,7 +18,7 @@ from torch import nn
 from sb3_cure.cure.actor_critic import ActorCritic, TrunkActor
 from sb3_cure.cure.critics import LatentCritic, TwinCritic
 from sb3_cure.cure.encoder_update import EncoderUpdate
-from sb3_cure.data.observations import image_spaces, images_of, join, sensed_space
+from sb3_cure.data.observations import check_images, image_spaces, images_of, join, sensed_space
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, RewardScale, make_reward
 from sb3_cure.networks.augmentations import make_augmentation
@@ -436,6 +436,7 @@ class CuRePolicy(BasePolicy):
         return self._predict(observation, deterministic)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        check_images(observation, self.observation_space)
         actor = self.agents[self.default_agent].actor
         return actor(self.encoder.trunk(self.center(observation)), deterministic)
 

@@ -32,6 +32,18 @@ def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
     return {key: observations[key] if isinstance(observations, dict) else observations for key in image_spaces(space)}
 
 
+def check_images(observations: Any, space: spaces.Space) -> None:
+    """Refuse images that networks would scale in another way than those of the replay buffer, which are uint8.
+
+    :param observations: Tensor, or a dictionary of tensors
+    :param space: Their space
+    :raises ValueError: If an image is not uint8
+    """
+    for image in images_of(observations, space).values():
+        if image.dtype != th.uint8:
+            raise ValueError(f"images must be uint8, not {image.dtype}: do not divide them by 255.")
+
+
 def by_key(images: Any) -> dict[str, Any]:
     """Name the parts of an observation.
 

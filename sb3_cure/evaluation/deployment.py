@@ -7,7 +7,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.data.observations import images_of
+from sb3_cure.data.observations import check_images
 from sb3_cure.evaluation.rollouts import trained_actors
 
 
@@ -51,9 +51,7 @@ class DeterministicActor(nn.Module):
         :return: Actions within the environment's bounds, [B, *action shape]
         :raises ValueError: for images that are not uint8
         """
-        for image in images_of(observations, self._observation_space).values():
-            if image.dtype != th.uint8:
-                raise ValueError(f"images must be uint8, not {image.dtype}: do not divide them by 255.")
+        check_images(observations, self._observation_space)
         (policy,) = self._policy
         policy.set_training_mode(False)  # as `predict` does, also after further training
         inputs: Any = observations if self.trunk is None else self.trunk(policy.center(observations))

@@ -258,3 +258,13 @@ def test_arguments_of_an_unknown_image_are_refused(srl: str | None) -> None:
     network = {"features_extractor_kwargs": {"n_layers": 2, "by_key": {"writs": {"n_filters": 2}}}}
     with pytest.raises(ValueError, match=r"by_key names \['writs'\], but the images are \['front', 'wrist'\]"):
         sensor_model(srl=srl, policy_kwargs=network)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int64])
+def test_policy_refuses_images_that_are_not_bytes(dtype: Any) -> None:
+    """Such as those of environments in SB3's workers: they were not scaled as those of the replay buffer are."""
+    model = sensor_model()
+    observation: Any = model.observation_space.sample()
+    model.predict(observation)
+    with pytest.raises(ValueError, match="images must be uint8, not torch"):
+        model.predict({**observation, "front": observation["front"].astype(dtype)})
