@@ -4,7 +4,7 @@ SB3's own arguments are SB3's to check.
 """
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
@@ -71,7 +71,9 @@ def check_arguments(model: Any) -> None:
         CuReArguments.model_validate(model)
     except ValidationError as error:
         first = error.errors()[0]
-        raise ValueError(f"{first['loc'][0]}={first['input']!r} is not valid: {first['msg'].lower()}.") from None
+        name = str(first["loc"][0])
+        or_none = " or None" if type(None) in get_args(CuReArguments.model_fields[name].annotation) else ""
+        raise ValueError(f"{name}={first['input']!r} is not valid: {first['msg'].lower()}{or_none}.") from None
     for is_wrong, sentence in _conflicts(model):
         if is_wrong:
             raise ValueError(sentence)
