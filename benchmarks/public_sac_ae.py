@@ -12,6 +12,7 @@ import argparse
 import importlib
 import itertools
 import json
+import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -28,7 +29,6 @@ from benchmarks.harness import BATCH_SIZE, Times, describe_machine, interleaved,
 from benchmarks.sac_ae import PlainSacAe
 from benchmarks.settings import SETTINGS, Setting
 from sb3_cure.evaluation.result_files import write_json
-from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.layers import conv_sizes
 
 #: Of a log of the public implementation and of ``PlainSacAe.losses``
@@ -195,11 +195,12 @@ def measure(checkout: Path, setting: Setting, repeats: int, tuned: bool) -> Time
     :param checkout: Path of the public implementation's checkout
     :param setting: Images and networks
     :param repeats: Rounds
-    :param tuned: Whether to set the allocator as ``make bench`` does
+    :param tuned: Whether large blocks of memory are kept, as every model sees to
     :return: Seconds per update of each round, by implementation
     """
-    if tuned:
-        tune_allocator()
+    if not tuned:
+        # Models leave the allocator alone then; the C library has read its variables when the process began.
+        os.environ["MALLOC_TRIM_THRESHOLD_"] = ""
     th.set_num_threads(setting.threads)
     replay_buffer, plain, public = _agents(checkout, setting)
     batches, log = [replay_buffer.sample(BATCH_SIZE) for _ in range(4)], Log()
