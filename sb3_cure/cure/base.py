@@ -429,8 +429,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._before_save()
 
     def _excluded_save_params(self) -> list[str]:
-        made_anew = "_guard _metrics _mixer _overlapped _computed_precision ent_coef_tensor _initial_rng_state"
-        return [*super()._excluded_save_params(), *made_anew.split()]
+        made_anew = ["_guard", "_metrics", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]
+        return [*super()._excluded_save_params(), *made_anew]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, variables = super()._get_torch_save_params()

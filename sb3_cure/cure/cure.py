@@ -192,7 +192,7 @@ class CuRe(CuReBase):
         if reward is not None and not reward.needs_srl:
             curious_rewards = self._curious_rewards(batch, srl)
         if "task" in turns:
-            self._update_task(batch, turns["task"], curious_rewards)
+            self._update_task(batch, turns["task"], curious_rewards if self.curiosity == "bonus" else None)
         if "curious" in turns:
             self._update_curious(batch, turns["curious"], curious_rewards)
         encoder.finish()
@@ -282,7 +282,7 @@ class CuRe(CuReBase):
     def _update_task(self, batch: Samples, turn: int, bonus: th.Tensor | None) -> None:
         """UpdateTaskAC, with returns of one step or of several."""
         n_step = batch.n_step or batch
-        rewards = n_step.rewards if self.curiosity != "bonus" else n_step.rewards + bonus  # type: ignore[operator]
+        rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
         discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
         next_view = "next_observations" if batch.n_step is None else "n_step"
         self._update_actor_critic("task", turn, batch.actions, rewards, discounts, next_view)

@@ -232,6 +232,9 @@ class Pretraining(CuRe):
         self._last_obs = None
         self._is_pretrained = True
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_initial_rng_state"]
+
     def _restart_random_streams(self) -> None:
         """Reset all RNGs to their state after construction."""
         self._is_pretrained = False
