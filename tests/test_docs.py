@@ -24,7 +24,7 @@ DOCS = ROOT / "docs"
 #: What docs/conf.py copies or builds is no page of its own
 PAGES = [
     ROOT / "README.md",
-    ROOT / "results" / "README.md",
+    *(ROOT / "results").glob("*.md"),
     *(p for p in DOCS.rglob("*.md") if not {"_build", "notebooks", "results"} & set(p.relative_to(DOCS).parts)),
 ]
 #: Modules whose public names users write in their own code; what is not in them is internal
