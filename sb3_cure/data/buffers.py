@@ -43,13 +43,16 @@ class FrameStackReplayBuffer(ReplayBuffer):
         as an infinite horizon task
     :param frame_stack: Frames per observation, which channels do not show: by key (1 for other images), or one number
         for all (in dictionaries 1 where it does not divide the channels)
+    :param info_shapes: What to keep of each step's ``info``, for rewards and heads of your own: shapes by key, such as
+        ``{"contacts": (4,)}``; ``rows["infos/contacts"]`` has it as float32
     :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
         a million transitions of 84x84 take 22 GB. The last directory of the path is created if it is missing. The
         first ``add`` reserves the room on the disk (``OSError`` if there is too little)
     """
 
-    #: Row arrays by name, [buffer_size, n_envs, ...] each; also ``slots/<key>`` of images, and of everything else
-    #: ``observations/<key>`` and ``next_observations/<key>`` (the key of a single observation is ``""``)
+    #: Row arrays by name, [buffer_size, n_envs, ...] each; also ``slots/<key>`` of images, of everything else
+    #: ``observations/<key>`` and ``next_observations/<key>`` (the key of a single observation is ``""``), and
+    #: ``infos/<key>``
     rows: dict[str, ndarray]
     #: Rings of frames by the key of their image
     rings: dict[str, FrameRing]
@@ -71,6 +74,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         handle_timeout_termination: bool = True,
         *,
         frame_stack: int | Mapping[str, int],
+        info_shapes: Mapping[str, tuple[int, ...]] | None = None,
         frames_dir: str | Path | None = None,
     ):
         # As SB3's DictReplayBuffer does: ReplayBuffer's constructor would allocate what this class avoids.
@@ -78,6 +82,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage, self.handle_timeout_termination = False, handle_timeout_termination
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
+        self.info_shapes = dict(info_shapes or {})
         self._spaces = by_key(getattr(observation_space, "spaces", observation_space))
         self._shapes = {key: (n_envs, *shape) for key, shape in by_key(self.obs_shape).items()}
         self.reset()
@@ -92,6 +97,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
                     self.rows[f"{name}/{key}"] = zeros(*self._shapes[key][1:], dtype=space.dtype)
         self.rows["actions"] = zeros(self.action_dim, dtype=self._maybe_cast_dtype(action_space.dtype))
         self.rows |= {name: zeros() for name in ("rewards", "dones", "timeouts")}
+        self.rows |= {f"infos/{key}": zeros(*shape) for key, shape in self.info_shapes.items()}
         self.rows["starts"] = zeros(dtype=bool)
         # SB3's names; `observations` and `next_observations` of single vectors, too
         names = {name.removesuffix("/"): array for name, array in self.rows.items()}
@@ -140,7 +146,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param action: Actions, [n_envs, ...]
         :param reward: Rewards, [n_envs]
         :param done: Whether the episode ended, [n_envs]
-        :param infos: One dictionary per environment, of which ``TimeLimit.truncated`` is read
+        :param infos: One dictionary per environment, of which ``TimeLimit.truncated`` and ``info_shapes`` are read
         :raises ValueError: If an observation has another shape, or numbers that a uint8 space cannot hold
         """
         obs, next_obs = self._checked(obs), self._checked(next_obs)
@@ -150,6 +156,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         row |= {"rewards": reward, "dones": done}
         if self.handle_timeout_termination:
             row["timeouts"] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(self.n_envs)
+        for key in self.info_shapes:
+            row[f"infos/{key}"] = np.array([info[key] for info in infos])
         counts = {}
         for key, ring in self.rings.items():
             tails = self.rows[f"slots/{key}"][before, :, 1] if self._n_valid else None
@@ -298,7 +306,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what has not been written to: a pickled buffer is as large as its contents."""
-        names = "observation_space action_space device n_envs handle_timeout_termination frame_stack frames_dir".split()
+        names = "observation_space action_space device n_envs handle_timeout_termination frame_stack".split()
+        names += ["info_shapes", "frames_dir"]
         settings = {name: getattr(self, name) for name in names}
         return {"buffer_size": self.buffer_size * self.n_envs, **settings, "state": self.state_dict()}
 

@@ -213,7 +213,7 @@ class _Record(BaseCallback):
         self.rewards_met = 0.0
         #: Of these, where the task policy and where the curious (or random) second actor acted; the rest: the warm-up
         self.rewards_met_task = self.rewards_met_curious = 0.0
-        #: Of these, after the first tenth of an episode; of episodes that have ended
+        #: Of these, after the first two fifths of an episode, of episodes that have ended: a start may lie in the goal
         self.rewards_met_late = 0.0
         #: Rewards of each environment's episode so far
         self.episode_rewards: list[list[float]] = []
@@ -273,7 +273,7 @@ class _Record(BaseCallback):
         for episode, reward, done in zip(self.episode_rewards, rewards.tolist(), dones, strict=True):
             episode.append(reward)
             if done:
-                self.rewards_met_late += sum(episode[-(-len(episode) // 10) :])
+                self.rewards_met_late += sum(episode[-(-2 * len(episode) // 5) :])
                 episode.clear()
 
     def best_return(self) -> float | None:

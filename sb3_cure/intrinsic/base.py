@@ -55,6 +55,15 @@ class RewardInputs:
         """The same of the next observations, [B, features_dim]."""
         return self._read_with_graph("next_observations")
 
+    def info(self, key: str) -> th.Tensor:
+        """What the environment's ``info`` held under a key after each step, [B, *shape].
+
+        :param key: A key that ``replay_buffer_kwargs=dict(info_shapes={key: shape})`` keeps
+        :return: Its values in this batch, float32
+        """
+        buffer: Any = self.replay_buffer
+        return buffer.to_torch(buffer.rows[f"infos/{key}"][buffer.last_sampled])
+
     def of(self, key: str, where: slice = slice(None)) -> "RewardInputs":
         """Return the inputs of a reward that sees one image of a dictionary.
 

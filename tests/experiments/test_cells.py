@@ -120,7 +120,7 @@ def test_cell_stops_at_a_return_reached_twice(tmp_path: Path, monkeypatch: pytes
 def test_rewards_met_by_actor_and_late(
     arm: dict[str, Any], by_task: int, by_second: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A reward of 1 in each of 100 steps: 20 of the warm-up, 80 by who acted; late are 18 of the 20 of an episode."""
+    """A reward of 1 in each of 100 steps: 20 of the warm-up, 80 by who acted; late are 12 of the 20 of an episode."""
     step = PixelBox.step
 
     def step_for_one(self: PixelBox, action: np.ndarray) -> tuple[Any, ...]:
@@ -130,7 +130,7 @@ def test_rewards_met_by_actor_and_late(
     monkeypatch.setattr(PixelBox, "step", step_for_one)
     cell = only_cell(tmp_path, methods={"arm": method(**arm)}, evaluation=dict(every=200, episodes=1))
     last = read_rows(run_cell(cell, tmp_path, pictures=False) / "eval.csv")[-1]
-    assert last["rewards_met"] == 100 and last["rewards_met_late"] == 5 * 18
+    assert last["rewards_met"] == 100 and last["rewards_met_late"] == 5 * 12
     assert (last["rewards_met_task"], last["rewards_met_curious"]) == (by_task, by_second)
 
 

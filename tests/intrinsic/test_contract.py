@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
 from envs_for_tests import PixelBox, VectorBox, tiny_model
+from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 from updates_for_tests import equal, filled_model, groups, moved, train_once
 
@@ -117,6 +119,28 @@ def test_reading_without_gradients_leaves_the_shared_graph(update: str) -> None:
     before = groups(model)
     train_once(model)
     assert {"trunk", "projection"} <= moved(before, groups(model))
+
+
+class TellsPlace(gym.Wrapper):
+    """Tells in the info where a step has led."""
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        observation, *rest, info = self.env.step(action)
+        return observation, *rest, {**info, "place": observation}
+
+
+def test_reward_reads_what_the_info_said(tmp_path: Path) -> None:
+    """Of the same transitions as the batch, of several environments, after a round of the buffer and a resume."""
+    kept: dict[str, Any] = dict(buffer_size=40, replay_buffer_kwargs=dict(info_shapes={"place": (2,)}))
+    env = make_vec_env(lambda: TellsPlace(VectorBox()), n_envs=2)
+    model = tiny_model("MlpPolicy", env, srl=None, intrinsic=LatentStep, **kept)
+    model.learn(100, callback=ExactCheckpoint(100, tmp_path))
+    resumed = type(model).resume(tmp_path, env, custom_objects={"intrinsic": LatentStep})
+    resumed.learn(20, reset_num_timesteps=False)
+    for each in (model, resumed):
+        reward: Any = each.policy.intrinsic
+        inputs = reward.given[-1]
+        assert th.equal(inputs.info("place"), inputs.batch.next_observations)
 
 
 @UPDATES
