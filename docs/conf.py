@@ -67,6 +67,8 @@ def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
         source[0] = source[0].replace("](../docs/", "](../")
         if not source[0].startswith("# "):
             source[0] = f"# {Path(docname).parent.name}\n\n{source[0]}"
+        if docname.count("/") > 1:  # tables of one experiment, which pages link to
+            source[0] = f"---\norphan: true\n---\n\n{source[0]}"
 
 
 def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
