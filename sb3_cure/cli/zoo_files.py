@@ -123,7 +123,10 @@ def check_environment(task: str) -> None:
     if module:
         import_module(module)
     if name not in gym.registry:
-        raise UsageError(f"there is no environment {name!r}{nearest(name, gym.registry)}")
+        hint = nearest(name, gym.registry)
+        if hint == "." and not module:
+            hint = f"; name the module that registers it, too, as in my_module:{name}"
+        raise UsageError(f"there is no environment {name!r}{hint}")
 
 
 def import_module(name: str) -> Any:

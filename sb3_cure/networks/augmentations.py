@@ -191,7 +191,7 @@ def _image_space(space: spaces.Space, name: str) -> spaces.Space:
     if not is_image_space(space):
         raise ValueError(
             f"augmentation={name!r} needs images, but observations are {space}: make pixels of the environment with "
-            "make_pixel_env, or set augmentation=None."
+            "make_pixel_env (in settings files as env_wrapper), or set augmentation=None."
         )
     return space
 
