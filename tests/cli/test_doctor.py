@@ -80,13 +80,13 @@ class Walk(gym.Env):
 @pytest.mark.parametrize(
     ("reward_of", "advice"),
     [
-        (lambda place: 0.0, "in 0 of 60 episodes; returns 0 to 0.\nHardly"),
-        (lambda place: -1.0 if place < 15 else 0.0, "in 0 of 60 episodes; returns -20 to -20.\nHardly"),
-        (lambda place: float(place > 3), "Seldom"),
-        (lambda place: float(place > 3) - float(place < -3), "Seldom"),  # falls are no rewards
+        (lambda place: 0.0, "in 0 of 60 episodes; returns 0 to 0.\nHardly any"),
+        (lambda place: -1.0 if place < 15 else 0.0, "in 0 of 60 episodes; returns -20 to -20.\nHardly any"),
+        (lambda place: float(place > 3), "Some: "),
+        (lambda place: float(place > 3) - float(place < -3), "Some: "),  # falls are no rewards
         (lambda place: float(place), "No two of 60 episodes"),
         (lambda place: float(place > 15) - 0.01 * float(place) ** 2, "a cost of actions hides"),
-        (lambda place: float(place > 0), "Often"),
+        (lambda place: float(place > 0), "Most: "),
     ],
 )
 def test_doctor_counts_the_random_episodes_that_meet_a_reward(
