@@ -38,7 +38,7 @@ EXTRAS = {
 }
 #: What to do, by the share of random episodes that meet a reward at most
 ADVICE = {
-    0.05: "Hardly any: exploration decides. Try curiosity (fast/cure_sac_ae); whether it learns such a task is not known.",
+    0.05: "Hardly any: exploration decides. Try curiosity (fast/cure_sac_ae); it is not known to learn such tasks.",
     0.5: (
         "Some: try it with curiosity (fast/cure_sac_ae) and without (fast/best). On one such task curiosity met three "
         "times the rewards in training; returns were still zero."
