@@ -1,7 +1,6 @@
 """What CuRe is besides its algorithm: arguments, set-up, environments and what is saved."""
 
 import warnings
-from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,7 +12,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cure.actor_critic import ActorCritic
 from sb3_cure.cure.arguments import check_arguments, named_intrinsic
 from sb3_cure.cure.crash_report import FiniteGuard
 from sb3_cure.cure.critics import LatentCritic
@@ -235,7 +233,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
         if self.verbose >= 1:
             print(f"Updates compute in {self._computed_precision} (precision={self.precision!r}).")
-        self._setup_temperatures()
+        for name in self.policy.agents:
+            self._set_temperature(name)
 
     def _policy_settings(self) -> dict[str, Any]:
         """Arguments of the policy that follow from the algorithm's."""
@@ -265,21 +264,15 @@ class CuReBase(OffPolicyAlgorithm):
             print(f"The curious agent is rewarded by {named!r} (intrinsic='auto').")
         return get_intrinsic_class(named)
 
-    def _setup_temperatures(self) -> None:
-        """Give each agent a temperature; SB3's attributes are the task's."""
-        task = self.policy.task
-        self._set_temperature(task, self.ent_coef)
-        self.log_ent_coef, self.ent_coef_optimizer = task.log_ent_coef, task.ent_coef_optimizer
-        self.ent_coef_tensor = task.ent_coef_tensor  # type: ignore[assignment]
-        self._setup_curious_temperature()
-
-    def _setup_curious_temperature(self) -> None:
-        if self.policy.curious is not None:
-            given = self.curiosity_ent_coef
-            self._set_temperature(self.policy.curious, self.ent_coef if given is None else given)
-
-    def _set_temperature(self, agent: ActorCritic, ent_coef: str | float) -> None:
+    def _set_temperature(self, name: str) -> None:
+        """Give an agent its temperature; SB3's attributes are the task's."""
+        agent, ent_coef = self.policy.agents[name], self.ent_coef
+        if name == "curious" and self.curiosity_ent_coef is not None:
+            ent_coef = self.curiosity_ent_coef
         agent.set_temperature(ent_coef, self.lr_schedule(1) * self.ent_coef_lr_factor, self.device)
+        if name == "task":
+            self.log_ent_coef, self.ent_coef_optimizer = agent.log_ent_coef, agent.ent_coef_optimizer
+            self.ent_coef_tensor = agent.ent_coef_tensor  # type: ignore[assignment]
 
     def set_random_seed(self, seed: int | None = None) -> None:
         """Seed all random streams, the mixer's included.
@@ -289,10 +282,6 @@ class CuReBase(OffPolicyAlgorithm):
         super().set_random_seed(seed)
         if seed is not None:
             self._mixer.rng = np.random.default_rng(seed)
-
-    def _train(self, gradient_steps: int, batch_size: int) -> None:
-        """Sample and update; implemented by the algorithm."""
-        raise NotImplementedError
 
     # ---------------------------------------------------------- environments
 
@@ -307,9 +296,6 @@ class CuReBase(OffPolicyAlgorithm):
         :return: The environments
         """
         return self.env.venv if isinstance(self.env, FiniteCheck) else self.env
-
-    def _prepare_learn(self) -> None:
-        """Hook that is called first in ``learn``."""
 
     def learn(
         self: Self,
@@ -330,7 +316,6 @@ class CuReBase(OffPolicyAlgorithm):
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :return: self
         """
-        self._prepare_learn()
         name = tb_log_name or type(self).__name__
         self._overlapped = OverlappedVecEnv(self.env) if self.overlap else None  # type: ignore[arg-type]
         try:
@@ -388,17 +373,6 @@ class CuReBase(OffPolicyAlgorithm):
                 self._last_original_obs = self._vec_normalize_env.get_original_obs()
             return
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Update now or, with ``overlap=True`` in ``learn``, while the environments make their next step.
-
-        :param gradient_steps: Number of updates (when alternating, of pairs of updates)
-        :param batch_size: Transitions per update
-        """
-        if self._overlapped is not None and self.num_timesteps < self._total_timesteps:
-            self._overlapped.defer(partial(self._train, gradient_steps, batch_size))
-        else:
-            self._train(gradient_steps, batch_size)
 
     @property
     def _progress_remaining(self) -> float:

@@ -62,32 +62,22 @@ class CuRe(CuReBase):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Let the curious actor act with probability p_c, per environment, else the task's."""
+        """Let the curious (or, as a control, a random) actor act where the mixer chooses it, else the task's."""
+        if self.curiosity == "random" and not self.task:  # uniform actions all the time
+            learning_starts = self.num_timesteps + 1
         _, actions = super()._sample_action(learning_starts, None, n_envs)
-        if self.num_timesteps >= learning_starts and self.curiosity in ("separate", "random"):
-            second = self._second_actor_acts(n_envs)
+        if self.task and self.curiosity in ("separate", "random") and self.num_timesteps >= learning_starts:
+            starts: Any = self._last_episode_starts
+            second = self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
             if second.any():
-                actions[second] = self._second_actor_actions(second)
+                if self.curiosity == "random":
+                    chosen = self._mixer.hold(self.action_space.sample)
+                else:
+                    chosen, _ = self.predict_curious(rows_of(self._last_obs, second))
+                actions[second] = self.policy.scale_action(chosen)
         if action_noise is not None:  # added once, whoever acts
             actions = np.clip(actions + action_noise(), -1, 1)
         return self.policy.unscale_action(actions), actions
-
-    def _second_actor_acts(self, n_envs: int) -> np.ndarray:
-        """Where the curious (or, as a control, a random) actor acts in this step, bool [n_envs]."""
-        if not self.task:  # the policy itself is the curious one
-            return np.full(n_envs, self.curiosity == "random")
-        starts: Any = self._last_episode_starts
-        return self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
-
-    def _second_actor_actions(self, where: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1] in the environments where it acts, [n, action_dim]."""
-        if self.curiosity == "separate":
-            actions, _ = self.predict_curious(rows_of(self._last_obs, where))
-        elif self.task:
-            actions = self._mixer.hold(self.action_space.sample)
-        else:
-            actions = np.array([self.action_space.sample() for _ in np.flatnonzero(where)])
-        return self.policy.scale_action(actions)
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """Collect as SB3 does, with the mixer in ``_sample_action``; after the warm-up, make the burst of updates.
@@ -123,6 +113,17 @@ class CuRe(CuReBase):
 
     # -------------------------------------------- learning: lines 8 to 12 of Algorithm 1
 
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update now or, with ``overlap=True`` in ``learn``, while the environments make their next step.
+
+        :param gradient_steps: Number of updates (when alternating, of pairs of updates)
+        :param batch_size: Transitions per update
+        """
+        if self._overlapped is not None and self.num_timesteps < self._total_timesteps:
+            self._overlapped.defer(partial(self._train, gradient_steps, batch_size))
+        else:
+            self._train(gradient_steps, batch_size)
+
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         """Sample, update, repeat."""
         self.policy.set_training_mode(True)
@@ -157,19 +158,23 @@ class CuRe(CuReBase):
         return batch
 
     @property
+    def _learns(self) -> tuple[bool, bool]:
+        """Whether there is a representation to train, and whether there are actors and critics."""
+        trains_srl = self.srl is not None and not self.policy.representation_frozen
+        return trains_srl, self.task or self._has_curious_agent
+
+    @property
     def _alternates(self) -> bool:
         """Whether SRL and RL take turns, which takes one of each."""
-        takes_turns = self.srl_schedule == "alternating" and self.srl is not None
-        return takes_turns and not self.policy.representation_frozen and (self.task or self._has_curious_agent)
+        return self.srl_schedule == "alternating" and all(self._learns)
 
     def _phase(self) -> tuple[bool, bool]:
         """Whether the next update trains the representation, and whether it trains actors and critics."""
-        learns_srl = self.srl is not None and not self.policy.representation_frozen
-        if not (self.task or self._has_curious_agent):
-            return learns_srl, False
-        learns_srl = learns_srl and (self._in_burst or self._n_updates % self.srl_interval == 0)
+        learns_srl, learns_rl = self._learns
+        if learns_rl and not self._in_burst:
+            learns_srl = learns_srl and self._n_updates % self.srl_interval == 0
         if not self._alternates:
-            return learns_srl, True
+            return learns_srl, learns_rl
         srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy
         return learns_srl and srl_phase, not srl_phase
 

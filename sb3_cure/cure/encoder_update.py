@@ -61,30 +61,22 @@ class EncoderUpdate:
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
         self.weights: dict[str, float] = {}
-        for source in sources:
-            self.add_source(source)
-        self.metrics: dict[str, th.Tensor] = {}
+        self.set_sources(sources)
         self._n_updates = 0
         self._reset({})
 
-    def add_source(self, source: str) -> None:
-        """Let a further loss train the encoder.
+    def set_sources(self, sources: Sequence[str]) -> None:
+        """Set which losses train the encoder; those that stay keep their state.
 
-        :param source: Name of the loss
+        :param sources: Names of the losses
         """
-        name = source if self.mode == "sequential" else "joint"
-        if self._parameters and name not in self.optimizers:
-            self.optimizers[name] = self._make_optimizer()
-        self.mean_squares[source], self.weights[source] = th.zeros(()), 0.0
-
-    def remove_source(self, source: str) -> None:
-        """Let a loss no longer train the encoder.
-
-        :param source: Name of the loss
-        """
-        self.optimizers.pop(source, None)
-        del self.mean_squares[source], self.weights[source]
-        self.metrics = {}
+        names = sources if self.mode == "sequential" else ["joint"] if sources else []
+        self.optimizers = {
+            name: self.optimizers.get(name) or self._make_optimizer() for name in names if self._parameters
+        }
+        self.mean_squares = {source: self.mean_squares.get(source, th.zeros(())) for source in sources}
+        self.weights = {source: self.weights.get(source, 0.0) for source in sources}
+        self.metrics: dict[str, th.Tensor] = {}
 
     # ------------------------------------------------------------ one update
 

@@ -143,12 +143,10 @@ class CuRePolicy(BasePolicy):
             self._build_intrinsic()
         if curious:
             self.curious = self._make_actor_critic()
-        sources = {"srl": self.srl is not None, "task": task} | self._curious_sources()
-        names = [name for name in ("srl", "intrinsic", "task", "curious") if sources.get(name)]
         self.encoder_update = EncoderUpdate(
             self.encoder,
             self.encoder_target,
-            names,
+            self._encoder_sources(),
             update,
             optimizer_class,
             lr=self.learning_rate,
@@ -239,12 +237,15 @@ class CuRePolicy(BasePolicy):
     def _make_optimizer(self, parameters: Any, **kwargs: Any) -> th.optim.Optimizer:
         return self.optimizer_class(parameters, lr=self.learning_rate, **{**self.optimizer_kwargs, **kwargs})  # type: ignore[call-arg]
 
-    def _curious_sources(self) -> dict[str, bool]:
-        """Which losses of the curious agent train the encoder."""
-        return {
+    def _encoder_sources(self) -> list[str]:
+        """Losses that train the encoder."""
+        trains = {
+            "srl": self.srl is not None,
             "intrinsic": self.intrinsic is not None and self.intrinsic.trains_encoder,
+            "task": self._arguments["task"],
             "curious": self.curious is not None and self._arguments["curiosity_encoder_grad"],
         }
+        return [source for source, does in trains.items() if does]
 
     def add_curious_agent(self, intrinsic_class: type[IntrinsicReward], intrinsic_kwargs: dict[str, Any]) -> None:
         """Build the curious actor-critic and, if there is none, its reward, with fresh weights.
@@ -257,22 +258,19 @@ class CuRePolicy(BasePolicy):
             self._build_intrinsic()
         self.curious = self._make_actor_critic()
         self.to(self.device)
-        for source, trains in self._curious_sources().items():
-            if trains and source not in self.encoder_update.mean_squares:
-                self.encoder_update.add_source(source)
+        self.encoder_update.set_sources(self._encoder_sources())
 
     def remove_curious_agent(self, keep_reward: bool) -> None:
-        """Drop the curious actor-critic.
+        """Drop the curious actor-critic, and forget the scale of its rewards, which differs from that of a bonus.
 
         :param keep_reward: Whether its reward stays
         """
         self._arguments["curious"] = False
         self.curious = None
+        self.scale.forget()
         if not keep_reward:
             self.intrinsic = self._arguments["intrinsic_class"] = None
-        for source, trains in self._curious_sources().items():
-            if not trains and source in self.encoder_update.mean_squares:
-                self.encoder_update.remove_source(source)
+        self.encoder_update.set_sources(self._encoder_sources())
 
     # ---------------------------------------------------------------- agents
 

@@ -28,19 +28,14 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_n_batches", "_n_rl_batches", "_war
 class Pretraining(CuRe):
     """Adds to CuRe: ``pretrain``, ``load_transitions`` and ``fit_representation``, and ``transfer_from``."""
 
-    @functools.wraps(CuRe.__init__)  # type: ignore[misc]  # so that help() shows the arguments
-    def __init__(self, *args: Any, **kwargs: Any):
-        #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
-        self._before_pretraining: dict[str, Any] | None = None
-        #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
-        self._is_pretrained = False
-        #: Whether encoder and head are kept as they are
-        self.representation_frozen = False
-        super().__init__(*args, **kwargs)
+    #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
+    _before_pretraining: dict[str, Any] | None = None
+    #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
+    _is_pretrained: bool = False
+    #: Whether encoder and head are kept as they are
+    representation_frozen: bool = False
 
     def _setup_model(self) -> None:
-        #: Whether ``pretrain`` calls ``learn``; never of an archive
-        self._pretrains = False
         before, self._before_pretraining = self._before_pretraining, None
         collector = "curious" if self._has_curious_agent else "random"
         if before is not None:  # of an archive that was saved while pretraining: first the networks of before
@@ -176,11 +171,9 @@ class Pretraining(CuRe):
         if collector not in ("curious", "random"):
             raise ValueError(f"collector must be 'curious' or 'random', but is {collector!r}.")
         self._begin_pretraining(collector)
-        self._pretrains = True
         try:
-            self.learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:
-            self._pretrains = False
             self._end_pretraining()
         return self
 
@@ -189,12 +182,12 @@ class Pretraining(CuRe):
         """Whether ``pretrain`` runs, or ran when the checkpoint was written that this model was resumed from."""
         return self._before_pretraining is not None
 
-    def _prepare_learn(self) -> None:
-        if self._pretrains:
-            return
+    @functools.wraps(CuRe.learn)
+    def learn(self: Self, *args: Any, **kwargs: Any) -> Self:
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
         if self._is_pretrained:
             self._restart_random_streams()
+        return super().learn(*args, **kwargs)
 
     def _check_that_srl_learns(self, call: str) -> None:
         if self.srl is None:
@@ -210,7 +203,7 @@ class Pretraining(CuRe):
             return
         if self.policy.curious is None:  # for this pretraining alone
             self.policy.add_curious_agent(self._intrinsic_class(), self.intrinsic_kwargs)
-            self._setup_curious_temperature()
+            self._set_temperature("curious")
         self.policy.default_agent = "curious"
 
     def _end_pretraining(self, keep_transitions: bool = False) -> None:
@@ -221,8 +214,6 @@ class Pretraining(CuRe):
         if policy.curious is not None and not self._has_curious_agent:
             policy.remove_curious_agent(keep_reward=self.curiosity == "bonus")
         policy.default_agent = "task" if self.task or policy.curious is None else "curious"
-        if self.curiosity == "bonus":
-            policy.scale.forget()  # a bonus is divided by its size, the reward of pretraining by its deviation
         if not keep_transitions:
             _empty(self.replay_buffer)  # type: ignore[arg-type]
             if policy.intrinsic is not None:

@@ -264,17 +264,17 @@ def test_sources_come_and_go(mode: str) -> None:
     _, update = make(mode, ("srl", "task"))
     whole(update, 0)
     before = str(update.state_dict())
-    update.add_source("curious")
+    update.set_sources(("srl", "task", "curious"))
     assert update.weights["curious"] == 0
     assert {"latent_grad_norm_curious", "latent_grad_norm_task"} <= whole(update, 1).keys()
-    update.remove_source("curious")
+    update.set_sources(("srl", "task"))
     assert not any("curious" in name for name in [*update.state_dict()["weights"], *update.optimizers, *update.metrics])
     other = make(mode, ("srl", "task"))[1]
     other.load_state_dict(update.state_dict())
     _, again = make(mode, ("srl", "task"))
     whole(again, 0)
-    again.add_source("curious")
-    again.remove_source("curious")
+    again.set_sources(("srl", "task", "curious"))
+    again.set_sources(("srl", "task"))
     assert str(again.state_dict()) == before
 
 

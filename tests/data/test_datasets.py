@@ -1,5 +1,6 @@
 """Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
 
+import copy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -251,10 +252,12 @@ def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_pa
 
 
 def test_training_goes_on_after_fitting() -> None:
-    """Neither a random warm-up nor a burst again, and its counters as they were."""
-    model = tiny_model("CnnPolicy", PixelBox(), warmup_updates=3).learn(14)
+    """Neither a random warm-up nor a burst again, its counters and the scale of its bonus as they were."""
+    model = tiny_model("CnnPolicy", PixelBox(), warmup_updates=3, curiosity="bonus").learn(14)
     done = model.num_timesteps, model._n_updates, model._n_batches
+    scale = copy.deepcopy(model.policy.scale.state_dict())
     model.fit_representation(5)
+    assert differences(scale, model.policy.scale.state_dict()) == []
     assert (model.num_timesteps, model._n_updates, model._n_batches) == done == (14, 7, 7)
     model.learn(2, reset_num_timesteps=False)
     assert (model.num_timesteps, model._n_updates) == (16, 9)
