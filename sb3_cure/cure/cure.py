@@ -192,6 +192,8 @@ class CuRe(CuReBase):
         curious_rewards = None
         if reward is not None and reward.needs_srl:  # the reward is of the head before its step
             curious_rewards = self._curious_rewards(batch, srl)
+            if srl is not None and reward.trains_encoder and self.update == "sequential":
+                srl = self._srl_loss(batch)  # of the encoder as the reward's loss has left it
         if srl is not None:
             self._update_srl(srl.loss)
         if reward is not None and not reward.needs_srl:

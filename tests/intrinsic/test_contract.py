@@ -158,6 +158,17 @@ def test_reward_that_trains_the_encoder_moves_it(augmentation: str | None, updat
         assert ("intrinsic" in model.policy.encoder_update.weights) == bool(trained)
 
 
+@UPDATES
+def test_head_trains_the_encoder_beside_a_reward_of_its_error_that_does(update: str) -> None:
+    """The step of the reward's loss comes first; the head's is then of the encoder as it is by now."""
+
+    class Both(SlowLatents):
+        needs_srl = True
+
+    logged = train_once(filled_model(intrinsic=Both, update=update))
+    assert logged["latent_grad_norm_srl"] > 0 < logged["latent_grad_norm_intrinsic"]
+
+
 @pytest.mark.parametrize("curiosity", [None, "bonus", "separate"])
 @pytest.mark.parametrize("reward", [Forward, SlowLatents])
 def test_rewards_survive_pretraining(reward: type[IntrinsicReward], curiosity: str | None) -> None:
