@@ -89,24 +89,17 @@ class Particle(IntrinsicReward):
             features = inputs.next_latents
         else:
             features = self.encoder(scaled(inputs.batch.next_observations, self.observation_space))
-        # Rows are counted from the first one that was ever added: positions come again after a round of the buffer.
-        oldest, newest = buffer.n_added - buffer.size(), buffer.n_added - 1
-        numbers, env_inds = self.places.T
-        # A model that was loaded without its buffer remembers rows of the former one.
-        known = np.flatnonzero((numbers >= oldest) & (numbers <= newest) & (env_inds < buffer.n_envs))
-        rows, env_inds = (buffer.pos - 1 - newest + numbers[known]) % buffer.buffer_size, env_inds[known]
-        episodes = self._number_episodes(buffer)
-        own, others = episodes[*buffer.last_sampled], episodes[rows, env_inds]
-        is_candidate = own[:, None] != np.concatenate([own, others])
+        sampled, (known, remembered) = buffer.last_sampled, self._remembered(buffer)
         candidates = features
         if self.encoder is not None:
             candidates = th.cat([features, self.features[th.from_numpy(known).to(features.device)]])
         elif len(known) > 0:
-            candidates = th.cat([features, inputs.encode(inputs.look_up(rows, env_inds).next_observations)])
-        sampled_rows, sampled_envs = buffer.last_sampled
-        numbers = newest - (buffer.pos - 1 - sampled_rows) % buffer.buffer_size
-        self._remember(np.stack([numbers, sampled_envs], axis=1), features)
-        return None, self._reward(features, candidates, th.from_numpy(is_candidate).to(features.device))
+            candidates = th.cat([features, inputs.encode(inputs.look_up(*remembered).next_observations)])
+        episodes = self._number_episodes(buffer)
+        others = np.concatenate([episodes[sampled], episodes[remembered]])
+        is_candidate = th.from_numpy(episodes[sampled][:, None] != others).to(features.device)
+        self._remember(buffer, features)
+        return None, self._reward(features, candidates, is_candidate)
 
     def forget(self) -> None:
         """Forget the memory, which refers to the replay buffer."""
@@ -122,10 +115,22 @@ class Particle(IntrinsicReward):
         mean = th.where(found, nearest, 0).sum(dim=1) / found.sum(dim=1).clamp(min=1)
         return mean.log1p()
 
-    def _remember(self, places: ndarray, features: th.Tensor) -> None:
-        n = min(len(places), len(self.places))
+    def _remembered(self, buffer: Any) -> tuple[ndarray, tuple[ndarray, ndarray]]:
+        """Places in the memory whose transitions are still stored, and their rows and environments."""
+        oldest, newest = buffer.n_added - buffer.size(), buffer.n_added - 1
+        numbers, env_inds = self.places.T
+        # A model that was loaded without its buffer remembers rows of the former one.
+        known = np.flatnonzero((numbers >= oldest) & (numbers <= newest) & (env_inds < buffer.n_envs))
+        return known, ((buffer.pos - 1 - newest + numbers[known]) % buffer.buffer_size, env_inds[known])
+
+    def _remember(self, buffer: Any, features: th.Tensor) -> None:
+        """Put the batch in place of what has been remembered longest."""
+        rows, env_inds = buffer.last_sampled
+        # Rows are counted from the first one that was ever added: positions come again after a round of the buffer.
+        numbers = buffer.n_added - 1 - (buffer.pos - 1 - rows) % buffer.buffer_size
+        n = min(len(rows), len(self.places))
         where = (self.cursor + np.arange(n)) % len(self.places)
-        self.places[where] = places[-n:]
+        self.places[where] = np.stack([numbers, env_inds], axis=1)[-n:]
         if self.encoder is not None:
             self.features[th.from_numpy(where).to(features.device)] = features[-n:]
         self.cursor = (self.cursor + n) % len(self.places)
