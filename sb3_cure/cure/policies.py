@@ -18,12 +18,12 @@ from torch import nn
 from sb3_cure.cure.actor_critic import ActorCritic, TrunkActor
 from sb3_cure.cure.critics import LatentCritic, TwinCritic
 from sb3_cure.cure.encoder_update import EncoderUpdate
-from sb3_cure.data.observations import check_images, image_spaces, images_of, join, sensed_space
+from sb3_cure.data.observations import check_images, image_spaces, images_of, sensed_space
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import IntrinsicReward, RewardScale, make_reward
 from sb3_cure.networks.augmentations import make_augmentation
 from sb3_cure.networks.encoders import DictEncoder, Encoder, PixelEncoder, VectorEncoder, make_encoder
-from sb3_cure.networks.layers import init_weights, set_mode
+from sb3_cure.networks.layers import flatten_vectors, init_weights, set_mode
 from sb3_cure.srl import DictHead, SRLHead
 
 
@@ -343,7 +343,7 @@ class CuRePolicy(BasePolicy):
         """
         if self.sensed_space is self.observation_space or not isinstance(observations, dict):
             return observations
-        return join(observations, self.observation_space)  # type: ignore[arg-type]
+        return flatten_vectors(observations, self.observation_space)
 
     def samples(self, sampled: Any, random: bool = True) -> Samples:
         """Make of a batch what heads and rewards get.

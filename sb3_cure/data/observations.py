@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 
 #: [B, *shape], or such by key
 Observations = th.Tensor | dict[str, th.Tensor]
@@ -106,17 +106,6 @@ def sensed_space(space: spaces.Space) -> spaces.Space:
     if not isinstance(space, spaces.Dict) or image_spaces(space):
         return space
     return spaces.Box(-np.inf, np.inf, (get_flattened_obs_dim(space),), np.float32)
-
-
-def join(observations: dict[str, th.Tensor], space: spaces.Dict) -> th.Tensor:
-    """Join a dictionary without images to one vector.
-
-    :param observations: Observations by key, as stored
-    :param space: Their space
-    :return: Vectors with discrete values one-hot, fp32 [B, n]
-    """
-    parts = [preprocess_obs(observations[key], part) for key, part in space.spaces.items()]
-    return th.cat([part.flatten(1) for part in parts], dim=1)  # type: ignore[union-attr]
 
 
 def detached(features: Any) -> Any:
