@@ -101,14 +101,14 @@ class CuRe(CuReBase):
         updates = self.warmup_updates
         if updates is None:
             updates = 0 if self.srl is None or self.learning_starts == 0 else get_srl_class(self.srl).warmup_updates
-        self._in_burst = self.gradient_steps != 0
-        if self._in_burst and updates and self.verbose >= 1:
-            print(f"Making {updates} updates before the next step (warmup_updates).")
-        try:
-            if self._in_burst:
+        if updates > 0 and self.gradient_steps != 0:
+            if self.verbose >= 1:
+                print(f"Making {updates} updates before the next step (warmup_updates).")
+            self._in_burst = True
+            try:
                 self._train(updates, self.batch_size)
-        finally:
-            self._in_burst = False
+            finally:
+                self._in_burst = False
         self._warmed_up = True
 
     # -------------------------------------------- learning: lines 8 to 12 of Algorithm 1
@@ -186,9 +186,9 @@ class CuRe(CuReBase):
             for each in (policy.encoder, policy.encoder_target):
                 each.update_statistics(batch.views)
         self._metrics = {}
-        turns = self._turns() if learns_rl else {}
+        learners = self._learners() if learns_rl else {}
         srl = self._srl_loss(batch) if learns_srl else None
-        reward = policy.intrinsic if "curious" in turns or (turns and self.curiosity == "bonus") else None
+        reward = policy.intrinsic if "curious" in learners or (learners and self.curiosity == "bonus") else None
         curious_rewards = None
         if reward is not None and reward.needs_srl:  # the reward is of the head before its step
             curious_rewards = self._curious_rewards(batch, srl)
@@ -198,12 +198,12 @@ class CuRe(CuReBase):
             self._update_srl(srl.loss)
         if reward is not None and not reward.needs_srl:
             curious_rewards = self._curious_rewards(batch, srl)
-        if "task" in turns:
-            self._update_task(batch, turns["task"], curious_rewards if self.curiosity == "bonus" else None)
-        if "curious" in turns:
-            self._update_curious(batch, turns["curious"], curious_rewards)
+        if "task" in learners:
+            self._update_task(batch, learners["task"], curious_rewards if self.curiosity == "bonus" else None)
+        if "curious" in learners:
+            self._update_curious(batch, learners["curious"], curious_rewards)
         encoder.finish()
-        self._update_targets(turns)
+        self._update_targets(learners)
         return self._metrics | encoder.metrics
 
     def _views(self, batch: Samples) -> dict[str, Callable[[], Any]]:
@@ -217,14 +217,14 @@ class CuRe(CuReBase):
             "centred next_observations": lambda: policy.center(batch.next_observations),
         }
 
-    def _turns(self) -> dict[str, int]:
-        """Agents that learn from this batch, and how many batches each of them has learned from."""
-        turns, interval = {}, 1 if self._in_burst else self.curious_interval
+    def _learners(self) -> dict[str, int]:
+        """Agents that learn from this batch, and how many batches each of them has learned from before."""
+        learners, interval = {}, 1 if self._in_burst else self.curious_interval
         if self.task:
-            turns["task"] = self._n_rl_batches
+            learners["task"] = self._n_rl_batches
         if self._has_curious_agent and self._n_rl_batches % interval == 0:
-            turns["curious"] = self._n_rl_batches // interval
-        return turns
+            learners["curious"] = self._n_rl_batches // interval
+        return learners
 
     def _srl_loss(self, batch: Samples, learns: bool = True) -> SRLOutput:
         """Loss of the head, and the error of each sample, [B]."""
@@ -286,24 +286,24 @@ class CuRe(CuReBase):
         )
         return scaled
 
-    def _update_task(self, batch: Samples, turn: int, bonus: th.Tensor | None) -> None:
+    def _update_task(self, batch: Samples, n_before: int, bonus: th.Tensor | None) -> None:
         """UpdateTaskAC, with returns of one step or of several."""
         n_step = batch.n_step or batch
         rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
         discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
         next_view = "next_observations" if batch.n_step is None else "n_step"
-        self._update_actor_critic("task", turn, batch.actions, rewards, discounts, next_view)
+        self._update_actor_critic("task", n_before, batch.actions, rewards, discounts, next_view)
 
-    def _update_curious(self, batch: Samples, turn: int, rewards: Any) -> None:
+    def _update_curious(self, batch: Samples, n_before: int, rewards: Any) -> None:
         """UpdateCuriousAC: episodes do not end, unless ``curiosity_episodic`` says so."""
         continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
         discounts = continues * self.curiosity_gamma
-        self._update_actor_critic("curious", turn, batch.actions, rewards, discounts, "next_observations")
+        self._update_actor_critic("curious", n_before, batch.actions, rewards, discounts, "next_observations")
 
     def _update_actor_critic(
         self,
         name: str,
-        turn: int,
+        n_before: int,
         actions: th.Tensor,
         rewards: th.Tensor,
         discounts: th.Tensor,
@@ -312,7 +312,7 @@ class CuRe(CuReBase):
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
 
         :param name: ``"task"`` or ``"curious"``
-        :param turn: Number of batches that this agent has learned from before
+        :param n_before: Number of batches that this agent has learned from before
         :param actions: The batch's, in [-1, 1], [B, action_dim]
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return continues, else 0, [B, 1]
@@ -326,7 +326,7 @@ class CuRe(CuReBase):
         critic_loss = agent.critic.loss(encoder.latents(name), actions, target)
         self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
         self._note({f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()})
-        if self._in_burst or turn % self.actor_update_interval == 0:
+        if self._in_burst or n_before % self.actor_update_interval == 0:
             self._update_actor(name, agent)
 
     def _update_actor(self, name: str, agent: ActorCritic) -> None:
@@ -342,13 +342,13 @@ class CuRe(CuReBase):
             self._optimize(f"{name} temperature", ent_coef_loss, agent.ent_coef_optimizer)
             self._note({f"{prefix}ent_coef_loss": ent_coef_loss})
 
-    def _update_targets(self, turns: dict[str, int]) -> None:
+    def _update_targets(self, learners: dict[str, int]) -> None:
         """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
         policy, interval = self.policy, 1 if self._in_burst else self.target_update_interval
         if self._n_batches % interval == 0:
             _polyak_step(policy.encoder, policy.encoder_target, self.encoder_tau)
-        for name, turn in turns.items():
-            if turn % interval == 0:
+        for name, n_before in learners.items():
+            if n_before % interval == 0:
                 _polyak_step(policy.agents[name].critic, policy.agents[name].critic_target, self.tau)
 
     def _note(self, metrics: Metrics) -> None:
@@ -379,11 +379,10 @@ class CuRe(CuReBase):
         policy, encoder = self.policy, self.policy.encoder_update
         # Without augmentation the centred views are those that everyone else sees, whose losses need the graph.
         shared = type(policy.augmentation) is Augmentation
-        trains = "intrinsic" in encoder.mean_squares
+        graph = shared or policy.intrinsic.trains_encoder  # type: ignore[union-attr]
 
         def read(name: str) -> th.Tensor:
-            with th.set_grad_enabled(shared or trains):
-                return encoder.latents("intrinsic", name if shared else f"centred {name}")
+            return encoder.latents("intrinsic", name if shared else f"centred {name}", graph)
 
         @th.no_grad()
         def encode(observations: Any) -> th.Tensor:

@@ -108,16 +108,19 @@ class EncoderUpdate:
                 self._features[name] = self.encoder.trunk(self._view(name))
         return self._features[name]
 
-    def latents(self, source: str, name: str = "observations") -> th.Tensor:
+    def latents(self, source: str, name: str = "observations", graph: bool = True) -> th.Tensor:
         """Latents for a loss: a copy in which its gradient stops, until it is collected.
 
         :param source: Name of the loss; of one that is no source of the encoder's, they have no gradient
         :param name: Name of the views
+        :param graph: Whether these views need their graph, for this loss or for another one, whatever the grad mode
         :return: fp32, [B, features_dim]
         """
         if name not in self._latents:
-            features = self.encoder.trunk(self._view(name))
-            self._features[name], self._latents[name] = detached(features), self.encoder.projection(features).float()
+            with th.set_grad_enabled(graph):
+                features = self.encoder.trunk(self._view(name))
+                self._latents[name] = self.encoder.projection(features).float()
+            self._features[name] = detached(features)
         leaf = self._latents[name].detach()
         leaf.requires_grad_(source in self.mean_squares and self._latents[name].requires_grad)
         self._leaves.setdefault(source, {})[name] = leaf
@@ -174,7 +177,7 @@ class EncoderUpdate:
         if self._gradients:
             joint = self.mode == "joint"
             optimizer = self.optimizers["joint" if joint else next(iter(self._gradients))]
-            update_learning_rate(optimizer, self.learning_rate * (len(self._gradients) ** 0.5 if joint else 1.0))
+            update_learning_rate(optimizer, self.learning_rate * len(self._gradients) ** 0.5)  # sequential: of one
             measures = self._n_updates % MEASURE_INTERVAL == 1
             if measures and joint:
                 self._measure_shares()

@@ -11,6 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from torch import nn
 
 from sb3_cure.data.samples import Samples
+from sb3_cure.networks.layers import move_average
 
 
 class RewardInputs:
@@ -42,18 +43,17 @@ class RewardInputs:
         """SRL error of each sample, before the head's step, detached, [B]; only for rewards that say ``needs_srl``."""
         if self._judge is None:
             raise ValueError("inputs.srl_error is for rewards that set needs_srl = True.")
-        with th.enable_grad():  # as in `_read_with_graph`
-            return self._judge()
+        return self._judge()
 
     @cached_property
     def latents(self) -> th.Tensor:
         """The online encoder's latents of the centred views, fp32, [B, features_dim]."""
-        return self._read_with_graph("observations")
+        return self._read("observations")
 
     @cached_property
     def next_latents(self) -> th.Tensor:
         """The same of the next observations, [B, features_dim]."""
-        return self._read_with_graph("next_observations")
+        return self._read("next_observations")
 
     def info(self, key: str) -> th.Tensor:
         """What the environment's ``info`` held under a key after each step, [B, *shape].
@@ -79,11 +79,6 @@ class RewardInputs:
             lambda rows, env_inds: self.look_up(rows, env_inds).of(key),
             self.encode,
         )
-
-    def _read_with_graph(self, name: str) -> th.Tensor:
-        # Other losses may share this pass of the encoder: it needs its graph, even if the reward works under no_grad.
-        with th.enable_grad():
-            return self._read(name)
 
 
 class IntrinsicReward(nn.Module):
@@ -213,17 +208,11 @@ class RewardScale(nn.Module):
         :return: Scaled reward, [B, 1]
         """
         if normalize:
-            mean = reward.mean()
-            variance = (reward - mean if center else reward).square().mean()
             # A spread below a thousandth of the rewards' size is rounding: rewards that are all alike are worth 0.
-            variance = th.maximum(variance, 1e-6 * reward.square().mean())
-            finite = variance.isfinite()
-            self.variance.copy_(th.where(finite, self.variance.lerp(variance, 1 - self.decay), self.variance))
-            # The average starts at zero: its total weight undoes that bias, as Adam does for its moments.
-            self.weight.copy_(
-                th.where(finite, self.weight.lerp(th.ones_like(self.weight), 1 - self.decay), self.weight)
-            )
+            least = 1e-6 * reward.square().mean()
+            reward = reward - reward.mean() if center else reward
+            move_average(self.variance, self.weight, th.maximum(reward.square().mean(), least), self.decay)
             # NaN until the first finite batch: rewards that are not finite reach no critic.
             deviation = (self.variance / self.weight).sqrt() + 1e-8
-            reward = ((reward - mean if center else reward) / deviation).clamp(-self.clip, self.clip)
+            reward = (reward / deviation).clamp(-self.clip, self.clip)
         return beta * reward.unsqueeze(1)

@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import DITHER
-from sb3_cure.networks.layers import scale_images
+from sb3_cure.networks.layers import move_average, scale_images
 from sb3_cure.srl import SRLHead
 
 
@@ -66,9 +66,7 @@ class SRLError(IntrinsicReward):
             return None, inputs.srl_error
         batch = inputs.batch
         target = self._target(batch.next_observations if self.is_about_next else batch.observations)
-        self.variance.lerp_(target.var(dim=0, correction=0), 1 - self.decay)
-        # An average that starts at zero, as in RewardScale
-        self.weight.lerp_(th.ones_like(self.weight), 1 - self.decay)
+        move_average(self.variance, self.weight, target.var(dim=0, correction=0), self.decay)
         return None, self._error(target, inputs.next_latents if self.is_about_next else inputs.latents)
 
     @th.no_grad()

@@ -300,6 +300,22 @@ class Projection(nn.Module):
         return th.tanh(latents) if self.tanh else latents
 
 
+@th.no_grad()
+def move_average(average: th.Tensor, weight: th.Tensor, value: th.Tensor, decay: float) -> None:
+    """Move an exponential average that starts at zero; divided by its total weight it has no bias, as Adam's moments.
+
+    A value that is not finite changes nothing.
+
+    :param average: Changed in place, any shape
+    :param weight: Its total weight, changed in place, []
+    :param value: The same shape as the average
+    :param decay: Weight of the past
+    """
+    rate = (1 - decay) * value.isfinite().all()
+    average.lerp_(value.nan_to_num(), rate)
+    weight.lerp_(th.ones_like(weight), rate)
+
+
 class RunningStandardize(nn.Module):
     """Flattens vectors and standardises each entry by running statistics, so that units do not matter.
 
@@ -387,10 +403,7 @@ class MeanError(nn.Module):
         if learns:
             # A spread below a thousandth of the errors' size is rounding, as in RewardScale.
             new = th.maximum(each.var(dim=1, correction=0), 1e-6 * each.square().mean(dim=1))
-            rate = (1 - self.decay) * new.isfinite().all()
-            self.variances.lerp_(new.nan_to_num(), rate)
-            self.weight.lerp_(th.ones_like(self.weight), rate)
-        # The averages start at zero, and their total weight undoes that bias; before the first, nothing is divided.
-        seen = self.weight > 0
+            move_average(self.variances, self.weight, new, self.decay)
+        seen = self.weight > 0  # before the first average, nothing is divided
         deviations = (self.variances / self.weight.clamp(min=1e-12)).sqrt().clamp(min=1e-12)
         return (each / th.where(seen, deviations, 1.0)[:, None]).mean(dim=0)
