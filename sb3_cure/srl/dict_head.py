@@ -42,7 +42,6 @@ class DictHead(SRLHead):
         self.keys, self.slices = tuple(encoder.images), tuple(encoder.slices.values())
         self.mean_error = MeanError(len(self.keys))
         self.optimizer_kwargs = self.heads[0].optimizer_kwargs  # type: ignore[assignment]
-        self.warmup_updates = head_class.warmup_updates  # type: ignore[misc]
 
     def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:
         """Set target encoder and augmentation of each head.
