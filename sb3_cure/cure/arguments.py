@@ -79,21 +79,21 @@ def check_arguments(model: Any) -> None:
             raise ValueError(sentence)
 
 
-def named_intrinsic(model: Any) -> str | type[IntrinsicReward]:
+def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
     """Choose the intrinsic reward; of ``"auto"`` the head decides.
 
     :param model: A CuRe model, its arguments set
-    :return: Name or class
+    :return: Class of the reward
     """
     if model.intrinsic != "auto":
-        return model.intrinsic  # type: ignore[no-any-return]
+        return get_intrinsic_class(model.intrinsic)
     tells = model.srl is not None and get_srl_class(model.srl).error_tells_novelty
-    return "srl_error" if tells else AUTO_WITHOUT_NOVELTY
+    return get_intrinsic_class("srl_error" if tells else AUTO_WITHOUT_NOVELTY)
 
 
 def _judges_observation(model: Any) -> bool:
     """Whether a transition's intrinsic reward depends on the observation that it begins with alone."""
-    is_error = issubclass(get_intrinsic_class(named_intrinsic(model)), SRLError) and model.srl is not None
+    is_error = issubclass(choose_intrinsic(model), SRLError) and model.srl is not None
     return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
 
 
@@ -140,10 +140,5 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
             model.use_sde,
             "use_sde=True explores by noise on the features of one actor, which the shared encoder changes: leave it "
             "out.",
-        ),
-        (
-            "share_features_extractor" in model.policy_kwargs,
-            "share_features_extractor is not an argument here, as the encoder is always shared and trained by the "
-            "critics: leave it out.",
         ),
     ]

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cure.arguments import check_arguments, named_intrinsic
+from sb3_cure.cure.arguments import check_arguments, choose_intrinsic
 from sb3_cure.cure.crash_report import FiniteGuard
 from sb3_cure.cure.critics import LatentCritic
 from sb3_cure.cure.mixers import CuriousMixer
@@ -20,7 +20,7 @@ from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.envs import check_observation_space
 from sb3_cure.envs.sharing import share_environment
-from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
+from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.srl import SRLHead, get_srl_class
@@ -233,6 +233,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._computed_precision = resolve_precision(self.precision, self.device, self.observation_space)
         if self.verbose >= 1:
             print(f"Updates compute in {self._computed_precision} (precision={self.precision!r}).")
+            if self.intrinsic == "auto" and self.policy.intrinsic is not None:
+                print(f"The curious agent is rewarded by {choose_intrinsic(self).__name__} (intrinsic='auto').")
         for name in self.policy.agents:
             self._set_temperature(name)
 
@@ -245,7 +247,7 @@ class CuReBase(OffPolicyAlgorithm):
             srl_kwargs=self.srl_kwargs,
             augmentation=self.augmentation,
             augmentation_kwargs=self.augmentation_kwargs,
-            intrinsic_class=self._intrinsic_class() if rewarded else None,
+            intrinsic_class=choose_intrinsic(self) if rewarded else None,
             intrinsic_kwargs=self.intrinsic_kwargs,
             reward_settings={
                 "frame_stack": self.replay_buffer_kwargs.get("frame_stack", 1),
@@ -256,13 +258,6 @@ class CuReBase(OffPolicyAlgorithm):
             curiosity_encoder_grad=self.curiosity_encoder_grad,
             update=self.update,
         )
-
-    def _intrinsic_class(self) -> type[IntrinsicReward]:
-        """Class of the intrinsic reward; ``"auto"`` is resolved by the head."""
-        named = named_intrinsic(self)
-        if self.intrinsic == "auto" and self.verbose >= 1:
-            print(f"The curious agent is rewarded by {named!r} (intrinsic='auto').")
-        return get_intrinsic_class(named)
 
     def _set_temperature(self, name: str) -> None:
         """Give an agent its temperature; SB3's attributes are the task's."""

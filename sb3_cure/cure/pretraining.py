@@ -15,6 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
+from sb3_cure.cure.arguments import choose_intrinsic
 from sb3_cure.cure.cure import CuRe
 from sb3_cure.data.datasets import episodes_of, fill
 from sb3_cure.persistence.archive import archived_networks
@@ -28,12 +29,15 @@ _COUNTERS = ("num_timesteps", "_n_updates", "_n_batches", "_n_rl_batches", "_war
 class Pretraining(CuRe):
     """Adds to CuRe: ``pretrain``, ``load_transitions`` and ``fit_representation``, and ``transfer_from``."""
 
-    #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
-    _before_pretraining: dict[str, Any] | None = None
-    #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
-    _is_pretrained: bool = False
-    #: Whether encoder and head are kept as they are
-    representation_frozen: bool = False
+    @functools.wraps(CuRe.__init__)  # type: ignore[misc]  # so that help() shows the arguments
+    def __init__(self, *args: Any, **kwargs: Any):
+        #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
+        self._before_pretraining: dict[str, Any] | None = None
+        #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
+        self._is_pretrained = False
+        #: Whether encoder and head are kept as they are
+        self.representation_frozen = False
+        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         before, self._before_pretraining = self._before_pretraining, None
@@ -111,11 +115,13 @@ class Pretraining(CuRe):
         transfers_curious = curious is not None and any(name.startswith("curious.") for name in networks)
         if transfers_curious:
             parts += ["curious.", "intrinsic.", "scale."]
+
+        def transferred(tensors: dict[str, Any]) -> dict[str, Any]:
+            kept = (name for name in tensors if name.startswith(tuple(parts)) and "_extra_state" not in name)
+            return {name: tensors[name] for name in kept}
+
         own = self.policy.state_dict()
-        here, there = (
-            {n: t for n, t in all_.items() if n.startswith(tuple(parts)) and "_extra_state" not in n}
-            for all_ in (own, networks)
-        )
+        here, there = transferred(own), transferred(networks)
         for name in here | there or dict.fromkeys(parts):
             ours, theirs = (tuple(each[name].shape) if name in each else None for each in (here, there))
             if ours is None or ours != theirs:
@@ -182,12 +188,19 @@ class Pretraining(CuRe):
         """Whether ``pretrain`` runs, or ran when the checkpoint was written that this model was resumed from."""
         return self._before_pretraining is not None
 
-    @functools.wraps(CuRe.learn)
-    def learn(self: Self, *args: Any, **kwargs: Any) -> Self:
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
         if self._is_pretrained:
             self._restart_random_streams()
-        return super().learn(*args, **kwargs)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _check_that_srl_learns(self, call: str) -> None:
         if self.srl is None:
@@ -202,7 +215,7 @@ class Pretraining(CuRe):
         if not self._has_curious_agent:
             return
         if self.policy.curious is None:  # for this pretraining alone
-            self.policy.add_curious_agent(self._intrinsic_class(), self.intrinsic_kwargs)
+            self.policy.add_curious_agent(choose_intrinsic(self), self.intrinsic_kwargs)
             self._set_temperature("curious")
         self.policy.default_agent = "curious"
 

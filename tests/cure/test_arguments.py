@@ -74,7 +74,6 @@ def test_bad_values_are_named() -> None:
         (dict(optimize_memory_usage=True, replay_buffer_class=ReplayBuffer), "optimize_memory_usage=True"),
         (dict(use_sde=True), "use_sde=True"),
         (dict(curiosity_ent_coef="auto_0"), "'auto_0' must begin above 0"),
-        (dict(policy_kwargs=dict(share_features_extractor=True)), "share_features_extractor"),
         (dict(srl="curl", augmentation=None), "augmentation is None"),
         (dict(augmentation="crop", augmentation_kwargs=dict(size=84)), "cannot cut 84 x 84 pixels out of images of 36"),
     ],
