@@ -54,6 +54,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     #: ``observations/<key>`` and ``next_observations/<key>`` (the key of a single observation is ``""``), and
     #: ``infos/<key>``
     rows: dict[str, ndarray]
+    #: Of these: whether a row's observation is not the successor in the row before, bool [buffer_size, n_envs]
+    starts: ndarray
     #: Rings of frames by the key of their image
     rings: dict[str, FrameRing]
     #: Frames ever stored, by the key of their image
@@ -108,9 +110,6 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 "available: make buffer_size smaller, or keep the frames on a disk (frames_dir).",
                 stacklevel=2,
             )
-
-    #: Whether a row's observation is not the successor stored in the row before, bool [buffer_size, n_envs]
-    starts: ndarray
 
     @property
     def nbytes(self) -> int:
