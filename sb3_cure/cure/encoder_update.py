@@ -5,7 +5,7 @@ plain sum under one Adam would let the critics drown the autoencoder: Adam divid
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch as th
@@ -92,11 +92,6 @@ class EncoderUpdate:
         # What was measured at the parameters is logged until it is measured again.
         self.metrics = {name: value for name, value in self.metrics.items() if not name.startswith("latent_")}
 
-    def _view(self, name: str) -> Any:
-        if name not in self._views:
-            self._views[name] = self._makers[name]()
-        return self._views[name]
-
     def features(self, name: str = "observations") -> Any:
         """Features of the trunk without their graph, which actors read.
 
@@ -105,7 +100,7 @@ class EncoderUpdate:
         """
         if name not in self._features:
             with th.no_grad():
-                self._features[name] = self.encoder.trunk(self._view(name))
+                self._features[name] = self.encoder.trunk(self._views[name]())
         return self._features[name]
 
     def latents(self, source: str, name: str = "observations", graph: bool = True) -> th.Tensor:
@@ -118,7 +113,7 @@ class EncoderUpdate:
         """
         if name not in self._latents:
             with th.set_grad_enabled(graph):
-                features = self.encoder.trunk(self._view(name))
+                features = self.encoder.trunk(self._views[name]())
                 self._latents[name] = self.encoder.projection(features).float()
             self._features[name] = detached(features)
         leaf = self._latents[name].detach()
@@ -134,7 +129,7 @@ class EncoderUpdate:
         :return: [B, features_dim]
         """
         if name not in self._target_latents:
-            self._target_latents[name] = self.target(self._view(name))
+            self._target_latents[name] = self.target(self._views[name]())
         return self._target_latents[name]
 
     def leaves(self, source: str) -> list[th.Tensor]:
@@ -175,9 +170,9 @@ class EncoderUpdate:
     def _step(self) -> None:
         """Step along the gradients that were collected since the last step, if there are any, and drop all graphs."""
         if self._gradients:
-            joint = self.mode == "joint"
-            optimizer = self.optimizers["joint" if joint else next(iter(self._gradients))]
-            update_learning_rate(optimizer, self.learning_rate * len(self._gradients) ** 0.5)  # sequential: of one
+            joint, source = self.mode == "joint", next(iter(self._gradients))  # sequential: the only one
+            optimizer = self.optimizers["joint" if joint else source]
+            update_learning_rate(optimizer, self.learning_rate * len(self._gradients) ** 0.5)
             measures = self._n_updates % MEASURE_INTERVAL == 1
             if measures and joint:
                 self._measure_shares()
@@ -187,7 +182,7 @@ class EncoderUpdate:
             optimizer.step()
             if before:
                 steps = [parameter.detach() - old for parameter, old in zip(self._parameters, before, strict=True)]
-                self.metrics[f"encoder_step_norm_{next(iter(self._gradients))}"] = _norm(steps)
+                self.metrics[f"encoder_step_norm_{source}"] = _norm(steps)
         self._forget()
 
     def _backward(self, gradients: Sequence[dict[str, th.Tensor]], retain_graph: bool = False) -> list[th.Tensor]:
@@ -216,10 +211,9 @@ class EncoderUpdate:
         self._leaves: dict[str, dict[str, th.Tensor]] = {}
         self._gradients: dict[str, dict[str, th.Tensor]] = {}
 
-    def _reset(self, makers: Mapping[str, Callable[[], Any]]) -> None:
+    def _reset(self, views: Mapping[str, Callable[[], Any]]) -> None:
         """Take the views of another update; between updates none, as graphs would forbid copies of the model."""
-        self._makers = makers
-        self._views: dict[str, Any] = {}
+        self._views = {name: cache(make) for name, make in views.items()}
         self._target_latents: dict[str, th.Tensor] = {}
         self._forget()
 
