@@ -6,21 +6,16 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
    spaces and ``np_random``.
 2. DeepMind Control tasks of the suite: MuJoCo's integration state, what the task changed in the model, its random
    stream, the step count.
-3. Plain attributes: numbers, strings, arrays, NumPy's generators, and containers of these. Functions, classes and
-   spaces are those of the new environment. State in class attributes, in module variables or on the side of a library
-   is not seen.
+3. Layers of Gymnasium, SB3 and this package: their plain attributes (numbers, strings, arrays, NumPy's generators, and
+   containers of these). Functions, classes and spaces are those of the new environment.
 
-A layer with any other attribute, or with one object under two names (which would be two after loading), makes its
-environment begin a new episode; what the other layers keep, such as running statistics, is restored all the same.
-Layers are compared by their classes and the environment's id, not by their arguments.
+Any other layer makes its environment begin a new episode, as nothing tells whether its attributes are all of its state;
+what the other layers keep, such as running statistics, is restored all the same. Layers are compared by their classes
+and the environment's id, not by their arguments.
 """
 
 import copy
-import inspect
 import random
-from collections import deque
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -47,10 +42,8 @@ _NO_STATE: dict[type, set[str]] = {
 }
 #: What Gymnasium's own environments draw into
 _RENDERERS = {"clock", "screen", "surf", "window", "window_surface"}
-#: Packages whose layers share only arrays that they never write into
-_KNOWN = ("gymnasium.wrappers.", "stable_baselines3.", "sb3_cure.")
-#: Types of values that cannot change, so that it does not matter how many names they have
-_IMMUTABLE = (type(None), bool, int, float, str, bytes, np.generic, Path)
+#: Packages whose layers keep their state in plain attributes
+_KNOWN = ("gymnasium.", "stable_baselines3.", "sb3_cure.")
 
 
 class NotKept(Exception):
@@ -193,11 +186,10 @@ def _describe(layers: list[Any]) -> str:
 
 def _layer_states(layers: list[Any]) -> list[dict[str, Any]]:
     states: list[dict[str, Any]] = []
-    kept: list[Any] = []  # of foreign layers, as one may hold what belongs to another
     for layer in layers:
         state: dict[str, Any] = {"error": None}
         try:
-            state |= _layer_state(layer, layers, kept)
+            state |= _layer_state(layer, layers)
         except (NotKept, TypeError) as error:  # TypeError: of a type that files do not hold
             state["error"] = str(error)
         except Exception as error:
@@ -206,7 +198,7 @@ def _layer_states(layers: list[Any]) -> list[dict[str, Any]]:
     return states
 
 
-def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, Any]:
+def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     name, own, attributes = type(layer).__name__, None, vars(layer)
     if _has_state_dict(layer):
         own, attributes = layer.state_dict(), {"_np_random": attributes.get("_np_random")}
@@ -219,19 +211,16 @@ def _layer_state(layer: Any, layers: list[Any], kept: list[Any]) -> dict[str, An
     elif isinstance(layer, wrappers.PassiveEnvChecker):
         # It compares the first observations and infos, which need not be plain, and is done with that when resumed.
         attributes = dict.fromkeys(("checked_reset", "checked_step", "checked_data_reuse"), True)
-    elif not isinstance(layer, gym.Env | VecEnvWrapper):
+    elif not isinstance(layer, gym.Env | VecEnvWrapper) or not type(layer).__module__.startswith(_KNOWN):
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
     values = {}
     for key, value in attributes.items():
-        is_built = isinstance(value, EnvSpec | gym.Space) or _is_stateless(value)
+        is_built = isinstance(value, EnvSpec | gym.Space | np.dtype) or callable(value)
         if key not in no_state and not is_built and not any(value is other for other in layers):
             encode(value, f"{name}.{key}", {})
             values[key] = value
-    if own is None and not type(layer).__module__.startswith(_KNOWN):
-        kept += values.values()
-        _check_sharing(kept, name)
     encode(own, f"{name}.state_dict()", {})
     drawn = {key: [part._np_random for part in _parts(space)] for key, space in _spaces(layer).items()}
     # A copy, as the environment may write into its own
@@ -277,53 +266,6 @@ def _spaces(layer: Any) -> dict[str, gym.Space]:
 
 def _parts(space: gym.Space) -> list[Any]:
     """List a space and all that it is composed of: each draws from a generator of its own."""
-    spaces = [space]
-    for each in spaces:  # grows meanwhile
-        values = [part for value in vars(each).values() for part in (value, *_inside(value))]
-        spaces += [part for part in values if isinstance(part, gym.Space)]
-    return spaces
-
-
-def _inside(value: Any) -> Iterable[Any]:
-    if isinstance(value, dict):
-        return [*value, *value.values()]
-    return value if isinstance(value, list | tuple | set | deque) else ()
-
-
-def _is_stateless(value: Any) -> bool:
-    """Check that a value is a function or class that keeps nothing."""
-    if isinstance(value, np.ufunc | np.dtype) or inspect.isclass(value):
-        return True
-    owner = getattr(value, "__self__", None)
-    is_free = getattr(value, "__closure__", None) is None and (owner is None or inspect.ismodule(owner))
-    # Functions that Gymnasium's wrappers make hold their constructor's arguments alone.
-    is_gymnasium = (getattr(value, "__module__", None) or "").startswith("gymnasium.")
-    return inspect.isroutine(value) and (is_free or is_gymnasium)
-
-
-def _check_sharing(values: Iterable[Any], name: str) -> None:
-    """Refuse objects and memory that are met twice, as they would be two after loading.
-
-    :param values: Plain values
-    :param name: What holds them
-    :raises NotKept: if an object is met twice, or an array is in the memory of another object
-    """
-    met: set[int] = set()
-    queue = list(values)
-    for value in queue:  # grows meanwhile
-        if isinstance(value, _IMMUTABLE):
-            continue
-        queue += [*_inside(value), *getattr(value, "__dict__", {}).values()]
-        if isinstance(value, np.ndarray):
-            if value.dtype.kind not in "biu" and not value.flags.c_contiguous:
-                raise NotKept(f"{name} has an array that is not in C's order, on which sums over it depend")
-            while isinstance(value.base, np.ndarray):
-                value = value.base
-            if value.base is not None and value.flags.writeable:
-                raise NotKept(f"{name} has an array in the memory of another object")
-        if isinstance(value, th.Tensor):
-            value = value.untyped_storage()
-        identity = value.data_ptr() if isinstance(value, th.UntypedStorage) else id(value)
-        if identity in met and not isinstance(value, tuple):
-            raise NotKept(f"{name} keeps one object or memory under two names")
-        met.add(identity)
+    inside = getattr(space, "spaces", ())
+    parts = inside.values() if isinstance(inside, dict) else inside
+    return [space, *(part for each in parts for part in _parts(each))]
