@@ -30,7 +30,6 @@ from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import decoding, diagnostics
 from sb3_cure.evaluation.encoding import encoder_of
-from sb3_cure.evaluation.result_files import write_csv
 from sb3_cure.evaluation.rollouts import (
     Episode,
     as_arrays,
@@ -462,12 +461,10 @@ class StateProbeCallback(RolloutCallback):
     """Measure how well a linear map of the latents predicts the true state, which the agent does not see.
 
     Logs R² of each coordinate, ``probe/<name>`` (``sb3_cure.evaluation.rollouts.state_probe``), and their mean,
-    ``probe/mean``; long names are not printed. Writes ``state_probe.csv``, a row per time, and ``state_probe.png``,
-    bars of the first and of the latest time. In a new training the first row is that of the untrained encoder. By
+    ``probe/mean``; long names are not printed. In a new training the first row is that of the untrained encoder. By
     default all rows are of the same episodes of random actions, so that they can be compared.
 
     :param eval_env: One (not vectorised) environment, not the training one
-    :param folder: Where to write
     :param every: Agent steps between two rows
     :param n_episodes: Episodes per policy, two at least
     :param state: Function of the environment that returns its true state, [d]; by default that of dm_control:
@@ -475,15 +472,13 @@ class StateProbeCallback(RolloutCallback):
     :param names: Names of what ``state`` returns, [d], required with it; none of them counts as an angle
     :param seed: Seed of the first reset and of the random actions each time
     :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; their episodes are taken together
-    :param kwargs: ``deterministic``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the names of the files
+    :param kwargs: ``deterministic``, ``verbose`` of ``RolloutCallback``
     :raises ValueError: if the environment's state is unknown, or ``state`` comes without ``names``
-    :raises ImportError: if matplotlib is not installed
     """
 
     def __init__(
         self,
         eval_env: gym.Env,
-        folder: str | Path,
         every: int = 5000,
         n_episodes: int = 10,
         state: Callable[[gym.Env], np.ndarray] | None = None,
@@ -493,11 +488,9 @@ class StateProbeCallback(RolloutCallback):
         **kwargs: Any,
     ):
         super().__init__(eval_env, every, n_episodes, seed=seed, actors=actors, **kwargs)
-        self.folder = Path(folder)
         self.state, self.names, self.units = _true_state(eval_env, state, names)
         #: One row per time: agent steps and R² by name
         self.rows: list[dict[str, float]] = []
-        from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -506,21 +499,12 @@ class StateProbeCallback(RolloutCallback):
                 self.on_period()
 
     def on_period(self) -> None:
-        """Measure, log and draw."""
-        from sb3_cure.evaluation import plots
-
+        """Measure and log."""
         episodes = (episode for actor in self.actors for episode in self.run(actor, states=self.state))
         found = state_probe(self.model, episodes, self.names, self.units)
         for name, value in {**found, "mean": float(np.nanmean(list(found.values())))}.items():
             self.logger.record(f"probe/{name}", value, exclude=("stdout", "log") if len(name) > PRINTED_NAME else ())
         self.rows.append({"timesteps": self.num_timesteps, **found})
-        write_csv(self._path(self.folder, "state_probe.csv"), list(self.rows[0]), self.rows)
-        first, last = self.rows[0], self.rows[-1]
-        plots.state_probe_bars(
-            self._path(self.folder, "state_probe.png"),
-            {f"{row['timesteps']:,} agent steps": {name: row[name] for name in self.names} for row in (first, last)},
-            "R² of the true state, predicted from the latents by a linear map",
-        )
 
 
 class DiagnosticsCallback(PeriodicCallback):

@@ -259,37 +259,6 @@ def _draw_bar(axes: Axes, position: float, bar: Bar, logarithmic: bool) -> None:
     note.set(ha="center", va="bottom", bbox={"color": "white", "alpha": 0.8, "pad": 0.5})
 
 
-@in_style
-def state_probe_bars(path: PathOrFile, probes: Mapping[str, Mapping[str, float]], title: str) -> None:
-    """R² of each coordinate of the true state, a bar for each probe.
-
-    Bars end at -0.1, as it does not matter how much worse than the mean a prediction is; numbers are written next to
-    them.
-
-    :param path: File to write
-    :param probes: By label (times of training, heads): R² by coordinate, of ``evaluation.state_probe``
-    :param title: Title of the figure
-    """
-    names = list(next(iter(probes.values())))
-    height = 0.8 / len(probes)
-    figure = Figure(figsize=(7.0, 1.3 + 0.34 * len(names) * max(1, 0.6 * len(probes))))
-    axes = figure.subplots()
-    colors = arm_colors(list(probes), next(iter(probes)))
-    for index, (label, values) in enumerate(probes.items()):
-        places = np.arange(len(names)) + (index - (len(probes) - 1) / 2) * height
-        widths = np.clip([values[name] for name in names], -0.1, None)
-        axes.barh(places, widths, 0.9 * height, color=colors[label], alpha=0.85, label=_plain(label))
-        for place, width, name in zip(places, widths, names, strict=True):
-            text = f"{round(values[name], 2) + 0:.2f}" if np.isfinite(width) else "n/a"
-            axes.text(max(np.nan_to_num(width), 0) + 0.01, place, text, va="center", fontsize=7)
-    axes.axvline(0, color="#333333", linewidth=1)
-    axes.set_yticks(range(len(names)), [_plain(name.replace("_", " ")) for name in names])
-    axes.set(xlim=(-0.1, 1.08), ylim=(len(names) - 0.5, -0.5), xlabel="R² of episodes left out", title=_plain(title))
-    axes.grid(False, axis="y")
-    _shared_legend(figure, [axes])
-    save(figure, path)
-
-
 def _panels(count: int, height: float, ylabel: str) -> tuple[Figure, list[Axes]]:
     """Make a figure with a number of axes, at most three in a row, as wide as a page."""
     columns = min(count, 3)

@@ -111,14 +111,14 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
                 ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
-                StateProbeCallback(env, tmp_path, 15, n_episodes=2, **MAP),
+                StateProbeCallback(env, 15, n_episodes=2, **MAP),
             ]
         model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12))
         models.append(model.learn(40, callback=callbacks))
     assert names(tmp_path) == sorted(
         [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
         + [f"curiosity_map_{steps}_steps.png" for steps in (15, 30)]
-        + ["reconstructions.png", "state_probe.csv", "state_probe.png"]
+        + ["reconstructions.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
 
@@ -334,7 +334,7 @@ class Wide(PixelBox):
         (lambda path: ReconstructionCallback(path, observations=np.zeros((2, 6, 36, 36))), "must be n of Box"),
         (lambda path: PolicyVideoCallback(PixelBox(), path), "must have render_mode='rgb_array', not None"),
         (lambda path: CuriosityMapCallback(PixelBox(), path), "has no physics of dm_control"),
-        (lambda path: StateProbeCallback(PixelBox(), path, state=position), "state and names belong together"),
+        (lambda path: StateProbeCallback(PixelBox(), state=position), "state and names belong together"),
         (lambda path: CuriosityMapCallback(PixelBox(), path, state=position, names=["x"]), "a map needs two"),
         (lambda path: CuriosityMapCallback(PixelBox(), path, coordinates=("x", "z"), **MAP), "choose of x, y"),
     ],
@@ -416,13 +416,13 @@ def test_key_with_slash_names_a_file(tmp_path: Path) -> None:
     assert names(tmp_path) == ["reconstructions_walker_camera.png"]
 
 
-def test_long_names_that_begin_alike_are_logged(tmp_path: Path) -> None:
+def test_long_names_that_begin_alike_are_logged() -> None:
     """SB3's printed table refuses them; other logs have both."""
     long = [f"position_of_the_gripper_in_the_world_{axis}" for axis in "xy"]
     kept, printed = KeptRows(), io.StringIO()
     model = tiny_model("CnnPolicy", PixelBox())
     model.set_logger(Logger(None, [HumanOutputFormat(printed), kept]))
-    probe = StateProbeCallback(PixelBox(), tmp_path, every=20, n_episodes=2, state=position, names=long)
+    probe = StateProbeCallback(PixelBox(), every=20, n_episodes=2, state=position, names=long)
     model.learn(41, callback=probe, log_interval=1)
     assert model.num_timesteps == 41 and "mean" in printed.getvalue()
     assert {f"probe/{name}" for name in long} <= kept.rows[0].keys()
@@ -522,13 +522,12 @@ def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:
     env.close(), training.close()
 
 
-def test_state_probe_over_training(tmp_path: Path) -> None:
-    """A row of the untrained encoder, then one each time, of the same episodes; logged and written."""
+def test_state_probe_over_training() -> None:
+    """A row of the untrained encoder, then one each time, of the same episodes; logged."""
     model, untrained = (tiny_model("CnnPolicy", PixelBox()) for _ in range(2))
-    callback = StateProbeCallback(PixelBox(), tmp_path, every=15, n_episodes=3, **MAP)
+    callback = StateProbeCallback(PixelBox(), every=15, n_episodes=3, **MAP)
     model.learn(35, callback=callback, log_interval=1)
-    rows = [line.split(",") for line in (tmp_path / "state_probe.csv").read_text().splitlines()]
-    assert rows[0] == ["timesteps", "x", "y"] and [row[0] for row in rows[1:]] == ["0", "15", "30"]
+    assert [row["timesteps"] for row in callback.rows] == [0, 15, 30]
     callback.on_period()
     for trained, row in ((untrained, callback.rows[0]), (model, callback.rows[-1])):
         episodes = list(run_episodes(trained, PixelBox(), 3, "random", states=position, seed=0))
@@ -537,15 +536,6 @@ def test_state_probe_over_training(tmp_path: Path) -> None:
     logged = model.logger.name_to_value
     assert (logged["probe/x"], logged["probe/y"]) == (row["x"], row["y"])
     assert logged["probe/mean"] == pytest.approx((row["x"] + row["y"]) / 2)
-
-
-def test_bars_of_a_state_probe(tmp_path: Path) -> None:
-    """Any number of probes, also far below zero or unknown."""
-    found = {"a": 0.9, "b_velocity": -7.0, "c": np.nan}
-    plots.state_probe_bars(tmp_path / "one.png", {"now": found}, "title")
-    plots.state_probe_bars(tmp_path / "two.png", {"first": found, "now": found}, "title")
-    one, two = (np.asarray(Image.open(tmp_path / f"{name}.png").convert("L")) for name in ("one", "two"))
-    assert one.std() > 5 and two.shape[0] > one.shape[0] and two.shape[1] == one.shape[1]
 
 
 @given(
