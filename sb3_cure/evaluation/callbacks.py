@@ -268,7 +268,6 @@ class ReconstructionCallback(PeriodicCallback):
         then that of the untrained model, if the head itself reconstructs. By default ``columns`` of the replay buffer,
         spread over their time when the first row is drawn
     :param columns: How many observations to take
-    :param frame_stack: Frames per observation, of which the newest is shown; by default that of the environment
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
     :param max_rows: Most rows of the picture; further times are left out evenly
     :param verbose: 1 prints the file's name
@@ -283,7 +282,6 @@ class ReconstructionCallback(PeriodicCallback):
         every: int = 5000,
         observations: np.ndarray | dict[str, np.ndarray] | None = None,
         columns: int = 8,
-        frame_stack: int | None = None,
         decoder_updates: int = 500,
         max_rows: int = 12,
         verbose: int = 0,
@@ -291,7 +289,7 @@ class ReconstructionCallback(PeriodicCallback):
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.frame_stack, self.decoder_updates, self.max_rows = frame_stack, decoder_updates, max_rows
+        self.decoder_updates, self.max_rows = decoder_updates, max_rows
         self.title = title
         #: Agent steps and the reconstructions then, their newest frames, uint8 [n, C, H, W], or such by key
         self.rows: list[tuple[int, Any]] = []
@@ -327,7 +325,7 @@ class ReconstructionCallback(PeriodicCallback):
         if drawn is None:
             return
         title, *pair = drawn
-        frame_stack = self.frame_stack or infer_frame_stack(self.training_env)
+        frame_stack = infer_frame_stack(self.training_env)
         seen, row = (
             {key: np.array(as_arrays(newest_frames(each[key], frame_stack))) for key in pair[1]} for each in pair
         )
@@ -512,7 +510,6 @@ class DiagnosticsCallback(PeriodicCallback):
 
     ========================  ============================================================================
     ``constant_image``        All recent observations of an environment are equal
-    ``dead_units``            90 % of the ReLUs of a layer of the encoder never fire
     ``collapsed_latents``     The encoder's latents differ by less than 1 % of their size
     ``autoencoder``           Explains less than 1 % of the pixels' variance: no better than the mean image
     ``temperature``           Outside of its bounds, while the policy's entropy misses its target

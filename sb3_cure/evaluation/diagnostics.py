@@ -10,23 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from torch import nn
 
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import transitions
 from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.evaluation.rollouts import stored_places
-from sb3_cure.networks.layers import Conv2dReLU
 from sb3_cure.srl import RAE, DictHead
 
 #: Latest transitions, of all environments together, that are checked for a constant image
 RECENT = 1000
 #: Observations of an environment that must be equal to count as constant: a robot may lie still for a moment
 MIN_ALIKE = 30
-#: Share of a layer's units that never fire. Half of them and more are silent in runs that learn well: as pixels are
-#: positive and of few colours, many random filters are negative everywhere
-DEAD_SHARE = 0.9
 #: Deviation of the latents between observations, as a share of their root mean square. Runs that learn well were
 #: measured at 0.3 to 0.5 after 1000 updates; in their first 500 some fell to 0.004 and came back
 LATENT_SPREAD = 0.01
@@ -90,10 +85,9 @@ def look(
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
     yield temperature_at_bound(temperatures, model, bounds)
-    encoded = _encode(model, batch)
-    if encoded is not None:
-        latents, silent = encoded
-        yield dead_units(silent) if silent else None
+    found = encoder_of(model.policy)
+    if found is not None:
+        latents = found[1](batch.observations)
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
         yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
@@ -129,21 +123,6 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
         "env.render() shows, and camera_id."
     )
     return Finding("constant_image", len(constant), problem if constant else None)
-
-
-def dead_units(silent: dict[str, float]) -> Finding:
-    """ReLUs of the encoder (channels of convolutions) that are 0 for all observations and hence get no gradient.
-
-    Value: the largest share of such units in a layer. Expected: below ``DEAD_SHARE``.
-
-    :param silent: By layer, the share of its units that are 0 for all observations
-    """
-    layer = max(silent, key=lambda name: silent[name])
-    problem = (
-        f"{silent[layer]:.0%} of the units of the encoder's layer {layer!r} are 0 for every observation and no longer "
-        "learn: restart with a smaller learning_rate, or clip or scale the rewards."
-    )
-    return Finding("dead_units", silent[layer], problem if silent[layer] >= DEAD_SHARE else None)
 
 
 def collapsed_latents(latents: th.Tensor) -> Finding:
@@ -235,29 +214,6 @@ def curious_reward(deviation: float, temperatures: Sequence[Temperature]) -> Fin
 
 
 # ------------------------------------------------------------------- measurements
-
-
-def _encode(model: Any, batch: ReplayBufferSamples) -> tuple[th.Tensor, dict[str, float]] | None:
-    """Compute latents, [n, features_dim], and for each ReLU of the encoder the share of its units that never fire."""
-    found = encoder_of(model.policy)
-    if found is None:
-        return None
-    encoder, encode = found
-    peaks: dict[str, th.Tensor] = {}
-
-    def note(module: nn.Module, _: Any, output: th.Tensor) -> None:
-        peaks[names[module]] = output.transpose(0, 1).flatten(1).amax(dim=1)
-
-    names: dict[nn.Module, str] = {
-        module: name for name, module in encoder.named_modules() if isinstance(module, nn.ReLU | Conv2dReLU)
-    }
-    handles = [module.register_forward_hook(note) for module in names]
-    try:
-        latents = encode(batch.observations)
-    finally:
-        for handle in handles:
-            handle.remove()
-    return latents, {name: float((peak <= 0).float().mean()) for name, peak in peaks.items()}
 
 
 def explained_share(model: Any, batch: ReplayBufferSamples, latents: th.Tensor) -> float | None:
