@@ -8,6 +8,7 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
    stream, the step count.
 3. Layers of Gymnasium, SB3 and this package: their plain attributes (numbers, strings, arrays, NumPy's generators, and
    containers of these). Functions, classes and spaces are those of the new environment.
+4. Other wrappers without attributes of their own: nothing.
 
 Any other layer makes its environment begin a new episode, as nothing tells whether its attributes are all of its state;
 what the other layers keep, such as running statistics, is restored all the same. Layers are compared by their classes
@@ -42,6 +43,8 @@ _NO_STATE: dict[type, set[str]] = {
 }
 #: What Gymnasium's own environments draw into
 _RENDERERS = {"clock", "screen", "surf", "window", "window_surface"}
+#: Attributes of a wrapper that keeps nothing
+_BARE = {*vars(gym.Wrapper(gym.Env())), "_saved_kwargs"}
 #: Packages whose layers keep their state in plain attributes
 _KNOWN = ("gymnasium.", "stable_baselines3.", "sb3_cure.")
 
@@ -211,7 +214,7 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     elif isinstance(layer, wrappers.PassiveEnvChecker):
         # It compares the first observations and infos, which need not be plain, and is done with that when resumed.
         attributes = dict.fromkeys(("checked_reset", "checked_step", "checked_data_reuse"), True)
-    elif not isinstance(layer, gym.Env | VecEnvWrapper) or not type(layer).__module__.startswith(_KNOWN):
+    elif not (_is_known(layer) or (isinstance(layer, gym.Wrapper) and attributes.keys() <= _BARE)):
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
@@ -253,6 +256,10 @@ def _load_layer(layer: Any, state: dict[str, Any]) -> None:
 def _has_state_dict(layer: Any) -> bool:
     # Of the class: an instance of VecEnvWrapper also shows what it wraps.
     return hasattr(type(layer), "state_dict") and hasattr(type(layer), "load_state_dict")
+
+
+def _is_known(layer: Any) -> bool:
+    return isinstance(layer, gym.Env | VecEnvWrapper) and type(layer).__module__.startswith(_KNOWN)
 
 
 def _is_dmc(layer: Any) -> bool:

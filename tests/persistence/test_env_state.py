@@ -211,15 +211,6 @@ class GlobalNoise(Dot):
         return observation, reward + np.random.normal() + random.random(), *rest
 
 
-@pytest.mark.parametrize("make", [Nested, functools.partial(make_pixel_env, "Pendulum-v1", image_size=12)])
-def test_spaces_and_environments_of_gymnasium_continue(make: Any) -> None:
-    venv, fresh = (DummyVecEnv([lambda: Monitor(make())] * 2) for _ in range(2))
-    venv.seed(0)
-    venv.reset()
-    follow(venv, actions(venv, 5))
-    check_continues(venv, fresh, 12)
-
-
 def test_worker_processes_continue_with_their_random_streams() -> None:
     def build() -> VecEnv:
         makers = [lambda: ResumableEnv(Monitor(GlobalNoise()))] * 2
@@ -243,8 +234,19 @@ def test_unreachable_layers_in_workers_are_reported(make: Callable[[], gym.Env])
     venv.close()
 
 
+class Halved(gym.RewardWrapper):
+    """A wrapper of the user's that keeps nothing."""
+
+    def reward(self, reward: Any) -> float:
+        return reward / 2
+
+
 class Silent(gym.Wrapper):
-    """A layer of the user's without ``state_dict``: it may keep anything."""
+    """A wrapper of the user's that keeps something, and does not say whether that is all of its state."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.seen = 0
 
 
 def locked() -> gym.Env:
@@ -252,6 +254,17 @@ def locked() -> gym.Env:
     env = gym.make("Pendulum-v1").unwrapped
     env.lock = threading.Lock()  # type: ignore[attr-defined]
     return env
+
+
+@pytest.mark.parametrize(
+    "make", [Nested, lambda: Halved(Dot()), functools.partial(make_pixel_env, "Pendulum-v1", image_size=12)]
+)
+def test_other_layers_continue(make: Any) -> None:
+    venv, fresh = (DummyVecEnv([lambda: Monitor(make())] * 2) for _ in range(2))
+    venv.seed(0)
+    venv.reset()
+    follow(venv, actions(venv, 5))
+    check_continues(venv, fresh, 12)
 
 
 class Broken(Dot):

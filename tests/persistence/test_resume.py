@@ -341,7 +341,11 @@ def test_other_algorithms_continue_bit_for_bit(tmp_path: Path) -> None:
 
 
 class NoState(gym.Wrapper):
-    """A layer of the user's that does not say what its state is."""
+    """A wrapper of the user's that does not say what its state is."""
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.seen = 0
 
 
 def test_new_episode_is_said_once_with_its_reason(tmp_path: Path) -> None:
