@@ -89,7 +89,7 @@ PEERS = {
         "c0c650b76c6e",
         {
             f"{lr}_{name}": _drqv2(float(lr), {"noise_share": share}, _OURS, 500)
-            for lr in ("3e-4", "1e-3")
+            for lr in ("1e-4", "3e-4", "1e-3")
             for name, share in _NOISE.items()
         },
         _drqv2(1e-4, {"noise_steps": _OWN_NOISE}, _THEIRS, 2000),
