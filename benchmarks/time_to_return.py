@@ -8,10 +8,10 @@ Arms:
 
 - names of files in ``zoo_configs/fast/`` (``best``, ``curl``, ``sac_ae`` ...): ours;
 - ``public``: the authors' SAC-AE (as in ``public_returns.py``) with the profile's sizes of networks;
-- ``drqv2`` and ``public_curl``: the authors' code (``peers.py``) in the best of their trials. Trials have the
-  profile's sizes of networks and warm-up, and learning rates by two schedules:
-  ``drqv2_{1e-4,3e-4,1e-3}_{easy,medium}`` and ``public_curl_{1e-3,2e-3}_{slow,quick}``, on cartpole-swingup, seed 0.
-  The best one has the highest mean return over the minutes of training. ``drqv2_own`` and ``public_curl_own``: in their own settings and sizes;
+- ``drqv2`` and ``public_curl``: the authors' code (``peers.py``) in the best of its trials, which have the profile's
+  sizes of networks and warm-up, and learning rates by two schedules: ``drqv2_{1e-4,3e-4,1e-3}_{easy,medium}`` and
+  ``public_curl_{1e-3,2e-3}_{slow,quick}``, on cartpole-swingup, seed 0. The best one has the highest mean return over
+  the minutes of training. ``drqv2_own`` and ``public_curl_own``: in their own settings and sizes;
 - ``sb3_sac``: SB3's ``SAC("CnnPolicy")`` with its defaults; ``sb3_sac_our_sizes``: with our hidden layers, batch size,
   learning rate and warm-up.
 
