@@ -62,6 +62,12 @@ class Goal(gym.Env):
         reward = float(self.compute_reward(self.place, self.goal, None))
         return self.observe(), reward, False, self.n >= 10, {}
 
+    def state_dict(self) -> dict[str, Any]:
+        return {"place": self.place, "goal": self.goal, "n": self.n}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+
 
 def sensor_model(env: Any = None, algorithm: type[CuReSAC] = CuReSAC, **kwargs: Any) -> CuReSAC:
     """Make a tiny model on ``SensorBox``.

@@ -1,5 +1,27 @@
 """Evaluation: rollouts and their errors, callbacks, diagnostics, plots, videos and deployment."""
 
-from sb3_cure.evaluation.rollouts import highest_errors, run_episodes, state_probe
+from sb3_cure.evaluation.rollouts import (
+    Episode,
+    HighestErrors,
+    balance_negatives,
+    binned_errors,
+    evenly_measured,
+    highest_errors,
+    run_episodes,
+    srl_errors,
+    state_probe,
+    trained_actors,
+)
 
-__all__ = ["highest_errors", "run_episodes", "state_probe"]
+__all__ = [
+    "Episode",
+    "HighestErrors",
+    "balance_negatives",
+    "binned_errors",
+    "evenly_measured",
+    "highest_errors",
+    "run_episodes",
+    "srl_errors",
+    "state_probe",
+    "trained_actors",
+]

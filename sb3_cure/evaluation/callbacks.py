@@ -18,12 +18,13 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
 from sb3_cure.data.buffers import infer_frame_stack, transitions
-from sb3_cure.data.observations import by_key, image_spaces
+from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
@@ -54,8 +55,6 @@ __all__ = [
 
 #: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
 PRINTED_NAME = 33
-#: Most rows of a picture of reconstructions; further times are left out evenly
-MAX_ROWS = 12
 
 
 class PeriodicCallback(BaseCallback):
@@ -265,14 +264,15 @@ class ReconstructionCallback(PeriodicCallback):
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param observations: What to reconstruct, as the model gets it: images uint8 [n, C, H, W], or dictionaries of such,
-        by key; the first row is then that of the untrained model, if the head itself reconstructs. By default
-        ``columns`` of the replay buffer, spread over their time when the first row is drawn
+    :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; the first row is
+        then that of the untrained model, if the head itself reconstructs. By default ``columns`` of the replay buffer,
+        spread over their time when the first row is drawn
     :param columns: How many observations to take
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
+    :param max_rows: Most rows of the picture; further times are left out evenly
     :param verbose: 1 prints the file's name
     :param title: Added to the picture's title, such as the names of task and method
-    :raises ValueError: if the model has no replay buffer, or does not learn from images with an encoder
+    :raises ValueError: if the model has no replay buffer, does not learn from images with an encoder, or from others
     :raises ImportError: if matplotlib is not installed
     """
 
@@ -283,21 +283,30 @@ class ReconstructionCallback(PeriodicCallback):
         observations: np.ndarray | dict[str, np.ndarray] | None = None,
         columns: int = 8,
         decoder_updates: int = 500,
+        max_rows: int = 12,
         verbose: int = 0,
         title: str = "",
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.decoder_updates, self.title = decoder_updates, title
+        self.decoder_updates, self.max_rows = decoder_updates, max_rows
+        self.title = title
         #: Agent steps and the reconstructions then, their newest frames, uint8 [n, C, H, W], or such by key
         self.rows: list[tuple[int, Any]] = []
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _init_callback(self) -> None:
-        if encoder_of(self.model.policy) is None or not image_spaces(self.model.observation_space):
+        space, given = self.model.observation_space, self.observations
+        if encoder_of(self.model.policy) is None or not image_spaces(space):
             raise ValueError("ReconstructionCallback needs a policy with an encoder of uint8 images, which it draws.")
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise ValueError("ReconstructionCallback needs a replay buffer, to which decoders are fitted.")
+        if given is None:
+            return
+        if isinstance(given, np.ndarray) and given.shape[1:] != space.shape:
+            self.observations = given = maybe_transpose(given, space)
+        if not all(space.contains(rows_of(given, i)) for i in range(len_of(given))):
+            raise ValueError(f"observations must be n of {space}, as the model learns from them.")
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
@@ -321,7 +330,7 @@ class ReconstructionCallback(PeriodicCallback):
             {key: np.array(as_arrays(newest_frames(each[key], frame_stack))) for key in pair[1]} for each in pair
         )
         self.rows.append((self.num_timesteps, row.get("", row)))
-        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), MAX_ROWS)).round().astype(int))
+        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
         for key, images in seen.items():
             # Keys such as dm_control's "walker/egocentric_camera"
             name = re.sub(r"[^\w.-]", "_", f"reconstructions_{key}" if key else "reconstructions")

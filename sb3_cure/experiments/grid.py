@@ -161,6 +161,8 @@ class GridFile(_Part):
         for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
             if name not in self.methods:
                 raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
+        if any(method.baseline == name for name, method in self.methods.items()):
+            raise ValueError("a method's baseline must be another method")
         return self
 
 

@@ -6,8 +6,8 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
    spaces and ``np_random``.
 2. DeepMind Control tasks of the suite: MuJoCo's integration state, what the task changed in the model, its random
    stream, the step count.
-3. Layers of Gymnasium, SB3 and this package: their plain attributes (numbers, strings, arrays, NumPy's generators, and
-   containers of these). Functions, classes and spaces are those of the new environment.
+3. Layers of Gymnasium, SB3, rl-zoo3 and this package: their plain attributes (numbers, strings, arrays, NumPy's
+   generators, and containers of these). Functions, classes and spaces are those of the new environment.
 4. Other wrappers without attributes of their own: nothing.
 
 Any other layer makes its environment begin a new episode, as nothing tells whether its attributes are all of its state;
@@ -46,7 +46,7 @@ _RENDERERS = {"clock", "screen", "surf", "window", "window_surface"}
 #: Attributes of a wrapper that keeps nothing
 _BARE = {*vars(gym.Wrapper(gym.Env())), "_saved_kwargs"}
 #: Packages whose layers keep their state in plain attributes
-_KNOWN = ("gymnasium.", "stable_baselines3.", "sb3_cure.")
+_KNOWN = ("gymnasium.", "stable_baselines3.", "sb3_contrib.", "rl_zoo3.", "sb3_cure.")
 
 
 class NotKept(Exception):

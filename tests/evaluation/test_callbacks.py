@@ -33,7 +33,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_cure import evaluation, make_dmc_env
 from sb3_cure.data.buffers import transitions
 from sb3_cure.envs import StackFrames
-from sb3_cure.evaluation import callbacks, plots
+from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import (
     CuriosityMapCallback,
     DiagnosticsCallback,
@@ -192,14 +192,11 @@ def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Pa
     assert picture.shape[0] > height and picture.std() > 5
 
 
-def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first row is the untrained model's; the picture stays as high as its most rows."""
-    monkeypatch.setattr(callbacks, "MAX_ROWS", 3)
+def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_path: Path) -> None:
+    """The first row is the untrained model's; the picture stays as high as ``max_rows`` rows."""
     env = PixelBox()
     observations = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
-    callback = ReconstructionCallback(tmp_path, every=4, observations=observations)
+    callback = ReconstructionCallback(tmp_path, every=4, observations=observations, max_rows=3)
     heights = []
 
     class Measure(BaseCallback):
@@ -333,6 +330,8 @@ class Wide(PixelBox):
         (lambda path: EvalBothCallback(PixelBox(low=-2)), "Action spaces do not match"),
         (lambda path: EvalBothCallback(DummyVecEnv([PixelBox])), "not a VecEnv"),  # type: ignore[arg-type]
         (lambda path: EvalBothCallback(PixelBox(), actors=["best"]), r"must be of task, random .* not \['best'\]"),
+        (lambda path: ReconstructionCallback(path, observations=np.zeros((2, 3, 8, 8), np.uint8)), "must be n of Box"),
+        (lambda path: ReconstructionCallback(path, observations=np.zeros((2, 6, 36, 36))), "must be n of Box"),
         (lambda path: PolicyVideoCallback(PixelBox(), path), "must have render_mode='rgb_array', not None"),
         (lambda path: CuriosityMapCallback(PixelBox(), path), "has no physics of dm_control"),
         (lambda path: StateProbeCallback(PixelBox(), state=position), "state and names belong together"),

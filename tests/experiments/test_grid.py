@@ -107,6 +107,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "neither of both": (dict(methods={"a": {"config": "zoo.yml", "train": False}}), "'a' neither trains nor"),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
+    "itself as baseline": (
+        dict(methods={"a": {"config": "zoo.yml", "baseline": "a"}, "b": {"config": "zoo.yml"}}),
+        "baseline must be another method",
+    ),
     "pictures that heads cannot judge alike": (
         dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),
         "differ in env_kwargs .*, but common heads judge all alike",

@@ -17,6 +17,7 @@ from envs_for_tests import differences
 from gymnasium import spaces, wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rl_zoo3.gym_patches import PatchedTimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecMonitor, VecNormalize
 
@@ -257,7 +258,13 @@ def locked() -> gym.Env:
 
 
 @pytest.mark.parametrize(
-    "make", [Nested, lambda: Halved(Dot()), functools.partial(make_pixel_env, "Pendulum-v1", image_size=12)]
+    "make",
+    [
+        Nested,
+        lambda: Halved(Dot()),
+        lambda: PatchedTimeLimit(Dot(), 7),  # rl-zoo3 puts it in place of Gymnasium's
+        functools.partial(make_pixel_env, "Pendulum-v1", image_size=12),
+    ],
 )
 def test_other_layers_continue(make: Any) -> None:
     venv, fresh = (DummyVecEnv([lambda: Monitor(make())] * 2) for _ in range(2))
