@@ -3,6 +3,7 @@
 import copy
 import pickle
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -367,13 +368,14 @@ def test_statistics_of_a_run_need_trust(folder: Path, played: list[Any]) -> None
     np.testing.assert_array_equal(statistics.obs_rms.mean, trained.obs_rms.mean)
 
 
-def test_environment_that_only_renders_is_wrapped_by_its_settings(
+def test_environment_that_only_renders_is_wrapped_by_the_guides_command(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As the guide's example does; it can be filmed, though so few steps are told to have taught nothing."""
+    """It can be filmed, though so few steps are told to have taught nothing."""
     guide = (Path(__file__).parents[2] / "docs" / "guide" / "environments.md").read_text()
-    example = next(block for block in re.findall(r"```yaml\n(.*?)```", guide, re.S) if "env_wrapper" in block)
-    train("--eval-freq", "-1", "-n", "14", task="Pendulum-v1", **yaml.safe_load(example)["default"])
+    command = next(block for block in re.findall(r"```bash\n(.*?)```", guide, re.S) if "env_wrapper" in block)
+    arguments = command.replace("my_module:My-v0", "Pendulum-v1").replace("-n 5000", "-n 14 --eval-freq -1")
+    assert main(shlex.split(arguments.replace("\\\n", ""))[1:]) == 0
     assert "Nothing was learned: no update is made before step learning_starts=500." in capsys.readouterr().out
     assert replay("record", Path("logs/cure_sac/Pendulum-v1_1"), "--trusted", task="Pendulum-v1") == 0
     (video,) = Path("logs/cure_sac/Pendulum-v1_1/videos").glob("*.mp4")
