@@ -23,7 +23,7 @@ OURS = "best"
 TRIAL_TASK, TRIAL_SEEDS = "cartpole-swingup", (0,)
 TARGETS = (300, 500, 700)
 #: Minutes after which returns are shown
-TIMES = (10, 30)
+TIMES = (5, 10, 15)
 COLUMNS = ("agent_steps", "environment_steps", "training_seconds", "return_mean", "return_std", "episodes", "limit")
 SUMMARY_COLUMNS = ("task", "arm", "target", "seeds", "reached", "median_minutes", "p_value", "minutes")
 #: Of the JSON files: conditions that the table names

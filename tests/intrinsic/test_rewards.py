@@ -395,6 +395,17 @@ def test_particle_forgets_a_buffer_that_was_not_loaded(space: str, tmp_path: Pat
     assert len(found) == 4 and not th.stack(found).any()
 
 
+def test_particle_numbers_the_episodes_of_a_buffer_that_was_loaded(tmp_path: Path) -> None:
+    """Into a model that has trained with another one: it holds but one episode."""
+    kwargs: dict[str, Any] = dict(intrinsic="particle", srl=None, task=False)
+    tiny_model("CnnPolicy", PixelBox(episode_length=50), **kwargs).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = tiny_model("CnnPolicy", PixelBox(episode_length=7), **kwargs).learn(30)
+    model.load_replay_buffer(tmp_path / "buffer")
+    found = captured(model)
+    model.train(2)
+    assert len(found) == 2 and not th.stack(found).any()
+
+
 def test_particle_of_a_single_episode_earns_nothing() -> None:
     model = filled_model(srl=None, intrinsic="particle")
     found = captured(model)
