@@ -155,8 +155,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         row |= {"rewards": reward, "dones": done}
         if self.handle_timeout_termination:
             row["timeouts"] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(self.n_envs)
-        for key in self.info_shapes:
-            row[f"infos/{key}"] = np.array([info[key] for info in infos])
+        for key, shape in self.info_shapes.items():
+            row[f"infos/{key}"] = np.array([info[key] for info in infos]).reshape(self.n_envs, *shape)
         counts = {}
         for key, ring in self.rings.items():
             tails = self.rows[f"slots/{key}"][before, :, 1] if self._n_valid else None
@@ -305,9 +305,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what has not been written to: a pickled buffer is as large as its contents."""
-        names = "observation_space action_space device n_envs handle_timeout_termination frame_stack".split()
-        names += ["info_shapes", "frames_dir"]
-        settings = {name: getattr(self, name) for name in names}
+        names = ("observation_space", "action_space", "device", "n_envs", "handle_timeout_termination")
+        settings = {name: getattr(self, name) for name in (*names, "frame_stack", "info_shapes", "frames_dir")}
         return {"buffer_size": self.buffer_size * self.n_envs, **settings, "state": self.state_dict()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
