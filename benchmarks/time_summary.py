@@ -173,7 +173,7 @@ def summarise(runs: Runs) -> list[Row]:
         for arm, seeds in arms.items():
             for target in TARGETS:
                 data = times_to(seeds, target)
-                median, compares = median_time(data), OURS in arms and arm != OURS
+                median, compares = median_time(data), OURS in arms and arm != OURS and not is_trial(arm)
                 values = (
                     *(task, arm, target, len(data), len(data) - data.num_censored()),
                     "not reached" if median is None else round(median, 2),
