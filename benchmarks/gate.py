@@ -1,5 +1,6 @@
 """Arms of ``zoo_configs/experiments/fast/gate*.yml``: a dense reward, and an oracle of exploration."""
 
+from collections import Counter
 from typing import Any
 
 import gymnasium as gym
@@ -45,7 +46,7 @@ class Oracle(IntrinsicReward):
     def __init__(self, *args: Any):
         super().__init__(*args)
         #: Visits of each cell
-        self.visits: dict[tuple[float, ...], int] = {}
+        self.visits = Counter[tuple[float, ...]]()
         self.n_counted = 0
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -58,7 +59,7 @@ class Oracle(IntrinsicReward):
 
         :param state: Result of ``get_extra_state``
         """
-        self.visits = dict(zip(map(tuple, state["cells"].tolist()), state["visits"].tolist(), strict=True))
+        self.visits = Counter(dict(zip(map(tuple, state["cells"].tolist()), state["visits"].tolist(), strict=True)))
         self.n_counted = int(state["n_counted"])
 
     def loss(self, inputs: RewardInputs) -> tuple[None, th.Tensor]:
@@ -70,8 +71,7 @@ class Oracle(IntrinsicReward):
         buffer: Any = inputs.replay_buffer
         new = np.arange(self.n_counted - buffer.n_added, 0) + buffer.pos
         for of_envs in buffer.rows["infos/cell"][new % buffer.buffer_size].tolist():
-            for cell in map(tuple, of_envs):
-                self.visits[cell] = self.visits.get(cell, 0) + 1
+            self.visits.update(map(tuple, of_envs))
         self.n_counted = buffer.n_added
         cells = inputs.info("cell")
         counts = [self.visits[tuple(cell)] for cell in cells.tolist()]
