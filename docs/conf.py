@@ -61,14 +61,14 @@ for folder in ("notebooks", "results"):
 def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
     """Links that work in the repository lead, on the site, to the pages that `notebooks` and `results` have there."""
     copied = r"(?=(?:notebooks|results)/[^)#]*\.(?:ipynb|md|png)[)#])"
-    if not docname.startswith("results/"):
-        source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./" + copied, r"\1", source[0])
-    else:
+    if docname.startswith("results/"):
         source[0] = source[0].replace("](../docs/", "](../")
         if not source[0].startswith("# "):
             source[0] = f"# {Path(docname).parent.name}\n\n{source[0]}"
         if docname.count("/") > 1:  # tables of one experiment, which pages link to
             source[0] = f"---\norphan: true\n---\n\n{source[0]}"
+    else:
+        source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./" + copied, r"\1", source[0])
 
 
 def escape_shapes(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

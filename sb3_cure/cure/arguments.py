@@ -22,7 +22,7 @@ Count = Annotated[int, Field(ge=1)]
 Schedule = Callable[[float], float]
 
 #: Reward of ``intrinsic="auto"`` where the head's error does not tell novelty: of those that explored as far as the
-#: error of an autoencoder (docs/evidence.md) the cheapest
+#: error of an autoencoder (results/curiosity.md) the cheapest
 AUTO_WITHOUT_NOVELTY = "rnd"
 
 
