@@ -14,7 +14,7 @@ from benchmarks.peers import is_trial, trial_arms
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.plots import arm_colors, in_style, save
 from sb3_cure.evaluation.result_files import Row, read_rows, write_csv, write_text
-from sb3_cure.experiments.grid import read_kept
+from sb3_cure.experiments.grid import read_json
 from sb3_cure.experiments.statistics import area_under_curve
 from sb3_cure.experiments.tables import NONE, Table
 
@@ -100,7 +100,7 @@ def read_runs(out: Path) -> Runs:
     runs: Runs = {}
     machines: dict[str, Path] = {}
     for path in sorted(out.glob("*/*/seed*.json")):
-        details, (task, arm) = read_kept(path), path.parts[-3:-1]
+        details, (task, arm) = read_json(path), path.parts[-3:-1]
         run = Run(read_rows(path.with_suffix(".csv"), COLUMNS), details)
         runs.setdefault(task, {}).setdefault(arm, {})[details["seed"]] = run
         machines[details["machine"]] = path

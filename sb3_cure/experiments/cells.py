@@ -26,7 +26,7 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_kept
+from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_json
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -88,7 +88,7 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
     :param settings: Settings of this run; keys that the file lacks are not compared
     :raises UsageError: if they differ
     """
-    before = read_kept(path) if path.exists() else {}
+    before = read_json(path) if path.exists() else {}
     for key, now in json.loads(json.dumps(settings, default=str)).items():
         if before.get(key, now) != now:
             raise UsageError(

@@ -309,17 +309,19 @@ def _changes_rewards(wrapper: Any) -> bool:
     return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper | gym.wrappers.NormalizeReward)
 
 
-def read_kept(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON file in the folder of results.
 
     :param path: The file
     :return: Its content
-    :raises UsageError: if it is damaged
+    :raises UsageError: if it is missing or damaged
     """
     try:
         return json.loads(path.read_text())
-    except (OSError, ValueError):
-        raise UsageError(f"{path} is damaged: remove {path.parent}, which is then made anew.") from None
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"{path} cannot be read ({error}): restore it, or remove {path.parent} and run the grid again."
+        ) from None
 
 
 def seed_of(folder: Path) -> int | None:

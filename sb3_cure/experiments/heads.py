@@ -18,7 +18,7 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, srl_errors
 from sb3_cure.experiments.cells import ERROR, alone_in
-from sb3_cure.experiments.grid import Cell, Grid, read_kept, short_name
+from sb3_cure.experiments.grid import Cell, Grid, read_json, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
 #: Updates of a common head
@@ -68,7 +68,7 @@ class CommonHeads:
     def fingerprint(self, results: Path) -> dict[str, Any]:
         """Content of their record: with further seeds, or a cell run again, it differs, and they are fitted anew."""
         finished = {
-            str(cell.folder): read_kept(results / cell.folder / "run.json")["finished"]
+            str(cell.folder): read_json(results / cell.folder / "run.json")["finished"]
             for cells in self.seeds(results).values()
             for cell in cells
         }
@@ -80,7 +80,7 @@ class CommonHeads:
         :param results: Folder of all results
         """
         path = results / self.folder / RECORD
-        return path.exists() and self.fingerprint(results).items() <= read_kept(path).items()
+        return path.exists() and self.fingerprint(results).items() <= read_json(path).items()
 
 
 Unit: TypeAlias = Cell | CommonHeads

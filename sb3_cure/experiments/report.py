@@ -10,7 +10,6 @@ import argparse
 import io
 import itertools
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -21,10 +20,10 @@ import numpy as np
 from PIL import Image
 
 import sb3_cure
-from sb3_cure.cli.usage import missing_file
+from sb3_cure.cli.usage import UsageError, missing_file
 from sb3_cure.evaluation import plots
 from sb3_cure.experiments import statistics, tables
-from sb3_cure.experiments.results import CellResult, Experiment, ResultsError, read_results
+from sb3_cure.experiments.results import CellResult, Experiment, read_results
 from sb3_cure.experiments.tables import (
     NONE,
     Table,
@@ -120,7 +119,6 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     :param thresholds: Returns, for the steps to reach them
     :param media: See ``media_of``
     :return: Its part of the report
-    :raises ResultsError: if a file of it cannot be read
     """
     status = tables.status_table(experiment)
     if not experiment.finished:
@@ -353,7 +351,7 @@ def write_report(
     :param thresholds: Returns, for the steps to reach them
     :param media: Of which seeds: ``"first"``, ``"all"`` or ``"none"``
     :return: The files that were written
-    :raises ResultsError: with one sentence that names the file and what is wrong
+    :raises UsageError: with one sentence, if the results cannot be read
     """
     sections = [describe(experiment, thresholds, media) for experiment in read_results(results)]
     facts = {"title": results.resolve().name, "sections": sections, "media": media}
@@ -378,7 +376,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure report``.
 
     :param argv: Command line, ``sys.argv`` by default
-    :return: 0, 1 if the results cannot be read, or 2 if there are none
+    :return: Exit status 0
+    :raises UsageError: with one sentence, if the results cannot be read
     """
     parser = argparse.ArgumentParser(
         prog="sb3-cure report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -391,15 +390,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=media_help)
     options = parser.parse_args(argv)
     if not options.results.is_dir():
-        print(f"{parser.prog}: {missing_file(options.results)}", file=sys.stderr)
-        return 2
-    try:
-        written = write_report(
-            options.results, options.out or options.results / "report.html", options.thresholds, options.media
-        )
-    except ResultsError as error:
-        print(f"sb3-cure report: {error}", file=sys.stderr)
-        return 1
+        raise UsageError(missing_file(options.results))
+    out = options.out or options.results / "report.html"
+    written = write_report(options.results, out, options.thresholds, options.media)
     size = written[0].stat().st_size / 2**20
     print(f"Wrote {written[0]} ({size:.1f} MB), and {len(written) - 1} tables and plots")
     return 0
@@ -412,7 +405,3 @@ def returns(text: str) -> list[float]:
     :return: The returns
     """
     return [float(number) for number in text.split(",")]
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,6 +1,5 @@
 """Read the folders that experiments wrote, and refuse what would give wrong numbers."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,14 +7,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sb3_cure.experiments.grid import SETTINGS, seed_of, short_name
+from sb3_cure.cli.usage import UsageError
+from sb3_cure.experiments.grid import SETTINGS, read_json, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
-_FIX = "remove the cell's folder and run the grid again"
-
-
-class ResultsError(ValueError):
-    """Results that cannot be read; the message is one sentence that names the file."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,8 @@ class CellResult:
             return np.zeros(0), np.zeros(0)
         known = table.dropna(subset=[column])
         steps, values = known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
-        if column == "return_mean" and stops_early(self.config) and len(steps) and steps[-1] < self.config["budget"]:
+        stopped = self.config.get("stop_at_return") is not None and len(steps) and steps[-1] < self.config["budget"]
+        if column == "return_mean" and stopped:
             steps, values = np.append(steps, self.config["budget"]), np.append(values, values[-1])
         return steps, values
 
@@ -71,18 +67,14 @@ class CellResult:
         """True physics states that were visited (``visits.npz``).
 
         :return: States by actor, [n, d] each, and the units of their coordinates; both empty if there are none
-        :raises ResultsError: if the file cannot be read
         """
         path = self.folder / "visits.npz"
         if not self.done or not path.exists():
             return {}, ()
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                names = [name for name in file.files if name.endswith("_states")]
-                found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
-                return found, tuple(map(str, file["state_units"])) if found else ()
-        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise ResultsError(f"{path} cannot be read ({error}): {_FIX}.") from None
+        with np.load(path) as file:
+            names = [name for name in file.files if name.endswith("_states")]
+            found = {name.removesuffix("_states"): np.asarray(file[name], dtype=np.float64) for name in names}
+            return found, tuple(map(str, file["state_units"])) if found else ()
 
 
 @dataclass(frozen=True)
@@ -168,22 +160,19 @@ def read_results(folder: str | Path) -> list[Experiment]:
 
     :param folder: A folder with experiments anywhere below it, or the folder of one
     :return: The experiments, by name
-    :raises ResultsError: with one sentence that names the folder or file and what is wrong with it
+    :raises UsageError: if there are none, if a JSON file is damaged, or if cells were run with different settings
     """
     folder = Path(folder)
     if (folder / "grid.json").exists():
         return [_read_experiment(folder / "grid.json")]
     grids = sorted(folder.rglob("grid.json"))
-    lost = {path.parents[3] for path in folder.rglob("*/*/seed*/DONE")} - {path.parent for path in grids}
-    if lost:
-        raise ResultsError(f"{min(lost)} holds finished cells, but no grid.json: run the grid again, which writes it.")
     if not grids:
-        raise ResultsError(f"{folder} holds no experiment: give the folder that `sb3-cure experiment` wrote.")
+        raise UsageError(f"{folder} holds no experiment: give the folder that `sb3-cure experiment` wrote.")
     return [_read_experiment(path, path.parent.relative_to(folder).as_posix()) for path in grids]
 
 
 def _read_experiment(path: Path, name: str | None = None) -> Experiment:
-    grid, root = _read_json(path, "experiment", "kind", "budget", "tasks", "methods", "seeds", "baseline"), path.parent
+    grid, root = read_json(path), path.parent
     tasks = [short_name(task) for task in grid["tasks"]]
     keys = [(task, method, seed) for task in tasks for method in grid["methods"] for seed in grid["seeds"]]
     for found in sorted(root.glob("*/*/seed*")):
@@ -208,7 +197,7 @@ def _check_settings(first: CellResult, other: CellResult, keys: tuple[str, ...])
     """Refuse to average over cells that were run with different settings."""
     for key in keys:
         if first.config.get(key) != other.config.get(key):
-            raise ResultsError(
+            raise UsageError(
                 f"{other.folder} was run with {key} {other.config.get(key)!r}, but {first.folder} with "
                 f"{first.config.get(key)!r}: put one of them into another folder."
             )
@@ -219,55 +208,12 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, grid: dict[str, 
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
         return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
-    config = _read_json(folder / "config.json", "task", "method", "seed", "budget", "env_kwargs", "arguments")
-    run = _read_json(folder / "run.json")
+    config, run = read_json(folder / "config.json"), read_json(folder / "run.json")
     if (short_name(config["task"]), config["method"], config["seed"]) != (task, method, seed):
-        raise ResultsError(f"{folder / 'config.json'} is of another cell than its folder: put it back.")
+        raise UsageError(f"{folder / 'config.json'} is of another cell than its folder: put it back.")
     budget = config["budget"]
     if budget not in (grid["budget"], 0):  # 0: representation learning alone, without training on the task
         return CellResult(task, method, seed, folder, f"other budget: {budget} steps", config, run)
-    is_visitation = grid["kind"] == "visitation"
-    evaluations = _read_table(folder / "eval.csv", budget > 0 and not is_visitation, "environment_steps", "return_mean")
-    visits = _read_table(folder / "visitation.csv", is_visitation, "error_min", "error_mean", "error_max")
-    covered = _read_table(folder / "coverage.csv", False, "environment_steps", "cells")
-    if budget > 0 and len(evaluations):
-        _check_whole(folder / "eval.csv", evaluations, config)
-    return CellResult(task, method, seed, folder, DONE, config, run, evaluations, visits, covered)
-
-
-def stops_early(config: dict[str, Any]) -> bool:
-    """Whether a cell may end before its budget.
-
-    :param config: Its ``config.json``
-    """
-    return config.get("stop_at_return") is not None
-
-
-def _check_whole(path: Path, evaluations: pd.DataFrame, config: dict[str, Any]) -> None:
-    """Refuse a curve that does not go from 0 to the budget, or lacks returns: its area would be wrong."""
-    steps, budget = evaluations["environment_steps"], config["budget"]
-    is_short = steps.iloc[-1] < budget and not stops_early(config)
-    if steps.iloc[0] > 0 or is_short or not (steps.diff().dropna() > 0).all():
-        raise ResultsError(f"{path} does not go step by step from 0 to {budget} environment steps: {_FIX}.")
-    if config["arguments"].get("task", True) and not np.isfinite(evaluations["return_mean"]).all():
-        raise ResultsError(f"{path} has a row without return_mean: {_FIX}.")
-
-
-def _read_json(path: Path, *needed: str) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if missing := [name for name in needed if name not in content]:
-            raise ValueError(f"it has no {missing[0]!r}")
-    except (OSError, ValueError, TypeError) as error:
-        raise ResultsError(f"{path} cannot be read ({error}): run the grid again, which writes it.") from None
-    return content
-
-
-def _read_table(path: Path, is_needed: bool, *numbers: str) -> pd.DataFrame:
-    """A CSV file with at least these columns of numbers; an empty table if there is none and none is needed."""
-    if not path.exists() and not is_needed:
-        return pd.DataFrame(columns=list(numbers), dtype=float)
-    try:
-        return pd.read_csv(path).astype(dict.fromkeys(numbers, float))
-    except (OSError, KeyError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise ResultsError(f"{path} cannot be read ({error}): {_FIX}.") from None
+    names = ("eval.csv", "visitation.csv", "coverage.csv")
+    tables = (pd.read_csv(folder / name) if (folder / name).exists() else pd.DataFrame() for name in names)
+    return CellResult(task, method, seed, folder, DONE, config, run, *tables)

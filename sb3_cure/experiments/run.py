@@ -3,7 +3,6 @@
 import argparse
 import os
 import re
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +15,7 @@ from sb3_cure.cli.progress import time_text
 from sb3_cure.cli.usage import UsageError, install_command
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
-from sb3_cure.experiments.grid import Grid, check_arms, load_grid, read_kept
+from sb3_cure.experiments.grid import Grid, check_arms, load_grid, read_json
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 
 ENGINES = ("local", "ray")
@@ -92,7 +91,7 @@ def _write_grid(grid: Grid, folder: Path) -> None:
     path = folder / "grid.json"
     description = dict(grid.description)
     if path.exists():
-        before = read_kept(path)
+        before = read_json(path)
         description["seeds"] = sorted({*before["seeds"], *description["seeds"]})
         description["tasks"] = list(dict.fromkeys([*before["tasks"], *description["tasks"]]))
         description["methods"] = {**before["methods"], **description["methods"]}
@@ -265,31 +264,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure experiment``.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0 if nothing failed, 1 if something did, 2 if the grid or the command line is wrong
+    :return: 0 if nothing failed, 1 if something did, 130 after Ctrl-C
+    :raises UsageError: with one sentence, if the grid cannot be run
     """
-    parser = _parser()
-    options = vars(parser.parse_args(arguments))
+    options = vars(_parser().parse_args(arguments))
     choice = {name: options.pop(name) for name in ("seeds", "tasks", "methods", "budget")}
     path, out, dry_run = (options.pop(name) for name in ("grid", "out", "dry_run"))
+    grid = load_grid(path, **choice)
+    if dry_run:
+        check_grid(grid, out)
+        print("\n".join(status_lines([*grid.cells, *common_heads(grid, out)], out)))
+        return 0
     try:
-        grid = load_grid(path, **choice)
-        if dry_run:
-            check_grid(grid, out)
-            print("\n".join(status_lines([*grid.cells, *common_heads(grid, out)], out)), flush=True)
-            return 0
         failed = run_grid(grid, out, **options)
-    except UsageError as error:
-        print(f"{parser.prog}: error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print(
             f"Stopped: {out} keeps the finished cells and the last checkpoints, from which the same command continues."
         )
         return 130
     for unit in failed:
-        print(f"{unit.folder} failed, see {out / unit.folder / ERROR}", flush=True)
+        print(f"{unit.folder} failed, see {out / unit.folder / ERROR}")
     return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

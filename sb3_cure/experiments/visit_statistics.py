@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from sb3_cure.experiments.results import Experiment, ResultsError
+from sb3_cure.experiments.results import Experiment
 from sb3_cure.experiments.statistics import Estimate, paired_ratio
 
 #: Heads by which policies are compared; others are yardsticks
@@ -132,7 +132,6 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
 
     :param experiment: An experiment
     :return: One row per task, arm and actor
-    :raises ResultsError: if a file cannot be read, or cells of a task have states of different coordinates
     """
     rows = []
     for task in experiment.tasks:
@@ -181,16 +180,13 @@ def entropy_bits(counts: np.ndarray) -> float:
 def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], tuple[str, ...]]:
     """True states by arm, actor and seed, and the units of their coordinates."""
     visits: dict[_Key, np.ndarray] = {}
-    kinds: dict[tuple[str, ...], str] = {}
+    units: tuple[str, ...] = ()
     for method in experiment.methods:
         for seed, cell in experiment.done(task, method).items():
-            states, units = cell.states()
+            states, own_units = cell.states()
             visits |= {(method, actor, seed): visited for actor, visited in states.items() if visited.size}
-            if states:
-                kinds.setdefault(units, f"{cell.folder} has states with the units {', '.join(units)}")
-    if len(kinds) > 1:
-        raise ResultsError(f"{', but '.join(kinds.values())}: they are of two tasks; put one of them elsewhere.")
-    return visits, next(iter(kinds), ())
+            units = own_units or units
+    return visits, units
 
 
 def _grid_of_random(visits: Mapping[_Key, np.ndarray], units: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

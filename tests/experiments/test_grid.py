@@ -13,6 +13,7 @@ import yaml
 from envs_for_tests import PixelBox
 from grids_for_tests import DMC_TASK, TASK, method, write_grid
 
+from sb3_cure.cli.main import main
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.experiments import run
 from sb3_cure.experiments.grid import Cell, check_arms, load_grid
@@ -144,7 +145,7 @@ def test_settings_that_cannot_work_are_refused(
     """By a dry run as by a run, before anything is written."""
     path = write_grid(tmp_path, methods={"right": {"config": "zoo.yml"}, "wrong": method(**overrides)})
     for more in ([], ["--dry-run"]):
-        assert run.main([str(path), "--out", str(tmp_path / "out"), *more]) == 2
+        assert main(["experiment", str(path), "--out", str(tmp_path / "out"), *more]) == 2
         assert f"method 'wrong' on {TASK} cannot be built: " in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -162,7 +163,7 @@ def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.Captu
         "--seeds 0": "seeds: List should have at least 1 item",
     }.items():
         try:
-            status = run.main([path, "--out", str(tmp_path / "out"), *wrong.replace("grid.yml", path).split()])
+            status = main(["experiment", path, "--out", str(tmp_path / "out"), *wrong.split()])
         except SystemExit as stop:  # argparse's
             status = stop.code  # type: ignore[assignment]
         assert status == 2

@@ -85,7 +85,7 @@ def test_heads_are_made_once_and_again_of_others(visits: Path, fitted: list[int]
     assert fitted[8:] == [0, 1, 2, 3] and common_rows(out)["seed0"] != rows["seed0"]
     cells.write_json(
         out / grid.cells[0].folder / "run.json",
-        {**run.read_kept(out / grid.cells[0].folder / "run.json"), "finished": "later"},
+        {**run.read_json(out / grid.cells[0].folder / "run.json"), "finished": "later"},
     )
     assert run.run_grid(grid, out, pictures=False) == [] and fitted[12:] == [0, 1, 2, 3]
 
@@ -144,7 +144,7 @@ def test_arms_of_tqc_are_trained_and_judged(tmp_path: Path, monkeypatch: pytest.
     folder = out / grid.cells[0].folder
     model = CuReTQC.load(folder / "model.zip")
     assert model.policy.critic.ensemble[-1].bias.shape == (2, 1, 5) and model.top_quantiles_to_drop_per_net == 1
-    config = cells.read_kept(folder / "config.json")
+    config = cells.read_json(folder / "config.json")
     assert config["algo"] == "cure_tqc"
     assert {row["head"] for row in read_rows(folder / "visitation.csv")} >= {"own", "common"}
 

@@ -15,6 +15,7 @@ from PIL import Image
 from programs_for_tests import find_program
 from results_for_tests import CURE, RAE, curve, write_cell, write_csv, write_grid
 
+from sb3_cure.cli.main import main
 from sb3_cure.experiments import report
 from sb3_cure.experiments.tables import NONE
 
@@ -371,12 +372,12 @@ def test_media_of_first_seed_or_all(tmp_path: Path) -> None:
 
 
 def test_errors_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert report.main([str(tmp_path / "nowhere")]) == 2
+    assert main(["report", str(tmp_path / "nowhere")]) == 2
     write_curves(tmp_path / "curves")
-    (tmp_path / "curves" / TASK / "sac_ae" / "seed0" / "eval.csv").write_text("nonsense")
-    assert report.main([str(tmp_path)]) == 1
+    (tmp_path / "curves" / TASK / "sac_ae" / "seed0" / "run.json").write_text("nonsense")
+    assert main(["report", str(tmp_path)]) == 2
     first, second = capsys.readouterr().err.splitlines()
-    assert "there is no" in first and "eval.csv cannot be read" in second
+    assert "there is no" in first and "run.json cannot be read" in second
     with pytest.raises(SystemExit):
         report.main([str(tmp_path), "--thresholds", "many"])
     assert "--thresholds: invalid returns value: 'many'" in capsys.readouterr().err
