@@ -3,9 +3,8 @@
 from sb3_cure.evaluation.rollouts import (
     Episode,
     HighestErrors,
-    balance_negatives,
+    balanced_negatives,
     binned_errors,
-    evenly_measured,
     highest_errors,
     run_episodes,
     srl_errors,
@@ -16,9 +15,8 @@ from sb3_cure.evaluation.rollouts import (
 __all__ = [
     "Episode",
     "HighestErrors",
-    "balance_negatives",
+    "balanced_negatives",
     "binned_errors",
-    "evenly_measured",
     "highest_errors",
     "run_episodes",
     "srl_errors",

@@ -34,7 +34,7 @@ from sb3_cure.evaluation.rollouts import (
     Episode,
     as_arrays,
     as_trained,
-    evenly_measured,
+    balanced_negatives,
     run_episodes,
     state_probe,
     stored_places,
@@ -398,7 +398,7 @@ class CuriosityMapCallback(RolloutCallback):
 
     Each policy acts alone for some episodes; the map is drawn over two coordinates of the environment's true state,
     which the agent does not see. Without an SRL head only visits are drawn. CURL's error is measured against an even
-    mix of what the policies see (``sb3_cure.evaluation.rollouts.balance_negatives``).
+    mix of what the policies see (``sb3_cure.evaluation.rollouts.balanced_negatives``).
 
     :param eval_env: One (not vectorised) environment, not the training one
     :param folder: Where to write
@@ -439,7 +439,7 @@ class CuriosityMapCallback(RolloutCallback):
         from sb3_cure.evaluation import plots
 
         self.visits = {}
-        with evenly_measured(self.model, self.eval_env, self.seed):
+        with balanced_negatives(self.model, self.eval_env, self.seed):
             for actor in self.actors:
                 pairs = [(episode.states, episode.srl_errors) for episode in self.run(actor, states=self.state)]
                 states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))

@@ -59,8 +59,8 @@ def draw_latents(
 def _images_and_latents(model: BaseAlgorithm, observations: Any, key: str) -> tuple[th.Tensor, th.Tensor]:
     """What the encoder sees of observations, in [0, 1], and its latents."""
     policy: Any = model.policy
-    found = encoder_of(policy)
-    if found is None:
+    encode = encoder_of(policy)
+    if encode is None:
         raise ValueError(f"decoders need a policy with an encoder, which {type(policy).__name__} does not have.")
     views = policy.augmentation.center(observations) if isinstance(policy, CuRePolicy) else observations
-    return by_key(views)[key].float() / 255, found[1](observations)
+    return by_key(views)[key].float() / 255, encode(observations)

@@ -85,9 +85,9 @@ def look(
     batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
     yield temperature_at_bound(temperatures, model, bounds)
-    found = encoder_of(model.policy)
-    if found is not None:
-        latents = found[1](batch.observations)
+    encode = encoder_of(model.policy)
+    if encode is not None:
+        latents = encode(batch.observations)
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
         yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)

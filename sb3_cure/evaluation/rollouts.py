@@ -78,47 +78,27 @@ def trained_actors(model: BaseAlgorithm) -> list[str]:
     return ["task"] * getattr(model, "task", True) + ["curious"] * has_curious
 
 
-def balance_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> None:
-    """Fill CURL's negatives evenly from what each policy sees, before policies are compared by CURL's error.
+@contextlib.contextmanager
+def balanced_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> Iterator[None]:
+    """Take CURL's negatives evenly from what each policy sees, while policies are compared by CURL's error.
 
     Rolls out an episode of each policy of the model. Otherwise the negatives are those of the random warm-up, which
     the random policy's observations resemble most. Heads without negatives stay unchanged.
 
-    :param model: A trained model
+    :param model: A model, also of SB3's own algorithms
     :param env: One (not vectorised) environment
     :param seed: Seed of the resets and of random actions
     """
-    heads = _heads_with_negatives(model)
-    if not heads:
-        return
-    actors = [*trained_actors(model), "random"]
+    every = heads_by_key(getattr(model.policy, "srl", None))
+    heads: dict[str, Any] = {key: head for key, head in every.items() if isinstance(head, CURL) and head.bank_filled}
+    banks = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
+    actors = [*trained_actors(model), "random"] if heads else []
     seen = [as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
     for key, head in heads.items():
         share = max(len(head.bank) // len(actors), 1)
         images = [images_of(each, model.observation_space)[key] for each in seen]
         frames = np.concatenate([each[np.linspace(0, len(each) - 1, share).astype(int)] for each in images])
         head.set_bank(th.as_tensor(frames[: len(head.bank)]))
-
-
-def _heads_with_negatives(model: BaseAlgorithm) -> dict[str, Any]:
-    heads = heads_by_key(getattr(model.policy, "srl", None))
-    return {key: head for key, head in heads.items() if isinstance(head, CURL)}
-
-
-@contextlib.contextmanager
-def evenly_measured(model: BaseAlgorithm, env: gym.Env, seed: int | None = None) -> Iterator[None]:
-    """Measure errors within ``balance_negatives``, and restore the head afterwards.
-
-    :param model: A model, also of SB3's own algorithms
-    :param env: One (not vectorised) environment
-    :param seed: Seed of the resets and of random actions
-    """
-    heads = _heads_with_negatives(model)
-    if not heads or any(int(head.bank_filled) == 0 for head in heads.values()):
-        yield
-        return
-    banks = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
-    balance_negatives(model, env, seed)
     try:
         yield
     finally:
@@ -312,7 +292,7 @@ def state_probe(
     is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect
     predictions, 0 for the mean of all states, and below 0 for worse.
 
-    :param model: A model of any SB3 algorithm with an encoder (``policies.encoder_of``); compare models on the same
+    :param model: A model of any SB3 algorithm with an encoder (``encoding.encoder_of``); compare models on the same
         episodes, such as those of random actions with a seed
     :param episodes: Two or more, of ``run_episodes(..., states=True)``
     :param names: Names of the state's coordinates, [d], as of ``sb3_cure.envs.physics_state_names``
@@ -322,8 +302,8 @@ def state_probe(
     :raises ValueError: if the model has no encoder, episodes have no states, or there are fewer than two
     """
     policy: Any = model.policy
-    found = encoder_of(policy)
-    if found is None:
+    encode = encoder_of(policy)
+    if encode is None:
         raise ValueError(f"state_probe needs a policy with an encoder, which {type(policy).__name__} does not have.")
     policy.set_training_mode(False)
     latents, states = [], []
@@ -333,7 +313,7 @@ def state_probe(
         seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
         parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, len(episode.states), 128)]
         with th.no_grad():
-            latents.append(np.concatenate([found[1](part).double().cpu().numpy() for part in parts]))
+            latents.append(np.concatenate([encode(part).double().cpu().numpy() for part in parts]))
         states.append(episode.states)
     if len(states) < 2:
         raise ValueError("state_probe needs two episodes at least: it predicts each from the others.")

@@ -13,7 +13,7 @@ from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
-from sb3_cure.evaluation.rollouts import evenly_measured, highest_errors, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import balanced_negatives, highest_errors, run_episodes, trained_actors
 from sb3_cure.evaluation.video import write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
@@ -76,7 +76,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
         actors = visiting_actors(model, cell)
         if env.has_wrapper_attr("physics") and actors != ["random"]:
             visits = {}
-            with evenly_measured(model, env, VISIT_SEED - 1):
+            with balanced_negatives(model, env, VISIT_SEED - 1):
                 for actor in actors:
                     episodes = roll_out(model, cell, env, actor, states=True)
                     states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)

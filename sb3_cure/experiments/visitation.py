@@ -3,6 +3,7 @@
 Own heads differ from run to run: see ``heads`` for common ones.
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.evaluation.rollouts import Episode, balance_negatives, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import Episode, balanced_negatives, run_episodes, trained_actors
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE
@@ -46,19 +47,16 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param cell: Its cell
     :param folder: Where to write
     """
-    env = cell.make_eval_env()
-    balance_negatives(model, env, seed=VISIT_SEED - 1)
-    has_physics = env.has_wrapper_attr("physics")
     arrays: dict[str, Any] = {}
-    if has_physics:
-        arrays.update(state_names=physics_state_names(env), state_units=physics_state_units(env))
-    episodes = {}
-    for actor in visiting_actors(model, cell):
-        episodes[actor] = seen = roll_out(model, cell, env, actor, has_physics)
+    with contextlib.closing(cell.make_eval_env()) as env, balanced_negatives(model, env, VISIT_SEED - 1):
+        has_physics = env.has_wrapper_attr("physics")
+        episodes = {actor: roll_out(model, cell, env, actor, has_physics) for actor in visiting_actors(model, cell)}
+        if has_physics:
+            arrays.update(state_names=physics_state_names(env), state_units=physics_state_units(env))
+    for actor, seen in episodes.items():
         arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in seen], dtype=np.float32)
         if has_physics:
             arrays[f"{actor}_states"] = np.concatenate([each.states for each in seen], dtype=np.float32)
-    env.close()
     mean_image = np.mean([mean_target(model, seen) for seen in episodes.values()], axis=0)
     rows: list[Row] = []
     for actor, seen in episodes.items():

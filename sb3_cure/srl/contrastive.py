@@ -130,7 +130,7 @@ class CURL(SRLHead):
         """Set the negatives of ``error``, which otherwise are the first observations of training.
 
         Observations that look like many of the bank have a high error. To compare policies, take an even mix of what
-        they see (``sb3_cure.evaluation.rollouts.balance_negatives``).
+        they see (``sb3_cure.evaluation.rollouts.balanced_negatives``).
 
         :param observations: 1 to ``bank_size`` observations as stored, [n, *shape], 0-255
         :raises ValueError: if there are none, too many, or of another shape

@@ -27,8 +27,7 @@ from sb3_cure.evaluation.callbacks import EvalBothCallback
 from sb3_cure.evaluation.decoding import draw_latents, fit_decoder
 from sb3_cure.evaluation.rollouts import (
     Episode,
-    balance_negatives,
-    evenly_measured,
+    balanced_negatives,
     highest_errors,
     run_episodes,
     srl_errors,
@@ -86,7 +85,7 @@ def test_episodes_of_dictionaries_are_measured(srl: str) -> None:
     """By key, without keys that the space does not have; each row's error does not depend on the others."""
     model = sensor_model(srl=srl).learn(40)
     banks = [head.bank.clone() for head in model.policy.srl.heads] if srl == "curl" else []
-    with evenly_measured(model, SensorBox(), seed=1):
+    with balanced_negatives(model, SensorBox(), seed=1):
         changed = [not th.equal(head.bank, bank) for head, bank in zip(model.policy.srl.heads, banks, strict=False)]
         assert len(changed) == len(banks) and all(changed)
         (episode,) = run_episodes(model, Talkative(), 1, "curious", seed=2)
@@ -145,26 +144,22 @@ def test_true_states_are_kept_on_request() -> None:
 def test_negatives_are_taken_evenly_from_each_policy() -> None:
     """A third of CURL's bank from each policy's episode, spread over it; restored after a measurement or an error."""
     model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12)).learn(20)
-    env = PixelBox()
-    balance_negatives(model, env, seed=3)
-    head = model.policy.srl
-    assert int(head.bank_filled) == 12
-    for third, actor in enumerate(("task", "curious", "random")):
-        (episode,) = run_episodes(model, env, 1, actor, seed=3)
-        expected = episode.observations[[0, 6, 12, 19]]
-        np.testing.assert_array_equal(head.bank[4 * third : 4 * third + 4].numpy(), expected)
+    env, head = PixelBox(), model.policy.srl
     before = {key: value.clone() for key, value in head.state_dict().items()}
-    with pytest.raises(RuntimeError), evenly_measured(model, env, seed=4):
-        assert not th.equal(head.bank, before["bank"])
+    with pytest.raises(RuntimeError), balanced_negatives(model, env, seed=3):
+        for third, actor in enumerate(("task", "curious", "random")):
+            (episode,) = run_episodes(model, env, 1, actor, seed=3)
+            expected = episode.observations[[0, 6, 12, 19]]
+            np.testing.assert_array_equal(head.bank[4 * third : 4 * third + 4].numpy(), expected)
         raise RuntimeError
     assert differences(head.state_dict(), before) == []
     # Two policies share it without a curious one; other models are left alone.
     plain = tiny_model("CnnPolicy", PixelBox(), srl="curl", curiosity=None).learn(20)
-    balance_negatives(plain, env, seed=3)
-    assert int(plain.policy.srl.bank_filled) == 64
+    with balanced_negatives(plain, env, seed=3):
+        assert int(plain.policy.srl.bank_filled) == 64
     for other in (tiny_model("CnnPolicy", PixelBox()), SAC("MlpPolicy", VectorBox())):
         before = {key: value.clone() for key, value in other.policy.state_dict().items()}
-        with evenly_measured(other, env):
+        with balanced_negatives(other, env):
             assert differences(dict(other.policy.state_dict()), before) == []
 
 
