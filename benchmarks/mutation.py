@@ -157,7 +157,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     table, drawn = options.out / "mutation.csv", {file: _draw(file, options.seed) for file in TESTS}
     lines = dict(pair for rows in drawn.values() for pair in zip(rows["id"], rows["line"], strict=True))
-    old = {row["id"]: row for row in (read_rows(table, COLUMNS) if table.exists() else [])}
+    old = {row["id"]: row for row in (read_rows(table) if table.exists() else [])}
     done = {name: {**row, "line": lines[name]} for name, row in old.items() if name in lines}  # the code is still there
     share = 1
     while sum(len(rows[:share]) for rows in drawn.values()) < min(options.sample, len(lines)):

@@ -101,7 +101,7 @@ def read_runs(out: Path) -> Runs:
     machines: dict[str, Path] = {}
     for path in sorted(out.glob("*/*/seed*.json")):
         details, (task, arm) = read_json(path), path.parts[-3:-1]
-        run = Run(read_rows(path.with_suffix(".csv"), COLUMNS), details)
+        run = Run(read_rows(path.with_suffix(".csv")), details)
         runs.setdefault(task, {}).setdefault(arm, {})[details["seed"]] = run
         machines[details["machine"]] = path
     if len(machines) > 1:

@@ -22,6 +22,8 @@ from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
 ACTORS = ("task", "curious", "random")
+#: Observations that are encoded at a time
+CHUNK = 128
 
 
 @dataclass
@@ -48,22 +50,21 @@ class Episode:
         return float(self.rewards.sum())
 
 
-def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples, chunk: int = 128) -> np.ndarray:
+def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples) -> np.ndarray:
     """Errors of transitions without training noise or augmentation.
 
     They are the SRL head's, or those of an intrinsic reward that measures errors itself, such as ``"reconstruction"``.
 
     :param model: A model with an SRL head, or such a reward
     :param batch: Transitions, observations as stored (images in 0-255)
-    :param chunk: How many at a time
     :return: Error per sample, [n]
     """
     policy: Any = model.policy
     policy.set_training_mode(False)
     errors = []
     with th.no_grad():
-        for start in range(0, len_of(batch.observations), chunk):
-            part: Any = (None if each is None else rows_of(each, slice(start, start + chunk)) for each in batch[:5])
+        for start in range(0, len_of(batch.observations), CHUNK):
+            part: Any = (None if each is None else rows_of(each, slice(start, start + CHUNK)) for each in batch[:5])
             errors.append(policy.error(policy.samples(Samples(*part), random=False)).float().cpu().numpy())
     return np.concatenate(errors)
 
@@ -230,7 +231,7 @@ def as_arrays(observations: Any) -> Any:
     return observations.cpu().numpy()
 
 
-def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: int = 128) -> HighestErrors:
+def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25) -> HighestErrors:
     """Find the observations of the replay buffer with the highest noise-free SRL error.
 
     Reads the whole buffer, a chunk at a time. Two observations of one environment are at least ``gap`` steps apart:
@@ -239,7 +240,6 @@ def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: i
     :param model: A model with an SRL head and a replay buffer
     :param k: How many observations; fewer if the buffer does not hold so many that are far enough apart
     :param gap: Least distance in time, in steps of one environment; 1 allows neighbours
-    :param chunk: How many observations are in memory at a time
     :return: The observations with their errors, highest first
     :raises ValueError: if the replay buffer is empty
     """
@@ -247,9 +247,9 @@ def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25, chunk: i
     rows, env_inds, ages = stored_places(buffer)
     if len(rows) == 0:
         raise ValueError("the replay buffer is empty.")
-    parts = [slice(start, start + chunk) for start in range(0, len(rows), chunk)]
+    parts = [slice(start, start + CHUNK) for start in range(0, len(rows), CHUNK)]
     batches = (transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env()) for part in parts)
-    errors = np.concatenate([srl_errors(model, batch, chunk) for batch in batches])
+    errors = np.concatenate([srl_errors(model, batch) for batch in batches])
     chosen: list[int] = []
     for candidate in np.argsort(-errors, kind="stable"):
         same = [other for other in chosen if env_inds[other] == env_inds[candidate]]
@@ -311,7 +311,7 @@ def state_probe(
         if len(episode.states) != len(episode.rewards):
             raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
         seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
-        parts = [rows_of(seen, slice(start, start + 128)) for start in range(0, len(episode.states), 128)]
+        parts = [rows_of(seen, slice(start, start + CHUNK)) for start in range(0, len(episode.states), CHUNK)]
         with th.no_grad():
             latents.append(np.concatenate([encode(part).double().cpu().numpy() for part in parts]))
         states.append(episode.states)

@@ -161,8 +161,6 @@ class GridFile(_Part):
         for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
             if name not in self.methods:
                 raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
-        if any(method.baseline == name for name, method in self.methods.items()):
-            raise ValueError("a method's baseline must be another method")
         return self
 
 
@@ -377,9 +375,7 @@ def load_grid(
         _check_pixels(arms, path)
     of_seed = [arm for arm in arms if arm.task in of_tasks and arm.method in of_arms]
     cells = tuple(replace(arm, seed=seed) for seed in sorted(set(chosen)) for arm in of_seed)
-    # Without None: `grid.json` of earlier versions lacks newer keys, and is compared
-    description = file.model_dump(exclude_unset=True) | {"evaluation": file.evaluation.model_dump(exclude_none=True)}
-    return Grid(file.experiment, file.kind, cells, arms, description)
+    return Grid(file.experiment, file.kind, cells, arms, file.model_dump(exclude_none=True))
 
 
 def _validated(path: Path, content: Any) -> GridFile:

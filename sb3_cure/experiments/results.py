@@ -21,8 +21,8 @@ class CellResult:
     :param method: Name of the arm
     :param seed: Seed
     :param folder: Its folder
-    :param status: ``"done"``, ``"unfinished"``, ``"failed"``, ``"not run"``, or which other budget it was run with;
-        only done cells have the following fields and enter statistics
+    :param status: ``"done"``, ``"unfinished"``, ``"failed"`` or ``"not run"``; only done cells have the following
+        fields and enter statistics
     :param config: ``config.json``
     :param run: ``run.json``
     :param evaluations: ``eval.csv`` (missing values are nan)
@@ -180,7 +180,7 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
             keys.append((found.parent.parent.name, found.parent.name, seed))
     order = list(dict.fromkeys(task for task, _, _ in keys))
     keys = sorted(dict.fromkeys(keys), key=lambda key: order.index(key[0]))
-    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key, grid) for key in keys}
+    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key) for key in keys}
     experiment = Experiment(name or grid["experiment"], root, grid, cells)
     for task, method in experiment.arms:
         done = list(experiment.done(task, method).values())
@@ -203,7 +203,7 @@ def _check_settings(first: CellResult, other: CellResult, keys: tuple[str, ...])
             )
 
 
-def _read_cell(folder: Path, task: str, method: str, seed: int, grid: dict[str, Any]) -> CellResult:
+def _read_cell(folder: Path, task: str, method: str, seed: int) -> CellResult:
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
@@ -211,9 +211,6 @@ def _read_cell(folder: Path, task: str, method: str, seed: int, grid: dict[str, 
     config, run = read_json(folder / "config.json"), read_json(folder / "run.json")
     if (short_name(config["task"]), config["method"], config["seed"]) != (task, method, seed):
         raise UsageError(f"{folder / 'config.json'} is of another cell than its folder: put it back.")
-    budget = config["budget"]
-    if budget not in (grid["budget"], 0):  # 0: representation learning alone, without training on the task
-        return CellResult(task, method, seed, folder, f"other budget: {budget} steps", config, run)
     names = ("eval.csv", "visitation.csv", "coverage.csv")
     tables = (pd.read_csv(folder / name) if (folder / name).exists() else pd.DataFrame() for name in names)
     return CellResult(task, method, seed, folder, DONE, config, run, *tables)

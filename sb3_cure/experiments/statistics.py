@@ -13,6 +13,7 @@ from scipy import integrate, stats
 
 from sb3_cure.experiments.results import CellResult, Experiment
 
+#: Draws of a mean over several tasks
 DRAWS = 100_000
 
 
@@ -143,13 +144,12 @@ class Estimate:
         return "better" if self.low > 0 else "worse" if self.high < 0 else "inconclusive"
 
 
-def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
+def t_interval(groups: Sequence[np.ndarray]) -> Estimate:
     """Mean of the groups' means, with the stratified t interval that this module's docstring describes.
 
     Groups of one value have no spread: where others have more, only those count.
 
     :param groups: Differences between the arms, seed by seed: one array per task
-    :param draws: How many, with more than one group
     :return: The estimate; without an interval if every group has a single value
     """
     groups = [np.sort(group) for group in groups if len(group)]  # sorted: sums do not depend on the seeds' order
@@ -162,7 +162,7 @@ def t_interval(groups: Sequence[np.ndarray], draws: int = DRAWS) -> Estimate:
         reach = float(stats.t.ppf(0.975, n - 1) * stats.sem(judged[0]))
     else:
         rng = np.random.default_rng(0)
-        drawn = np.mean([stats.sem(group) * rng.standard_t(len(group) - 1, draws) for group in judged], axis=0)
+        drawn = np.mean([stats.sem(group) * rng.standard_t(len(group) - 1, DRAWS) for group in judged], axis=0)
         # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
         reach = float(np.percentile(np.abs(drawn), 95))
     return Estimate(value, value - reach, value + reach, n)

@@ -22,7 +22,7 @@ from sb3_cure.cure.reconstructions import reconstruction_strip, reconstruction_s
 from sb3_cure.data.buffers import transitions
 from sb3_cure.data.observations import by_key, rows_of
 from sb3_cure.data.samples import Samples
-from sb3_cure.evaluation import plots
+from sb3_cure.evaluation import plots, rollouts
 from sb3_cure.evaluation.callbacks import EvalBothCallback
 from sb3_cure.evaluation.decoding import draw_latents, fit_decoder
 from sb3_cure.evaluation.rollouts import (
@@ -81,7 +81,7 @@ class Talkative(SensorBox):
 
 
 @pytest.mark.parametrize("srl", ["rae", "curl"])
-def test_episodes_of_dictionaries_are_measured(srl: str) -> None:
+def test_episodes_of_dictionaries_are_measured(srl: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """By key, without keys that the space does not have; each row's error does not depend on the others."""
     model = sensor_model(srl=srl).learn(40)
     banks = [head.bank.clone() for head in model.policy.srl.heads] if srl == "curl" else []
@@ -94,7 +94,8 @@ def test_episodes_of_dictionaries_are_measured(srl: str) -> None:
     assert episode.srl_errors.shape == (20,) and (episode.srl_errors >= 0).all()
     batch = model.replay_buffer.sample(12)
     alone = [srl_errors(model, Samples(*(rows_of(part, slice(i, i + 1)) for part in batch[:5]))) for i in range(12)]
-    np.testing.assert_allclose(srl_errors(model, batch, chunk=5), np.concatenate(alone), rtol=1e-4, atol=1e-6)
+    monkeypatch.setattr(rollouts, "CHUNK", 5)
+    np.testing.assert_allclose(srl_errors(model, batch), np.concatenate(alone), rtol=1e-4, atol=1e-6)
     worst = highest_errors(model, 3, gap=1)
     assert worst.observations["wrist"].shape == (3, 6, 28, 28) and worst.errors[0] == max(worst.errors)
 
@@ -223,7 +224,7 @@ def test_decoder_draws_what_a_frozen_encoder_sees() -> None:
     [(1, dict(buffer_size=50)), (2, dict(buffer_size=500, replay_buffer_class=ReplayBuffer))],
     ids=["full", "SB3's, half full, two environments"],
 )
-def test_highest_errors_equal_brute_force(n_envs: int, kwargs: dict[str, Any]) -> None:
+def test_highest_errors_equal_brute_force(n_envs: int, kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """Highest first, apart in time, whatever the chunks; looking draws no random numbers."""
     model = tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * n_envs), **kwargs).learn(74)
     buffer, everything = model.replay_buffer, []
@@ -240,7 +241,8 @@ def test_highest_errors_equal_brute_force(n_envs: int, kwargs: dict[str, Any]) -
         for each in sorted(everything, key=lambda each: -each[2]):
             if len(chosen) < 7 and not any(each[1] == other[1] and abs(each[0] - other[0]) < gap for other in chosen):
                 chosen.append(each)
-        found = highest_errors(model, 7, gap=gap, chunk=chunk)
+        monkeypatch.setattr(rollouts, "CHUNK", chunk)
+        found = highest_errors(model, 7, gap=gap)
         np.testing.assert_allclose(found.errors, [error for _, _, error in chosen], rtol=1e-4)
         assert found.ages.tolist() == [age * n_envs for age, _, _ in chosen]
         batch = Samples(th.as_tensor(found.observations), *[None] * 4)

@@ -68,7 +68,8 @@ def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int,
     described = grid.description["methods"]
     assert "pretrain" not in described["none"] and grid.description["budget"] == asked
     assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}
-    assert load_grid(path).description["methods"] == methods
+    unscaled = load_grid(path).description["methods"]
+    assert all(unscaled[name].get("pretrain") == method.get("pretrain") for name, method in methods.items())
 
 
 def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:
@@ -108,10 +109,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "neither of both": (dict(methods={"a": {"config": "zoo.yml", "train": False}}), "'a' neither trains nor"),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
-    "itself as baseline": (
-        dict(methods={"a": {"config": "zoo.yml", "baseline": "a"}, "b": {"config": "zoo.yml"}}),
-        "baseline must be another method",
-    ),
     "pictures that heads cannot judge alike": (
         dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),
         "differ in env_kwargs .*, but common heads judge all alike",
@@ -219,9 +216,8 @@ def test_project_pretraining_trains_in_miniature() -> None:
 
 
 def test_folders_of_earlier_versions_are_continued(tmp_path: Path) -> None:
-    """Their grid.json and config.json lack newer keys, which is no other setting; another stop is one."""
+    """Their config.json lacks newer keys, which is no other setting; another stop is one."""
     grid = load_grid(write_grid(tmp_path))
-    assert grid.description["evaluation"] == {"every": 160, "episodes": 2} and "stop_at_return" not in grid.description
     (cell,) = grid.cells
     folder = tmp_path / cell.folder
     folder.mkdir(parents=True)

@@ -22,10 +22,10 @@ def test_only_finished_cells_enter_statistics(tmp_path: Path) -> None:
     folder = tmp_path / "curves"
     write_grid(folder, seeds=[0, 1, 2])
     write_cell(folder, TASK, "sac_ae", 0, curve(0, 10))
-    write_cell(folder, TASK, "sac_ae", 1, curve(0, 10), budget=50_000)
+    write_cell(folder, TASK, "sac_ae", 1, curve(0, 10), done=False)
     (experiment,) = read_results(folder)
     assert [cell.status for cell in experiment.cells.values()] == [
-        "done", "other budget: 50000 steps", "not run", "not run", "not run", "not run",
+        "done", "unfinished", "not run", "not run", "not run", "not run",
     ]  # fmt: skip
     assert list(experiment.done(TASK, "sac_ae")) == [0]
     assert statistics.paired_differences(experiment) == []
@@ -48,7 +48,11 @@ def test_damaged_files_are_named(results: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("method", "seed", "settings"),
-    [("sac_ae", 1, {"arguments": {"gamma": 0.5}}), ("cure_sac_ae", 0, {"eval_episodes": 3, "arguments": CURE})],
+    [
+        ("sac_ae", 1, {"arguments": {"gamma": 0.5}}),
+        ("sac_ae", 1, {"budget": 50_000}),
+        ("cure_sac_ae", 0, {"eval_episodes": 3, "arguments": CURE}),
+    ],
 )
 def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: int, settings: dict) -> None:
     """Seeds of an arm must share all settings, arms of a task their evaluations."""

@@ -114,7 +114,7 @@ def test_summary_reads_finished_cells_only(tmp_path: Path, capsys: pytest.Captur
     write_run(tmp_path, "curl", 3, make_run([800]), finished=False)
     write_run(tmp_path, "sac_ae", 3, make_run([20, 30]), task="reacher-easy")
     assert ttr.main(["--out", str(tmp_path), "--summarise-only"]) == 0
-    rows = {(row["arm"], row["target"]): row for row in read_rows(tmp_path / "summary.csv", summary.SUMMARY_COLUMNS)}
+    rows = {(row["arm"], row["target"]): row for row in read_rows(tmp_path / "summary.csv")}
     assert [rows["curl", target]["median_minutes"] for target in summary.TARGETS] == [3, 6, "not reached"]
     assert rows["curl", 300]["seeds"] == 3
     table = (tmp_path / "table.md").read_text()
@@ -249,7 +249,7 @@ def test_clock_stands_still_during_evaluation(tmp_path: Path, clock: Clock) -> N
     record.visit(10, np.zeros_like, finished=True)
     assert clock.seconds == pytest.approx(11 * 1.5 + 4 * 0.2)
     assert record.times() == pytest.approx((11 * 1.5, 2 * 11 * 1.5))
-    rows = read_rows(tmp_path / "seed0.csv", summary.COLUMNS)
+    rows = read_rows(tmp_path / "seed0.csv")
     assert [row["agent_steps"] for row in rows] == [0, 4, 8, 10]
     assert [row["environment_steps"] for row in rows] == [0, 32, 64, 80]
     assert [row["training_seconds"] for row in rows] == [0, 6, 12, 16.5]
@@ -324,7 +324,7 @@ def test_cell_trains_on_real_pixels(arm: str, tmp_path: Path) -> None:
     process.start()
     process.join()
     path = ttr.cell_path(tmp_path, cell)
-    rows = read_rows(path, summary.COLUMNS)
+    rows = read_rows(path)
     assert [(row["agent_steps"], row["environment_steps"]) for row in rows] == [(0, 0), (4, 32), (6, 48)]
     assert 0 < rows[-1]["return_mean"] < 1000
     details = json.loads(path.with_suffix(".json").read_text())
