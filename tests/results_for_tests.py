@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 EVAL_COLUMNS = (
-    "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
+    "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std",
     "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met",
 )  # fmt: skip
 RAE = {"policy": "CnnPolicy", "srl": "rae", "curiosity": None}
@@ -98,7 +98,7 @@ def write_cell(
     }  # fmt: skip
     (cell / "run.json").write_text(json.dumps(run))
     rows = [
-        [step, step // 8, step // 8, step / 100, value, 5.0, "" if step == 0 else 1e-3 / (1 + step / 5e4), 0.001]
+        [step, step // 8, step // 8, step / 100, value, 5.0, 0.001]
         + ([value / 2, 0.002] if curious else ["", ""])
         + [rewards_met]
         for step, value in curve.items()

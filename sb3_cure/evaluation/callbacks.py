@@ -23,7 +23,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tens
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
-from sb3_cure.data.buffers import infer_frame_stack, transitions
+from sb3_cure.data.buffers import infer_frame_stack, stored_places, transitions
 from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
@@ -37,7 +37,6 @@ from sb3_cure.evaluation.rollouts import (
     balanced_negatives,
     run_episodes,
     state_probe,
-    stored_places,
     trained_actors,
 )
 
@@ -228,19 +227,17 @@ class PolicyVideoCallback(RolloutCallback):
     :param eval_env: One (not vectorised) environment made with ``render_mode="rgb_array"``, not the training one
     :param folder: Where to write
     :param every: Agent steps between two videos
-    :param fps: Pictures per second, one per agent step; by default the environment's ``render_fps``, or 30
     :param kwargs: ``actors``, ``deterministic``, ``seed``, ``verbose`` of ``RolloutCallback``; verbose=1 prints the
         name of each video
     :raises ValueError: if the environment does not render RGB frames
     :raises ImportError: if imageio is not installed
     """
 
-    def __init__(self, eval_env: gym.Env, folder: str | Path, every: int = 5000, fps: int | None = None, **kwargs: Any):
+    def __init__(self, eval_env: gym.Env, folder: str | Path, every: int = 5000, **kwargs: Any):
         super().__init__(eval_env, every, n_episodes=1, **kwargs)
         if eval_env.render_mode != "rgb_array":
             raise ValueError(f"eval_env must have render_mode='rgb_array', not {eval_env.render_mode!r}.")
         self.folder = Path(folder)
-        self.fps = fps or max(round(eval_env.metadata.get("render_fps") or 30), 1)
         from sb3_cure.evaluation import video  # noqa: F401  (fail before training if a package is missing)
 
     def on_period(self) -> None:
@@ -252,7 +249,7 @@ class PolicyVideoCallback(RolloutCallback):
             (episode,) = self.run(actor, render=True)
             path = self._path(self.folder, f"{actor}_policy_{steps}_steps.mp4")
             title = f"{actor} policy, {self._actions}, after {steps:,} agent steps"
-            video.write_video(path, {title: episode}, self.fps, repeat)
+            video.write_video(path, {title: episode}, video.frame_rate(self.eval_env), repeat)
 
 
 class ReconstructionCallback(PeriodicCallback):
@@ -291,8 +288,8 @@ class ReconstructionCallback(PeriodicCallback):
         self.folder, self.observations, self.columns = Path(folder), observations, columns
         self.decoder_updates, self.max_rows = decoder_updates, max_rows
         self.title = title
-        #: Agent steps and the reconstructions then, their newest frames, uint8 [n, C, H, W], or such by key
-        self.rows: list[tuple[int, Any]] = []
+        #: Agent steps and the reconstructions then, their newest frames by key, uint8 [n, C, H, W]
+        self.rows: list[tuple[int, dict[str, np.ndarray]]] = []
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _init_callback(self) -> None:
@@ -329,7 +326,7 @@ class ReconstructionCallback(PeriodicCallback):
         seen, row = (
             {key: np.array(as_arrays(newest_frames(each[key], frame_stack))) for key in pair[1]} for each in pair
         )
-        self.rows.append((self.num_timesteps, row.get("", row)))
+        self.rows.append((self.num_timesteps, row))
         shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
         for key, images in seen.items():
             # Keys such as dm_control's "walker/egocentric_camera"
@@ -337,7 +334,7 @@ class ReconstructionCallback(PeriodicCallback):
             plots.reconstructions_over_training(
                 self._path(self.folder, f"{name}.png"),
                 images,
-                [(steps, by_key(row)[key]) for steps, row in (self.rows[index] for index in shown)],
+                [(steps, row[key]) for steps, row in (self.rows[index] for index in shown)],
                 "\n".join(filter(None, (f"{title}: {key}" if key else title, self.title))),
             )
 
@@ -540,8 +537,8 @@ class DiagnosticsCallback(PeriodicCallback):
         verbose: int = 0,
     ):
         super().__init__(every, verbose)
-        low, high = map(float, temperature_bounds)  # also of strings, as YAML reads 1e-4
-        self._arguments = n_samples, min_updates, autoencoder_updates, (low, high)
+        self.n_samples, self.min_updates, self.autoencoder_updates = n_samples, min_updates, autoencoder_updates
+        self.temperature_bounds = [float(bound) for bound in temperature_bounds]  # YAML reads 1e-4 as a text
         #: Names of the problems that were warned of
         self.warned: list[str] = []
         self._reward_std: Any = None
@@ -553,7 +550,14 @@ class DiagnosticsCallback(PeriodicCallback):
 
     def on_period(self) -> None:
         """Look, log and warn; after a problem nothing is looked at that it may explain."""
-        findings = diagnostics.look(self.model, self._reward_std, *self._arguments)
+        findings = diagnostics.look(
+            self.model,
+            self._reward_std,
+            self.n_samples,
+            self.min_updates,
+            self.autoencoder_updates,
+            self.temperature_bounds,
+        )
         for name, value, problem in filter(None, findings):
             self.logger.record(f"diagnostics/{name}", float(value))
             if self.verbose >= 1:

@@ -12,10 +12,9 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.data.buffers import transitions
+from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.evaluation.encoding import encoder_of
-from sb3_cure.evaluation.rollouts import stored_places
 from sb3_cure.srl import RAE, DictHead
 
 #: Latest transitions, of all environments together, that are checked for a constant image

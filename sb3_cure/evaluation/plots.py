@@ -241,7 +241,9 @@ def actor_bars(
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
     if lines or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
         marks = "thick dashes (thin lines: least to greatest)" if logarithmic else "bars"
-        _shared_legend(figure, places, f"{marks} and lines across: means of the dots and bands")
+        legends = [axes.get_legend_handles_labels() for axes in places]
+        handles = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
+        _legend(figure, handles, f"{marks} and lines across: means of the dots and bands")
     save(figure, path)
 
 
@@ -278,12 +280,6 @@ def _use_logarithms(axes: Axes) -> None:
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _shared_legend(figure: Figure, panels: Sequence[Axes], note: str = "") -> None:
-    """Draw one legend of all panels below them."""
-    shown = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    _legend(figure, shown, note)
 
 
 def _legend(figure: Figure, handles: Mapping[str, Artist], note: str = "") -> None:

@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import gymnasium as gym
 import imageio.v2 as imageio
 import imageio_ffmpeg  # type: ignore[import-untyped]  # noqa: F401  (imageio imports it late: at the first frame)
 import numpy as np
@@ -16,6 +17,15 @@ MIN_WIDTH = 256
 #: Characters of a line of the title; text grows with the picture, so that it holds as many at any width
 LINE = 36
 RED, GREY = "#d62728", "#bbbbbb"
+
+
+def frame_rate(env: gym.Env) -> int:
+    """Pictures per second of an environment's videos, one per agent step: its ``render_fps``, or 30.
+
+    :param env: An environment
+    :return: At least 1
+    """
+    return max(round(env.metadata.get("render_fps") or 30), 1)
 
 
 def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:

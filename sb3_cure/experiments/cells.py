@@ -12,7 +12,6 @@ from typing import Any
 
 import filelock
 import numpy as np
-import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -35,12 +34,11 @@ from sb3_cure.persistence import ExactCheckpoint
 EVAL_SEED = 10_000
 #: File with the traceback of a failed cell, until it is started again
 ERROR = "error.txt"
-_EVAL_COLUMNS = (
-    "environment_steps", "agent_steps", "updates", "seconds", "return_mean", "return_std", "srl_loss",
-    "task_srl_error", "curious_return_mean", "curious_srl_error", "rewards_met", "rewards_met_task",
-    "rewards_met_curious", "rewards_met_late", "cpu_seconds",
-)  # fmt: skip
 _REWARDS_MET = ("rewards_met", "rewards_met_task", "rewards_met_curious", "rewards_met_late")
+_EVAL_COLUMNS = (
+    "environment_steps", "agent_steps", "updates", "seconds", "cpu_seconds", "return_mean", "return_std",
+    "task_srl_error", "curious_return_mean", "curious_srl_error", *_REWARDS_MET,
+)  # fmt: skip
 _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 
 
@@ -98,7 +96,7 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
 
 
 class _CellRun:
-    """Everything that a running cell needs."""
+    """An attempt at a cell: its model and its callbacks."""
 
     def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool):
         self.cell, self.folder, self.pictures = cell, folder, pictures
@@ -208,7 +206,6 @@ class _Record(BaseCallback):
         self.attempts: list[Row] = []
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
-        self.loss_sum, self.n_losses = th.zeros(()), 0
         #: Sum of the task's rewards of all transitions that training has collected
         self.rewards_met = 0.0
         #: Of these, where the task policy and where the curious (or random) second actor acted; the rest: the warm-up
@@ -225,8 +222,8 @@ class _Record(BaseCallback):
 
         :return: Records, but not clocks
         """
-        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", "loss_sum", "n_losses")
-        return {name: getattr(self, name) for name in (*names, *_REWARDS_MET, "episode_rewards")}
+        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", *_REWARDS_MET, "episode_rewards")
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from these records.
@@ -248,11 +245,6 @@ class _Record(BaseCallback):
         self._begin_attempt(self.model)  # type: ignore[arg-type]
 
     def _on_step(self) -> bool:
-        loss = self.logger.name_to_value.get("train/srl_loss")
-        if loss is not None:
-            value = th.as_tensor(loss)
-            self.loss_sum = self.loss_sum.to(value.device) + value
-            self.n_losses += 1
         if self.evaluates:
             self._count_rewards()
         self._tick()
@@ -326,8 +318,6 @@ class _Record(BaseCallback):
         is_last = finished or self.has_reached_return
         if "curious" in actors and (is_last or self.cell.eval_curious != "end"):
             self._measure("curious", row)
-        row["srl_loss"] = float(self.loss_sum) / self.n_losses if self.n_losses else ""
-        self.loss_sum, self.n_losses = th.zeros(()), 0
         self._tick()
         row.update(seconds=round(self.seconds, 1), cpu_seconds=self.cpu_seconds)
         row.update({name: round(getattr(self, name), 3) for name in _REWARDS_MET})

@@ -14,7 +14,7 @@ from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
 from sb3_cure.evaluation.rollouts import balanced_negatives, highest_errors, run_episodes, trained_actors
-from sb3_cure.evaluation.video import write_video
+from sb3_cure.evaluation.video import frame_rate, write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
 
@@ -70,10 +70,10 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param cell: The cell
     :param folder: Where to write
     """
+    actors = visiting_actors(model, cell)
     with contextlib.closing(cell.make_eval_env()) as env:
         repeat = action_repeat_of(env)
         can_film = cell.budget > 0 and "rgb_array" in env.metadata.get("render_modes", [])
-        actors = visiting_actors(model, cell)
         if env.has_wrapper_attr("physics") and actors != ["random"]:
             visits = {}
             with balanced_negatives(model, env, VISIT_SEED - 1):
@@ -86,11 +86,10 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
             plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
     if can_film:
         with contextlib.closing(cell.make_eval_env(render_mode="rgb_array")) as env:
-            fps = max(round(env.metadata.get("render_fps") or 30), 1)
             for actor in trained_actors(model):
                 (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
                 title = f"{actor} policy, deterministic actions: {_title(cell)}"
-                write_video(folder / f"{actor}_policy.mp4", {title: episode}, fps, repeat)
+                write_video(folder / f"{actor}_policy.mp4", {title: episode}, frame_rate(env), repeat)
     if getattr(model.policy, "measures_errors", False) and is_image_space(model.observation_space):
         _draw_replay_buffer(model, cell, repeat, folder)
 

@@ -99,8 +99,8 @@ class Section:
     @property
     def summary(self) -> str:
         """The first headline, for the overview."""
-        more = len(self.headlines) - 1
-        return (*self.headlines, NONE)[0] + (f" (And {plural(more, 'line')} more.)" if more > 0 else "")
+        first, *others = self.headlines or [NONE]
+        return first + (f" (And {plural(len(others), 'line')} more.)" if others else "")
 
 
 def _figure(name: str, caption: str, draw: Callable[..., None], *arguments: Any) -> Figure:
@@ -137,8 +137,10 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
         headlines += _exploration_headlines(experiment, list(explored))
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
-        # "Nothing to compare" is about returns alone
-        headlines += compared if compared or headlines else [_why_no_comparison(experiment)]
+        headlines += compared
+        if not headlines:  # no cells that could be compared either
+            several = len(experiment.methods) > 1
+            headlines = [render_text("nothing_shared", experiment.baseline) if several else render_text("one_arm")]
         if experiment.kind == "pretraining":
             parts.insert(0, tables.pretraining_table(experiment))
         parts += more
@@ -294,11 +296,6 @@ def _comparison(
     if differences:
         parts += _difference_parts(experiment, differences, colors)
     return headlines, parts
-
-
-def _why_no_comparison(experiment: Experiment) -> str:
-    several = len(experiment.methods) > 1
-    return render_text("nothing_shared", experiment.baseline) if several else render_text("one_arm")
 
 
 def _difference_parts(

@@ -298,8 +298,10 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
     found = []
     for method in experiment.methods:
         other = experiment.baseline_of(method)
+        if method == other:
+            continue
         by_task, same = {}, {}
-        for task in experiment.tasks if method != other and other in experiment.methods else ():
+        for task in experiment.tasks:
             ours, theirs = arms[task, method], arms[task, other]
             _, mine, its = np.intersect1d(ours.seeds, theirs.seeds, assume_unique=True, return_indices=True)
             if len(mine):
@@ -309,11 +311,12 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
                 same[task] = int(((first == second) | np.isnan(first) | np.isnan(second)).all(axis=1).sum())
         # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
-        rows: list[tuple[str | None, dict[str, np.ndarray]]] = [(None, judged)] if len(by_task) > 1 else []
-        for name, row in [*rows, *((task, {task: values}) for task, values in by_task.items())]:
-            left_out = tuple(task for task in by_task if name is None and task not in judged)
-            starts_alike = sum(same[task] for task in row)
-            found.append(
-                PairedDifference(method, other, name, row, t_interval(list(row.values())), starts_alike, left_out)
-            )
+        left_out = tuple(task for task in by_task if task not in judged)
+        rows: list[tuple[str | None, dict[str, np.ndarray], tuple[str, ...]]]
+        rows = [(task, {task: values}, ()) for task, values in by_task.items()]
+        if len(rows) > 1:
+            rows.insert(0, (None, judged, left_out))
+        for name, values, without in rows:
+            interval, starts_alike = t_interval(list(values.values())), sum(same[task] for task in values)
+            found.append(PairedDifference(method, other, name, values, interval, starts_alike, without))
     return found

@@ -143,10 +143,6 @@ def interval_text(estimate: Estimate, digits: int = 0) -> str:
     return f"[{number_text(estimate.low, digits)}, {number_text(estimate.high, digits)}]"
 
 
-def _value_and_interval(estimate: Estimate, digits: int) -> tuple[str, str]:
-    return number_text(estimate.value, digits), interval_text(estimate, digits)
-
-
 def ratio_text(estimate: Estimate) -> str:
     """Format a ratio and its interval.
 
@@ -276,9 +272,9 @@ def difference_table(
     columns = "arm; task; >pairs; >same start; >difference; >95 % t; >above; >p; >p, Holm; verdict"
     shown = []
     for row, corrected in zip(rows, statistics.holm([row.p for row in rows]), strict=True):
-        value, interval = _value_and_interval(row.t, difference_digits(row, experiment))
-        numbers = [str(row.pairs), str(row.same_starts), value, interval, str(row.wins)]
-        numbers += [_p_text(row.p), _p_text(corrected)]
+        digits = difference_digits(row, experiment)
+        numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, digits), interval_text(row.t, digits)]
+        numbers += [str(row.wins), _p_text(row.p), _p_text(corrected)]
         shown.append([difference_label(row, experiment.baseline), tasks_text(row), *numbers, row.t.verdict])
     title = f"Paired difference from {compared_with(rows, experiment)}: {measure}"
     return _table(title, columns, shown, render_text("differences") if note is None else note)
@@ -395,26 +391,23 @@ def rewards_met_table(experiment: Experiment) -> Table:
     :param experiment: An experiment
     :return: The table; without a row where rewards were not recorded or are negative
     """
+
+    def final(task: str, method: str, column: str) -> np.ndarray:
+        return np.array(list(statistics.final_values(experiment, task, method, column).values()))
+
     shown = []
     for task, method in experiment.arms:
-        met = np.array(list(statistics.final_values(experiment, task, method, "rewards_met").values()))
-        if len(met) and (met >= 0).all():
-            against = statistics.rewards_met_difference(experiment, task, method)
-            text = NONE if method == experiment.baseline_of(method) else ratio_text(against)
-            parts = [
-                np.array(list(statistics.final_values(experiment, task, method, f"rewards_met_{part}").values()))
-                for part in ("task", "curious", "late")
-            ]
-            numbers = [
-                _mean_std(met),
-                *(_mean_std(part) or NONE for part in parts),
-                f"{np.log1p(met).mean():.2f}",
-                text,
-            ]
-            shown.append([task, method, str(len(met)), *numbers])
-    columns = (
-        "task; arm; >seeds; >rewards met, c; >by task policy; >by second actor; >late; >log(1 + c); >minus baseline's"
-    )
+        met = final(task, method, "rewards_met")
+        if len(met) == 0 or (met < 0).any():
+            continue
+        parts = [final(task, method, f"rewards_met_{part}") for part in ("task", "curious", "late")]
+        numbers = [_mean_std(met), *(_mean_std(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
+        difference = NONE
+        if method != experiment.baseline_of(method):
+            difference = ratio_text(statistics.rewards_met_difference(experiment, task, method))
+        shown.append([task, method, str(len(met)), *numbers, difference])
+    columns = "task; arm; >seeds; >rewards met, c; >by task policy; >by second actor; >late; >log(1 + c)"
+    columns += "; >minus baseline's"
     return _table("Rewards met in training", columns, shown, render_text("rewards_met", _baselines(experiment)))
 
 

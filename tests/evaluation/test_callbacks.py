@@ -158,7 +158,7 @@ def test_video_shows_both_policies_with_their_errors(tmp_path: Path) -> None:
     """Decoded, each video shows the frames of that policy's episode; below, the curve grows from frame to frame."""
     env = Filmed(PixelBox())
     model = tiny_model("CnnPolicy", PixelBox())
-    model.learn(20, callback=PolicyVideoCallback(env, tmp_path, every=20, seed=4, fps=5))
+    model.learn(20, callback=PolicyVideoCallback(env, tmp_path, every=20, seed=4))
     # The update after the last step came after the film.
     for actor in ("task", "curious"):
         frames = np.stack(imageio.mimread(tmp_path / f"{actor}_policy_20_steps.mp4", memtest=False))
@@ -186,8 +186,8 @@ def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Pa
     np.testing.assert_array_equal(callback.observations, chosen)
     with th.no_grad():
         drawn = model.policy.srl.reconstruct(model.policy.encode(th.as_tensor(chosen)))
-    np.testing.assert_array_equal(callback.rows[-1][1], drawn[:, 3:])
-    assert not np.array_equal(callback.rows[0][1], callback.rows[-1][1])
+    np.testing.assert_array_equal(callback.rows[-1][1][""], drawn[:, 3:])
+    assert not np.array_equal(callback.rows[0][1][""], callback.rows[-1][1][""])
     picture = np.asarray(Image.open(tmp_path / "reconstructions.png").convert("L"))
     assert picture.shape[0] > height and picture.std() > 5
 
@@ -445,7 +445,7 @@ def test_latents_of_any_algorithm_are_drawn(make: Callable[[], BaseAlgorithm], t
     none = ReconstructionCallback(tmp_path / "none", every=32, decoder_updates=0)
     make().learn(32, callback=[callback, none])
     assert [steps for steps, _ in callback.rows] == [32] and names(tmp_path) == ["reconstructions.png"]
-    observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1]  # type: ignore[index, call-overload]
+    observed, drawn = callback.observations[:, -3:].astype(float), callback.rows[-1][1][""]  # type: ignore[index, call-overload]
     different = len(np.unique(callback.observations, axis=0))  # type: ignore[arg-type]
     assert different >= 3, "of different times"
     assert np.abs(drawn - observed).mean() < 0.75 * np.abs(observed - 128).mean(), "not grey"

@@ -332,7 +332,9 @@ def test_names_are_text_only(tmp_path: Path) -> None:
     """Whatever stands in the files stays text: in HTML, in Markdown, and in matplotlib, which has formulas."""
     arm = HOSTILE.replace("(b)", "")
     folder = tmp_path / "curves"
-    write_grid(folder, experiment=HOSTILE, methods={"sac_ae": {}, arm: {}}, evaluation={"every": HOSTILE})
+    write_grid(
+        folder, experiment=HOSTILE, methods={"sac_ae": {}, arm: {}}, evaluation={"every": HOSTILE, "episodes": 1}
+    )
     for seed in (0, 1):
         write_cell(folder, TASK, "sac_ae", seed, curve(0, 1))
         write_cell(folder, TASK, arm, seed, curve(0, 2), arguments={"srl": HOSTILE})
