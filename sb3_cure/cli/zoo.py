@@ -28,15 +28,22 @@ from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
 from sb3_cure.cli.progress import TimeLeft, time_text
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
-from sb3_cure.cli.zoo_files import ALGORITHMS, check_environment, find_class, import_module, read_yaml, zoo_file
+from sb3_cure.cli.zoo_files import (
+    ALGORITHMS,
+    OWN,
+    check_environment,
+    find_class,
+    import_module,
+    named_classes,
+    read_yaml,
+    zoo_file,
+)
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
 DEFAULT_ALGORITHM = "cure_sac"
 #: The file of settings where ``--conf-file`` is not given
 DEFAULT_SETTINGS = "cure_sac_ae"
-#: Arguments of the algorithms that take a class of the user's, which settings name as ``my_module.MyClass``
-OWN = ("srl", "intrinsic")
 #: Settings of a run that make a replay import and call code, or unpickle files
 TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
 
@@ -121,10 +128,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 raise UsageError(
                     f"{self.config} has no {name!r} for {self.env_name.gym_id}{nearest(name, hyperparams)}"
                 )
-        for name in (*OWN, "replay_buffer_class"):
-            value = hyperparams.get(name)
-            if isinstance(value, str) and "." in value:
-                hyperparams[name] = find_class(value)
+        hyperparams.update(named_classes(hyperparams))
         processed = super()._preprocess_hyperparams(hyperparams)
         rate = processed[0].get("learning_rate")
         if isinstance(rate, SimpleLinearSchedule):  # which archives do not know

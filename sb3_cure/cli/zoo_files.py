@@ -2,6 +2,7 @@
 
 import importlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 
 #: Algorithms by their name for ``--algo`` and in grids
 ALGORITHMS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
+#: Arguments that may name a class of the user's, as ``my_module.MyClass``, which no saved model holds
+OWN = ("srl", "intrinsic")
 #: Settings of methods, for ``sb3-cure train --conf-file`` and for grids
 ZOO = Path(__file__).parents[1] / "zoo_configs"
 #: Grids, for ``sb3-cure experiment``
@@ -143,6 +146,17 @@ def import_module(name: str) -> Any:
             raise
         here = [path.stem for path in Path().glob("*.py")]
         raise UsageError(f"there is no module {error.name!r}{nearest(error.name, here)}") from None
+
+
+def named_classes(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Import the user's classes that arguments of an algorithm name.
+
+    :param arguments: Arguments by name
+    :return: The classes by argument
+    :raises UsageError: as ``find_class``
+    """
+    given = {name: arguments.get(name) for name in (*OWN, "replay_buffer_class")}
+    return {name: find_class(value) for name, value in given.items() if isinstance(value, str) and "." in value}
 
 
 def find_class(name: str) -> Any:

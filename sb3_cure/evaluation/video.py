@@ -122,13 +122,8 @@ def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray,
 _font = functools.cache(ImageFont.load_default)
 
 
-def _width(line: str, size: int) -> float:
-    """Width of a line in pixels, with glyphs such as ``_`` that extend below the next one."""
-    return _font(size).getbbox(line)[2]
-
-
 def _fitting_size(line: str, size: int, width: int) -> int:
     """Reduce a font size until the line fits, as it may contain long numbers."""
-    while size > 1 and _width(line, size) > width:
+    while size > 1 and _font(size).getbbox(line)[2] > width:
         size -= 1
     return size

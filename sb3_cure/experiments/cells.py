@@ -19,11 +19,11 @@ from sb3_cure.cli.progress import TimeLeft
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.envs.counting import TASK_REWARD
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
+from sb3_cure.experiments import rewards_met
 from sb3_cure.experiments.coverage import CoverageRecorder
 from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_json
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
@@ -34,10 +34,9 @@ from sb3_cure.persistence import ExactCheckpoint
 EVAL_SEED = 10_000
 #: File with the traceback of a failed cell, until it is started again
 ERROR = "error.txt"
-_REWARDS_MET = ("rewards_met", "rewards_met_task", "rewards_met_curious", "rewards_met_late")
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "cpu_seconds", "return_mean", "return_std",
-    "task_srl_error", "curious_return_mean", "curious_srl_error", *_REWARDS_MET,
+    "task_srl_error", "curious_return_mean", "curious_srl_error", *rewards_met.COLUMNS,
 )  # fmt: skip
 _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 
@@ -124,7 +123,7 @@ class _CellRun:
             clock = TimeLeft(f"{cell.folder} (pretraining)")
             self.model.pretrain(steps, cell.pretrain.collector, callback=[record, self.checkpoints, clock])
         clock = TimeLeft(str(cell.folder), best_return=record.best_return)
-        callbacks: list[BaseCallback] = [record, self.checkpoints, clock]
+        callbacks: list[BaseCallback] = [record.rewards, record, self.checkpoints, clock]
         record.evaluates = True
         if cell.budget > 0:
             if cell.coverage is not None:
@@ -185,9 +184,9 @@ class _TimedCheckpoint(ExactCheckpoint):
 
 
 class _Record(BaseCallback):
-    """Evaluate between two agent steps, when all updates are made.
+    """Evaluate between two agent steps, when all updates are made, and keep times and conditions.
 
-    Its records are plain attributes, which checkpoints keep.
+    A resumed cell continues from its records.
 
     :param cell: The cell
     :param folder: Its folder
@@ -206,27 +205,19 @@ class _Record(BaseCallback):
         self.attempts: list[Row] = []
         #: Wall-clock time of all attempts, without what a kill undid
         self.seconds = 0.0
-        #: Sum of the task's rewards of all transitions that training has collected
-        self.rewards_met = 0.0
-        #: Of these, where the task policy and where the curious (or random) second actor acted; the rest: the warm-up
-        self.rewards_met_task = self.rewards_met_curious = 0.0
-        #: Of these, after the first two fifths of an episode, of episodes that have ended: a start may lie in the goal
-        self.rewards_met_late = 0.0
-        #: Rewards of each environment's episode so far
-        self.episode_rewards: list[list[float]] = []
+        self.rewards = rewards_met.RewardsMet()
         self._now, self._cpu_now = time.monotonic(), time.process_time()
         self._has_begun = False
 
     def state_dict(self) -> dict[str, Any]:
-        """Get what a resumed cell continues from.
+        """Get the records, without clocks.
 
-        :return: Records, but not clocks
+        :return: Plain data
         """
-        names = ("evaluates", "evaluations", "episodes", "attempts", "seconds", *_REWARDS_MET, "episode_rewards")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in ("evaluations", "episodes", "attempts", "seconds")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from these records.
+        """Restore the records.
 
         :param state: Result of ``state_dict``
         """
@@ -245,28 +236,8 @@ class _Record(BaseCallback):
         self._begin_attempt(self.model)  # type: ignore[arg-type]
 
     def _on_step(self) -> bool:
-        if self.evaluates:
-            self._count_rewards()
         self._tick()
         return not self.has_reached_return
-
-    def _count_rewards(self) -> None:
-        """Add the task's rewards of this step to the sums."""
-        model: Any = self.model
-        infos, dones = self.locals["infos"], self.locals["dones"]
-        given = zip(infos, self.locals["rewards"], strict=True)
-        rewards = np.array([info.get(TASK_REWARD, reward) for info, reward in given], dtype=np.float64)
-        self.rewards_met += float(rewards.sum())
-        if model.num_timesteps - len(rewards) >= model.learning_starts:
-            where = _second_actor_acted(model, len(rewards))
-            self.rewards_met_curious += float(rewards[where].sum())
-            self.rewards_met_task += float(rewards[~where].sum())
-        self.episode_rewards = self.episode_rewards or [[] for _ in rewards]
-        for episode, reward, done in zip(self.episode_rewards, rewards.tolist(), dones, strict=True):
-            episode.append(reward)
-            if done:
-                self.rewards_met_late += sum(episode[-(-2 * len(episode) // 5) :])
-                episode.clear()
 
     def best_return(self) -> float | None:
         """Best mean return of the task policy in an evaluation; None before the first."""
@@ -294,7 +265,7 @@ class _Record(BaseCallback):
     @property
     def cpu_seconds(self) -> float:
         """CPU time of all attempts, without what a kill undid."""
-        return round(sum(attempt.get("cpu_seconds", 0.0) for attempt in self.attempts), 1)
+        return round(sum(attempt["cpu_seconds"] for attempt in self.attempts), 1)
 
     def _evaluate_if_due(self, finished: bool) -> None:
         steps = self.num_timesteps * self.action_repeat
@@ -320,7 +291,7 @@ class _Record(BaseCallback):
             self._measure("curious", row)
         self._tick()
         row.update(seconds=round(self.seconds, 1), cpu_seconds=self.cpu_seconds)
-        row.update({name: round(getattr(self, name), 3) for name in _REWARDS_MET})
+        row.update({name: round(value, 3) for name, value in self.rewards.sums.items()})
         self.write_tables()
 
     def _measure(self, actor: str, row: Row) -> None:
@@ -417,13 +388,6 @@ def is_held(folder: Path) -> bool:
     except OSError:
         return False
     return False
-
-
-def _second_actor_acted(model: Any, n_envs: int) -> np.ndarray:
-    """Where the curious (or random) second actor chose the last actions, bool [n_envs]."""
-    if not model.task:  # the policy itself is the curious one
-        return np.ones(n_envs, dtype=bool)
-    return model._mixer.curious if model.curiosity in ("separate", "random") else np.zeros(n_envs, dtype=bool)
 
 
 def _describe(model: CuReSAC) -> dict[str, Any]:

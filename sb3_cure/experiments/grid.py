@@ -3,7 +3,6 @@
 import contextlib
 import copy
 import json
-import pkgutil
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,17 @@ import torch as th
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt
 
 from sb3_cure.cli.usage import UsageError, nearest, one_sentence
-from sb3_cure.cli.zoo_files import ALGORITHMS, GRIDS, ZOO, check_environment, read_yaml, zoo_entry, zoo_file
+from sb3_cure.cli.zoo_files import (
+    ALGORITHMS,
+    GRIDS,
+    ZOO,
+    check_environment,
+    find_class,
+    named_classes,
+    read_yaml,
+    zoo_entry,
+    zoo_file,
+)
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.counting import CellInfo, TaskReward
@@ -27,8 +36,6 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 DONE = "DONE"
 #: Keys of ``config.json`` that decide what is trained, and are compared before results are mixed
 SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
-#: Arguments that may name a class of the user's, as ``"my_module.MyClass"``
-_CLASSES = ("srl", "intrinsic", "replay_buffer_class")
 
 
 def short_name(task: str) -> str:
@@ -250,12 +257,11 @@ class Cell:
         named = self.arguments.get("env_wrapper") or []
         for each in named if isinstance(named, list) else [named]:
             [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
-            yield pkgutil.resolve_name(name), kwargs
+            yield find_class(name), kwargs
 
     def custom_objects(self) -> dict[str, Any]:
         """Import the user's classes that the arguments name; a model's archive needs them to be loaded."""
-        given = {name: str(self.arguments.get(name)) for name in _CLASSES}
-        return {name: pkgutil.resolve_name(value) for name, value in given.items() if "." in value}
+        return named_classes(self.arguments)
 
     def make_model(self, env: Any, **changes: Any) -> CuReSAC:
         """Make its model.

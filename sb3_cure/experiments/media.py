@@ -3,6 +3,7 @@
 import contextlib
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
@@ -70,28 +71,35 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     :param cell: The cell
     :param folder: Where to write
     """
-    actors = visiting_actors(model, cell)
+    is_trained = cell.budget > 0
     with contextlib.closing(cell.make_eval_env()) as env:
-        repeat = action_repeat_of(env)
-        can_film = cell.budget > 0 and "rgb_array" in env.metadata.get("render_modes", [])
-        if env.has_wrapper_attr("physics") and actors != ["random"]:
-            visits = {}
-            with balanced_negatives(model, env, VISIT_SEED - 1):
-                for actor in actors:
-                    episodes = roll_out(model, cell, env, actor, states=True)
-                    states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
-                    visits[actor] = np.concatenate(states), np.concatenate(errors)
-            title = f"Where policies go with sampled actions: {_title(cell)}"
-            names, units = physics_state_names(env), physics_state_units(env)
-            plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
-    if can_film:
-        with contextlib.closing(cell.make_eval_env(render_mode="rgb_array")) as env:
-            for actor in trained_actors(model):
-                (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
-                title = f"{actor} policy, deterministic actions: {_title(cell)}"
-                write_video(folder / f"{actor}_policy.mp4", {title: episode}, frame_rate(env), repeat)
+        repeat, can_film = action_repeat_of(env), "rgb_array" in env.metadata.get("render_modes", [])
+        if is_trained and env.has_wrapper_attr("physics"):
+            _draw_map(model, cell, env, folder)
+    if is_trained and can_film:
+        _film(model, cell, repeat, folder)
     if getattr(model.policy, "measures_errors", False) and is_image_space(model.observation_space):
         _draw_replay_buffer(model, cell, repeat, folder)
+
+
+def _draw_map(model: CuReSAC, cell: Cell, env: gym.Env, folder: Path) -> None:
+    visits = {}
+    with balanced_negatives(model, env, VISIT_SEED - 1):
+        for actor in visiting_actors(model, cell):
+            episodes = roll_out(model, cell, env, actor, states=True)
+            states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
+            visits[actor] = np.concatenate(states), np.concatenate(errors)
+    title = f"Where policies go with sampled actions: {_title(cell)}"
+    names, units = physics_state_names(env), physics_state_units(env)
+    plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)
+
+
+def _film(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -> None:
+    with contextlib.closing(cell.make_eval_env(render_mode="rgb_array")) as env:
+        for actor in trained_actors(model):
+            (episode,) = run_episodes(model, env, 1, actor, seed=FILM_SEED, render=True)
+            title = f"{actor} policy, deterministic actions: {_title(cell)}"
+            write_video(folder / f"{actor}_policy.mp4", {title: episode}, frame_rate(env), repeat)
 
 
 def _draw_replay_buffer(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -> None:

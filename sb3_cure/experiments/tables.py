@@ -50,6 +50,16 @@ def _table(title: str, columns: str, rows: Sequence[Sequence[str]], note: str = 
 # Templates
 
 
+def plural(count: int, noun: str) -> str:
+    """Count and noun: ``"1 seed"``, ``"2 seeds"``.
+
+    :param count: Number of things
+    :param noun: In the singular
+    :return: The text
+    """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def markdown_text(text: str) -> str:
     """Escape plain text for Markdown: nothing of it ends a cell of a table, or becomes HTML, a link or a picture.
 
@@ -70,6 +80,7 @@ _TEMPLATES = jinja2.Environment(
 )
 _TEMPLATES.filters |= {
     "md": markdown_text,
+    "plural": plural,
     "heading": lambda name: name.removeprefix(">"),
     "json": lambda value: json.dumps(value, indent=2, ensure_ascii=False),
     "base64": lambda content: base64.b64encode(content).decode(),
@@ -151,16 +162,6 @@ def ratio_text(estimate: Estimate) -> str:
     """
     shown = "(one seed)" if estimate.low is None else interval_text(estimate, 2)
     return f"{number_text(estimate.value, 2)} {shown}" if math.isfinite(estimate.value) else NONE
-
-
-def plural(count: int, noun: str) -> str:
-    """Count and noun: ``"1 seed"``, ``"2 seeds"``.
-
-    :param count: Number of things
-    :param noun: In the singular
-    :return: The text
-    """
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _list(values: Iterable[Any]) -> str:
