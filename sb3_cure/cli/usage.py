@@ -17,11 +17,11 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
     :param name: What was typed
     :param known: Names that there are
-    :return: ``"; did you mean a, b or c?"``, or ``"."`` where nothing is near
+    :return: ``"; did you mean a or b?"``, or ``"."`` where nothing is near
     """
     by_lower_case = {each.lower(): each for each in known}
     found = [by_lower_case[each] for each in difflib.get_close_matches(name.lower(), by_lower_case)]
-    return f"; did you mean {' or '.join(filter(None, (', '.join(found[:-1]), found[-1])))}?" if found else "."
+    return f"; did you mean {' or '.join(found)}?" if found else "."
 
 
 def missing_file(path: Path, names: Iterable[str] = ()) -> str:

@@ -180,7 +180,7 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
             keys.append((found.parent.parent.name, found.parent.name, seed))
     order = list(dict.fromkeys(task for task, _, _ in keys))
     keys = sorted(dict.fromkeys(keys), key=lambda key: order.index(key[0]))
-    cells = {key: _read_cell(root / key[0] / key[1] / f"seed{key[2]}", *key) for key in keys}
+    cells = {key: _read_cell(root, *key) for key in keys}
     experiment = Experiment(name or grid["experiment"], root, grid, cells)
     for task, method in experiment.arms:
         done = list(experiment.done(task, method).values())
@@ -203,7 +203,8 @@ def _check_settings(first: CellResult, other: CellResult, keys: tuple[str, ...])
             )
 
 
-def _read_cell(folder: Path, task: str, method: str, seed: int) -> CellResult:
+def _read_cell(root: Path, task: str, method: str, seed: int) -> CellResult:
+    folder = root / task / method / f"seed{seed}"
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
     if not (folder / "DONE").exists():
