@@ -8,6 +8,7 @@ import pytest
 from envs_for_tests import PixelBox, tiny_model
 from stable_baselines3.common.logger import KVWriter, Logger
 
+from sb3_cure.evaluation import diagnostics
 from sb3_cure.evaluation.callbacks import DiagnosticsCallback, EvalBothCallback
 
 GLOSSARY = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text(encoding="utf-8")
@@ -36,8 +37,10 @@ def as_in_glossary(name: str) -> str:
 def logged() -> set[str]:
     model, keeper = tiny_model("CnnPolicy", PixelBox(), intrinsic="icm"), Keeper()
     model.set_logger(Logger(None, [keeper]))
-    watching = [EvalBothCallback(PixelBox(), 40, 1), DiagnosticsCallback(every=40, min_updates=1)]
-    model.learn(80, callback=watching, log_interval=1)
+    watching = [EvalBothCallback(PixelBox(), 40, 1), DiagnosticsCallback(every=40)]
+    with pytest.MonkeyPatch.context() as early:
+        early.setattr(diagnostics, "MIN_UPDATES", 1)
+        model.learn(80, callback=watching, log_interval=1)
     return {as_in_glossary(name) for name in keeper.names}
 
 

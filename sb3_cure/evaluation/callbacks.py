@@ -514,31 +514,15 @@ class DiagnosticsCallback(PeriodicCallback):
     ========================  ============================================================================
 
     Works with every off-policy algorithm of SB3; checks that do not apply are left out. Each number is logged as
-    ``diagnostics/<name>``; ``sb3_cure.evaluation.diagnostics`` defines them and gives reasons for the thresholds.
-    A look takes less time than one update with a batch of ``n_samples``.
+    ``diagnostics/<name>``; ``sb3_cure.evaluation.diagnostics`` defines them and the thresholds, with reasons.
+    A look takes less time than one update with a batch of as many observations.
 
     :param every: Agent steps between two looks
-    :param n_samples: Observations of the replay buffer to look at
-    :param min_updates: Updates before networks, temperatures and the curious reward are judged: in the first hundreds
-        latents may collapse and recover
-    :param autoencoder_updates: Updates before the autoencoder is judged: before a few thousand it is no better than
-        the mean image in good runs either
-    :param temperature_bounds: Least and greatest temperature that can still weigh entropy against reward
     :param verbose: 1 prints each look
     """
 
-    def __init__(
-        self,
-        every: int = 1000,
-        n_samples: int = 128,
-        min_updates: int = 2000,
-        autoencoder_updates: int = 5000,
-        temperature_bounds: Sequence[float] = (1e-4, 1e2),
-        verbose: int = 0,
-    ):
+    def __init__(self, every: int = 1000, verbose: int = 0):
         super().__init__(every, verbose)
-        self.n_samples, self.min_updates, self.autoencoder_updates = n_samples, min_updates, autoencoder_updates
-        self.temperature_bounds = [float(bound) for bound in temperature_bounds]  # YAML reads 1e-4 as a text
         #: Names of the problems that were warned of
         self.warned: list[str] = []
         self._reward_std: Any = None
@@ -550,15 +534,7 @@ class DiagnosticsCallback(PeriodicCallback):
 
     def on_period(self) -> None:
         """Look, log and warn; after a problem nothing is looked at that it may explain."""
-        findings = diagnostics.look(
-            self.model,
-            self._reward_std,
-            self.n_samples,
-            self.min_updates,
-            self.autoencoder_updates,
-            self.temperature_bounds,
-        )
-        for name, value, problem in filter(None, findings):
+        for name, value, problem in filter(None, diagnostics.look(self.model, self._reward_std)):
             self.logger.record(f"diagnostics/{name}", float(value))
             if self.verbose >= 1:
                 print(f"{name} {value:.3g}")

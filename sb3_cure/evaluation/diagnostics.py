@@ -17,6 +17,16 @@ from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.evaluation.encoding import encoder_of
 from sb3_cure.srl import RAE, DictHead
 
+#: Observations of the replay buffer that are looked at
+SAMPLES = 128
+#: Updates before networks, temperatures and the curious reward are judged: in the first hundreds latents may collapse
+#: and recover
+MIN_UPDATES = 2000
+#: Updates before an autoencoder is judged: before a few thousand it is no better than the mean image, also in good
+#: runs
+AUTOENCODER_UPDATES = 5000
+#: Least and greatest temperature that can still weigh entropy against reward
+TEMPERATURES = 1e-4, 1e2
 #: Latest transitions, of all environments together, that are checked for a constant image
 RECENT = 1000
 #: Observations of an environment that must be equal to count as constant: a robot may lie still for a moment
@@ -62,47 +72,40 @@ class Temperature(NamedTuple):
 
 
 @th.no_grad()
-def look(
-    model: Any, reward_std: Any, n_samples: int, min_updates: int, autoencoder_updates: int, bounds: Sequence[float]
-) -> Iterator[Finding | None]:
+def look(model: Any, reward_std: Any) -> Iterator[Finding | None]:
     """Look at a model in training, from cause to effect: a problem may explain those that follow.
 
     Behind a constant image all latents are alike, and next to a huge temperature no reward counts.
 
     :param model: An off-policy algorithm of SB3, or of this package
     :param reward_std: Standard deviation of the curious reward, last logged; None before the first update
-    :param n_samples: Observations to look at
-    :param min_updates: Updates before networks and temperatures are judged
-    :param autoencoder_updates: Updates before the autoencoder is judged
-    :param bounds: Least and greatest temperature
     :return: Findings; None for checks that do not apply
     """
-    yield constant_image(model, n_samples)
-    if model._n_updates < max(min_updates, 1):
+    yield constant_image(model)
+    if model._n_updates < MIN_UPDATES:
         return
     model.policy.set_training_mode(False)
-    batch = model.replay_buffer.sample(n_samples, env=model._vec_normalize_env)
+    batch = model.replay_buffer.sample(SAMPLES, env=model._vec_normalize_env)
     temperatures = list(_temperatures(model, batch))
-    yield temperature_at_bound(temperatures, model, bounds)
+    yield temperature_at_bound(temperatures, model)
     encode = encoder_of(model.policy)
     if encode is not None:
         latents = encode(batch.observations)
         yield collapsed_latents(latents)
         explained = explained_share(model, batch, latents)
-        yield None if explained is None else autoencoder(explained, model._n_updates, autoencoder_updates)
+        yield None if explained is None else autoencoder(explained, model._n_updates)
     yield None if reward_std is None else curious_reward(float(reward_std), temperatures)
 
 
 # ------------------------------------------------------------------------ checks
 
 
-def constant_image(model: Any, n_samples: int) -> Finding | None:
+def constant_image(model: Any) -> Finding | None:
     """Environments whose latest images are all equal, as nothing moves or the camera sees nothing.
 
     Value: number of such environments, or of their images for dictionaries. Expected: 0.
 
     :param model: The model
-    :param n_samples: Observations to look at, of all environments together
     :return: None without images, or with fewer than ``MIN_ALIKE`` observations of each environment
     """
     buffer = model.replay_buffer
@@ -110,7 +113,7 @@ def constant_image(model: Any, n_samples: int) -> Finding | None:
     count = min(len(rows) // buffer.n_envs, max(-(-RECENT // buffer.n_envs), MIN_ALIKE))
     if not image_spaces(model.observation_space) or count < MIN_ALIKE:
         return None
-    chosen = np.linspace(0, count - 1, min(count, max(n_samples // buffer.n_envs, MIN_ALIKE))).astype(int)
+    chosen = np.linspace(0, count - 1, min(count, max(SAMPLES // buffer.n_envs, MIN_ALIKE))).astype(int)
     constant: list[str] = []
     for env in range(buffer.n_envs):
         seen = transitions(buffer, rows[env_inds == env][chosen], np.full(len(chosen), env)).observations
@@ -140,53 +143,51 @@ def collapsed_latents(latents: th.Tensor) -> Finding:
     return Finding("collapsed_latents", spread, problem if spread < LATENT_SPREAD else None)
 
 
-def autoencoder(explained: float, updates: int, min_updates: int) -> Finding:
+def autoencoder(explained: float, updates: int) -> Finding:
     """An autoencoder no better than the mean image, which is the best constant reconstruction.
 
-    Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` after some
-    thousand updates; early on it is below 0.
+    Value: 1 - (noise-free squared error) / (that of the mean image). Expected: at least ``EXPLAINED_SHARE`` after
+    ``AUTOENCODER_UPDATES``; early on it is below 0.
 
     :param explained: The value
     :param updates: Updates that were made
-    :param min_updates: Updates after which it is judged
     """
     problem = (
         f"after {updates} updates the autoencoder explains {explained:.3f} of the pixels' variance, not "
         f"{EXPLAINED_SHARE} at least: try another learning_rate, more filters, or srl='curl'."
     )
-    is_bad = updates >= min_updates and explained < EXPLAINED_SHARE
+    is_bad = updates >= AUTOENCODER_UPDATES and explained < EXPLAINED_SHARE
     return Finding("autoencoder", explained, problem if is_bad else None)
 
 
-def temperature_at_bound(temperatures: Sequence[Temperature], model: Any, bounds: Sequence[float]) -> Finding | None:
+def temperature_at_bound(temperatures: Sequence[Temperature], model: Any) -> Finding | None:
     """Temperatures that no longer weigh entropy against reward.
 
     SAC's temperature falls towards 0 if the policy stays more random than the target entropy at any temperature (say,
     without any reward), and rises without limit if the policy cannot become as random as the target. So a learned one
-    counts as at its bound when it lies outside of ``bounds`` *and* the policy's entropy misses its target by
+    counts as at its bound when it lies outside of ``TEMPERATURES`` *and* the policy's entropy misses its target by
     ``ENTROPY_GAP`` nats per action dimension in the direction that drives it further out: small rewards alone need a
-    small temperature, and with it the policy meets the target. A fixed one counts when it lies outside of ``bounds``,
-    unless it is 0, which turns the entropy off.
+    small temperature, and with it the policy meets the target. A fixed one counts when it lies outside of
+    ``TEMPERATURES``, unless it is 0, which turns the entropy off.
 
     Value: number of temperatures at a bound. Expected: 0.
 
     :param temperatures: Of the agents that are trained
     :param model: The model
-    :param bounds: Least and greatest temperature
     :return: None for algorithms without temperature
     """
-    problems = []
+    (least, greatest), problems = TEMPERATURES, []
     for agent, value, learned, log_prob in temperatures:
         entropy, target = -float(log_prob.mean()), float(model.target_entropy)
         gap = (entropy - target) / np.prod(model.action_space.shape)
-        too_low, too_high = value < bounds[0], value > bounds[1]
+        too_low, too_high = value < least, value > greatest
         how, advice = "is fixed at", "use ent_coef='auto', or scale the rewards"
         if learned:
             too_low, too_high = too_low and gap > ENTROPY_GAP, too_high and gap < -ENTROPY_GAP
             how = f"has reached, with an entropy of {entropy:.1f} and a target of {target:.1f},"
             advice = "check whether it finds any reward" if too_low else "set a smaller target_entropy"
         if (too_low or too_high) and (learned or value != 0):
-            expected = f"not in [{bounds[0]:g}, {bounds[1]:g}]: {advice}"
+            expected = f"not in [{least:g}, {greatest:g}]: {advice}"
             problems.append(f"the temperature of the {agent} agent {how} {value:.1e}, {expected}.")
     return Finding("temperature", len(problems), problems[0] if problems else None) if temperatures else None
 

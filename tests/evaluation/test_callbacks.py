@@ -33,7 +33,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_cure import evaluation, make_dmc_env
 from sb3_cure.data.buffers import transitions
 from sb3_cure.envs import StackFrames
-from sb3_cure.evaluation import plots
+from sb3_cure.evaluation import diagnostics, plots
 from sb3_cure.evaluation.callbacks import (
     CuriosityMapCallback,
     DiagnosticsCallback,
@@ -388,11 +388,12 @@ def test_tensorboard_shows_each_image(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "make", [lambda: SensorBox(("front", "joints"), channels_last=True), Goal], ids=["channels last", "vectors"]
 )
-def test_dictionaries_are_watched(make: Any) -> None:
+def test_dictionaries_are_watched(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Evaluation and diagnostics see them as training does; another dictionary is refused."""
+    monkeypatch.setattr(diagnostics, "MIN_UPDATES", 1)
     evaluate = EvalBothCallback(make(), eval_freq=20, n_episodes=1)
     model = tiny_model("MultiInputPolicy", make())
-    model.learn(30, [evaluate, DiagnosticsCallback(every=10, min_updates=1)])
+    model.learn(30, [evaluate, DiagnosticsCallback(every=10)])
     assert {"eval/task_reward", "eval/curious_srl_error"} <= evaluate.history[-1].keys()
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         model.learn(1, EvalBothCallback(SensorBox(), 20))
