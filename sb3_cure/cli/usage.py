@@ -9,7 +9,7 @@ from typing import Any
 
 
 class UsageError(ValueError):
-    """A command line, or a file that it names, that cannot be used; the message is one sentence for its author."""
+    """A command line, or a file or folder that it names, that cannot be used; the message is one sentence."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -54,6 +54,8 @@ __all__ = [
 
 #: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
 PRINTED_NAME = 33
+#: Most rows of a picture of reconstructions; further times are left out evenly
+MAX_ROWS = 12
 
 
 class PeriodicCallback(BaseCallback):
@@ -266,7 +268,6 @@ class ReconstructionCallback(PeriodicCallback):
         spread over their time when the first row is drawn
     :param columns: How many observations to take
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
-    :param max_rows: Most rows of the picture; further times are left out evenly
     :param verbose: 1 prints the file's name
     :param title: Added to the picture's title, such as the names of task and method
     :raises ValueError: if the model has no replay buffer, does not learn from images with an encoder, or from others
@@ -280,14 +281,12 @@ class ReconstructionCallback(PeriodicCallback):
         observations: np.ndarray | dict[str, np.ndarray] | None = None,
         columns: int = 8,
         decoder_updates: int = 500,
-        max_rows: int = 12,
         verbose: int = 0,
         title: str = "",
     ):
         super().__init__(every, verbose)
         self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.decoder_updates, self.max_rows = decoder_updates, max_rows
-        self.title = title
+        self.decoder_updates, self.title = decoder_updates, title
         #: Agent steps and the reconstructions then, their newest frames by key, uint8 [n, C, H, W]
         self.rows: list[tuple[int, dict[str, np.ndarray]]] = []
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
@@ -327,7 +326,7 @@ class ReconstructionCallback(PeriodicCallback):
             {key: np.array(as_arrays(newest_frames(each[key], frame_stack))) for key in pair[1]} for each in pair
         )
         self.rows.append((self.num_timesteps, row))
-        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), self.max_rows)).round().astype(int))
+        shown = np.unique(np.linspace(0, len(self.rows) - 1, min(len(self.rows), MAX_ROWS)).round().astype(int))
         for key, images in seen.items():
             # Keys such as dm_control's "walker/egocentric_camera"
             name = re.sub(r"[^\w.-]", "_", f"reconstructions_{key}" if key else "reconstructions")

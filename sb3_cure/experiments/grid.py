@@ -66,6 +66,7 @@ _Seeds = Annotated[
 ]
 
 
+# Dataclasses, as `asdict` of a cell describes them, too
 @pydantic.dataclasses.dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Pretraining:
     """A phase of representation learning without task reward, before training.
@@ -351,7 +352,7 @@ def load_grid(
 ) -> Grid:
     """Read a grid and the zoo files it names.
 
-    A file's budget of 0 means pretraining alone, and then ``budget`` can be given only if no method pretrains.
+    A file's budget of 0 means pretraining alone, which ``budget`` cannot change.
 
     :param path: YAML file, or the name of one of the package's grids, such as ``fast/curves``
     :param seeds: Instead of the file's: a number of seeds (the first of the file's list, else from 0), or a list
@@ -404,10 +405,10 @@ def _validation_message(error: Any) -> str:
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
     """Change the budget, and that of pretraining in proportion."""
+    if file.budget == 0:
+        raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
     for method in file.methods.values():
         if method.pretrain is not None:
-            if file.budget == 0:
-                raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
             method.pretrain = replace(method.pretrain, budget=steps)
     file.budget = budget

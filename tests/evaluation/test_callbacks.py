@@ -33,7 +33,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_cure import evaluation, make_dmc_env
 from sb3_cure.data.buffers import transitions
 from sb3_cure.envs import StackFrames
-from sb3_cure.evaluation import diagnostics, plots
+from sb3_cure.evaluation import callbacks, diagnostics, plots
 from sb3_cure.evaluation.callbacks import (
     CuriosityMapCallback,
     DiagnosticsCallback,
@@ -192,11 +192,14 @@ def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Pa
     assert picture.shape[0] > height and picture.std() > 5
 
 
-def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(tmp_path: Path) -> None:
-    """The first row is the untrained model's; the picture stays as high as ``max_rows`` rows."""
+def test_given_observations_are_drawn_from_the_start_and_rows_thinned_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first row is the untrained model's; the picture stays as high as ``MAX_ROWS`` rows."""
+    monkeypatch.setattr(callbacks, "MAX_ROWS", 3)
     env = PixelBox()
     observations = np.stack([env.reset(seed=seed)[0] for seed in range(3)])
-    callback = ReconstructionCallback(tmp_path, every=4, observations=observations, max_rows=3)
+    callback = ReconstructionCallback(tmp_path, every=4, observations=observations)
     heights = []
 
     class Measure(BaseCallback):
