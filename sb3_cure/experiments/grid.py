@@ -51,10 +51,7 @@ def short_name(task: str) -> str:
 
 
 def _check_registered(task: str) -> str:
-    try:
-        check_environment(task)
-    except UsageError as error:
-        raise ValueError(f"{str(error).rstrip('.')} (one of your own is my_module:My-v0)") from error
+    check_environment(task)  # whose errors are ValueErrors, as pydantic wants them
     return task
 
 
@@ -399,7 +396,7 @@ def _validation_message(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         known = {name for part in (GridFile, Method, Evaluation) for name in part.model_fields}
         return f"{'.'.join(keys)} is no key of a grid{nearest(keys[-1], known)}".rstrip(".")
-    text = f"{'.'.join(keys) or 'it'}: {error['msg'].removeprefix('Value error, ')}"
+    text = f"{'.'.join(keys) or 'it'}: {error['msg'].removeprefix('Value error, ').rstrip('.')}"
     return text + (f" (got {error['input']!r:.60})" if keys else "")
 
 

@@ -93,7 +93,7 @@ def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
             yield head.target(images, dither=False).cpu().numpy()
         elif not is_image_space(model.observation_space):
             yield flatten_vectors(images, model.observation_space).cpu().numpy()
-        else:
+        else:  # five bits, as an autoencoder's by default
             yield ((images.div(8, rounding_mode="floor") + 0.5) / 32 - 0.5).cpu().numpy()
 
 
