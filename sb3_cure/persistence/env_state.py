@@ -7,7 +7,8 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
 2. DeepMind Control tasks of the suite: MuJoCo's integration state, what the task changed in the model, its random
    stream, the step count.
 3. Layers of Gymnasium, SB3, rl-zoo3 and this package: their plain attributes (numbers, strings, arrays, NumPy's
-   generators, and containers of these). Functions, classes and spaces are those of the new environment.
+   generators, and containers of these). Classes, spaces, and functions that keep nothing are those of the new
+   environment.
 4. Other wrappers without attributes of their own: nothing.
 
 Any other layer makes its environment begin a new episode, as nothing tells whether its attributes are all of its state;
@@ -16,6 +17,7 @@ and the environment's id, not by their arguments.
 """
 
 import copy
+import inspect
 import random
 from typing import Any
 
@@ -220,7 +222,7 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
     values = {}
     for key, value in attributes.items():
-        is_built = isinstance(value, EnvSpec | gym.Space | np.dtype) or callable(value)
+        is_built = isinstance(value, EnvSpec | gym.Space | np.dtype | np.ufunc) or _keeps_nothing(value)
         if key not in no_state and not is_built and not any(value is other for other in layers):
             encode(value, f"{name}.{key}", {})
             values[key] = value
@@ -260,6 +262,16 @@ def _has_state_dict(layer: Any) -> bool:
 
 def _is_known(layer: Any) -> bool:
     return isinstance(layer, gym.Env | VecEnvWrapper) and type(layer).__module__.startswith(_KNOWN)
+
+
+def _keeps_nothing(value: Any) -> bool:
+    """Whether a value is a class, or a function without an object or a closure that could hold state."""
+    if not inspect.isroutine(value):
+        return inspect.isclass(value)
+    # Those that known layers make themselves hold their constructor's arguments alone.
+    is_known = (getattr(value, "__module__", None) or "").startswith(_KNOWN)
+    holder = getattr(value, "__closure__", None) or getattr(value, "__self__", None)
+    return is_known or holder is None or inspect.ismodule(holder)
 
 
 def _is_dmc(layer: Any) -> bool:

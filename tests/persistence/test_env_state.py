@@ -142,6 +142,9 @@ def test_saving_changes_nothing() -> None:
 
 WRAPPERS: dict[str, Callable[[gym.Env], gym.Env]] = {
     "ClipAction": wrappers.ClipAction,
+    "TransformReward": lambda env: wrappers.TransformReward(env, np.tanh),
+    "TransformReward of a function": lambda env: wrappers.TransformReward(env, lambda reward: reward / 2),
+    "RescaleAction": lambda env: wrappers.RescaleAction(env, np.float32(-1), np.float32(1)),
     "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
     "NormalizeObservation": wrappers.NormalizeObservation,
@@ -284,10 +287,30 @@ class Broken(Dot):
         pass
 
 
+class Fading:
+    """A function of the user's that remembers how often it was called."""
+
+    def __init__(self) -> None:
+        self.n_calls = 0
+
+    def __call__(self, reward: Any) -> float:
+        self.n_calls += 1
+        return float(reward) / self.n_calls
+
+
+def fading() -> Callable[[Any], float]:
+    """The same as a closure."""
+    count = itertools.count(1)
+    return lambda reward: float(reward) / next(count)
+
+
 NOT_KEPT: dict[str, Callable[[], gym.Env]] = {
     "Silent has no state_dict": lambda: Silent(Dot()),
     r"PendulumEnv\.lock is of the type _thread\.lock": locked,
     "Broken.*'missing'": Broken,
+    r"TransformReward\.func is of the type .*Fading": lambda: wrappers.TransformReward(Dot(), Fading()),
+    r"TransformReward\.func is the function .*Fading": lambda: wrappers.TransformReward(Dot(), Fading().__call__),
+    r"TransformReward\.func is the function .*fading": lambda: wrappers.TransformReward(Dot(), fading()),
 }
 
 
