@@ -50,9 +50,10 @@ class Particle(IntrinsicReward):
         self.places = np.full((memory, 2), -1)
         self.cursor = 0
         # Episode of each stored transition, another number for each environment, [buffer_size, n_envs]; how many rows
-        # had been added when they were numbered, and the identity of their buffer
+        # had been added when they were numbered, and the starts of their buffer: held, as a later one may have its id
         self._episodes: ndarray | None = None
-        self._n_numbered, self._numbered_buffer = 0, 0
+        self._n_numbered = 0
+        self._starts: ndarray | None = None
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the memory."""
@@ -139,12 +140,12 @@ class Particle(IntrinsicReward):
         """Number the episodes of the rows added since the last update; a new number wherever the stream breaks."""
         size, n_envs = buffer.buffer_size, buffer.n_envs
         n_new = min(buffer.n_added - self._n_numbered, buffer.size())
-        if self._episodes is None or self._numbered_buffer != id(buffer):
+        if self._episodes is None or self._starts is not buffer.starts:
             self._episodes, n_new = np.tile(np.arange(n_envs), (size, 1)), buffer.size()
         for start in range(0, n_new, CHUNK):
             rows = (buffer.pos - n_new + np.arange(start, min(start + CHUNK, n_new))) % size
             before = (rows - 1) % size
             begins = buffer.starts[rows] | (buffer.dones[before] > 0)
             self._episodes[rows] = self._episodes[before[:1]] + n_envs * begins.cumsum(axis=0)
-        self._n_numbered, self._numbered_buffer = buffer.n_added, id(buffer)
+        self._n_numbered, self._starts = buffer.n_added, buffer.starts
         return self._episodes

@@ -406,6 +406,17 @@ def test_particle_numbers_the_episodes_of_a_buffer_that_was_loaded(tmp_path: Pat
     assert len(found) == 2 and not th.stack(found).any()
 
 
+def test_particle_numbers_the_episodes_of_a_buffer_at_the_address_of_another() -> None:
+    """As of two loads in a row, of which the second may take the freed memory of the former buffer."""
+    kwargs: dict[str, Any] = dict(intrinsic="particle", srl=None, task=False)
+    other: Any = tiny_model("CnnPolicy", PixelBox(episode_length=50), **kwargs).learn(30).replay_buffer
+    model = tiny_model("CnnPolicy", PixelBox(episode_length=7), **kwargs).learn(30)
+    model.replay_buffer.__setstate__(other.__getstate__())  # type: ignore[union-attr]
+    found = captured(model)
+    model.train(2)
+    assert len(found) == 2 and not th.stack(found).any()
+
+
 def test_particle_of_a_single_episode_earns_nothing() -> None:
     model = filled_model(srl=None, intrinsic="particle")
     found = captured(model)
