@@ -144,7 +144,7 @@ WRAPPERS: dict[str, Callable[[gym.Env], gym.Env]] = {
     "ClipAction": wrappers.ClipAction,
     "TransformReward": lambda env: wrappers.TransformReward(env, np.tanh),
     "TransformReward of a function": lambda env: wrappers.TransformReward(env, lambda reward: reward / 2),
-    "RescaleAction": lambda env: wrappers.RescaleAction(env, np.float32(-1), np.float32(1)),
+    "ClipReward": lambda env: wrappers.ClipReward(env, -0.5, 0.5),
     "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
     "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
     "NormalizeObservation": wrappers.NormalizeObservation,
