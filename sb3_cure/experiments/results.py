@@ -11,6 +11,7 @@ from sb3_cure.cli.usage import UsageError
 from sb3_cure.experiments.grid import SETTINGS, read_json, seed_of, short_name
 
 DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+_FIX = "remove the cell's folder and run the grid again"
 
 
 @dataclass(frozen=True)
@@ -160,12 +161,16 @@ def read_results(folder: str | Path) -> list[Experiment]:
 
     :param folder: A folder with experiments anywhere below it, or the folder of one
     :return: The experiments, by name
-    :raises UsageError: if there are none, if a JSON file is damaged, or if cells were run with different settings
+    :raises UsageError: with one sentence that names the folder or file, if there are none, if files are missing or
+        damaged, or if cells were run with different settings
     """
     folder = Path(folder)
     if (folder / "grid.json").exists():
         return [_read_experiment(folder / "grid.json")]
     grids = sorted(folder.rglob("grid.json"))
+    lost = {path.parents[3] for path in folder.rglob("*/*/seed*/DONE")} - {path.parent for path in grids}
+    if lost:
+        raise UsageError(f"{min(lost)} holds finished cells, but no grid.json: run the grid again, which writes it.")
     if not grids:
         raise UsageError(f"{folder} holds no experiment: give the folder that `sb3-cure experiment` wrote.")
     return [_read_experiment(path, path.parent.relative_to(folder).as_posix()) for path in grids]
@@ -190,6 +195,9 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
         done = [cell for cell in experiment.finished if cell.task == task]
         for cell in done[1:]:
             _check_settings(done[0], cell, ("eval_every", "eval_episodes", "coverage", "stop_at_return"))
+    for cell in experiment.finished:
+        if cell.config["budget"] > 0 and (experiment.kind != "visitation" or len(cell.evaluations)):
+            _check_curve(cell)
     return experiment
 
 
@@ -215,3 +223,14 @@ def _read_cell(root: Path, task: str, method: str, seed: int) -> CellResult:
     names = ("eval.csv", "visitation.csv", "coverage.csv")
     tables = (pd.read_csv(folder / name) if (folder / name).exists() else pd.DataFrame() for name in names)
     return CellResult(task, method, seed, folder, DONE, config, run, *tables)
+
+
+def _check_curve(cell: CellResult) -> None:
+    """Refuse a curve that does not go from 0 to the budget, or lacks returns: its area would be wrong."""
+    path, budget = cell.folder / "eval.csv", cell.config["budget"]
+    steps, _ = cell.curve("environment_steps")
+    is_whole = len(steps) > 0 and (steps[-1] >= budget or cell.config.get("stop_at_return") is not None)
+    if not is_whole or steps[0] > 0 or not (np.diff(steps) > 0).all():
+        raise UsageError(f"{path} does not go step by step from 0 to {budget} environment steps: {_FIX}.")
+    if cell.config["arguments"].get("task", True) and cell.evaluations["return_mean"].isna().any():
+        raise UsageError(f"{path} has a row without return_mean: {_FIX}.")

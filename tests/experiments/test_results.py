@@ -47,6 +47,29 @@ def test_damaged_files_are_named(results: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "content",
+    [
+        "environment_steps\n1\n",
+        "environment_steps,return_mean\n0,1\n200000,1\n100000,2\n",
+        "environment_steps,return_mean\n0,1\n90000,2\n",
+        "environment_steps,return_mean\n9,1\n100000,2\n",
+        "environment_steps,return_mean\n0,1\n50000,\n100000,2\n",
+    ],
+)
+def test_curves_that_are_not_whole_are_refused(results: Path, content: str) -> None:
+    """Their area would be wrong."""
+    (results / TASK / "sac_ae" / "seed0" / "eval.csv").write_text(content)
+    with pytest.raises(UsageError, match=r"eval\.csv"):
+        read_results(results)
+
+
+def test_missing_curve_of_finished_cell_is_refused(results: Path) -> None:
+    (results / TASK / "sac_ae" / "seed0" / "eval.csv").unlink()
+    with pytest.raises(UsageError, match=r"eval\.csv"):
+        read_results(results)
+
+
+@pytest.mark.parametrize(
     ("method", "seed", "settings"),
     [
         ("sac_ae", 1, {"arguments": {"gamma": 0.5}}),
@@ -69,6 +92,12 @@ def test_moved_cells_are_refused(results: Path) -> None:
         read_results(results)
 
 
-def test_folder_without_experiment_is_refused(tmp_path: Path) -> None:
+def test_finished_cells_need_their_grid(results: Path, tmp_path: Path) -> None:
+    """Else they would be missing in the report without a word."""
+    write_grid(results.parent / "another")
+    (results / "grid.json").unlink()
+    with pytest.raises(UsageError, match=r"curves holds finished cells, but no grid\.json"):
+        read_results(results.parent)
+    (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="holds no experiment"):
-        read_results(tmp_path)
+        read_results(tmp_path / "empty")
