@@ -265,8 +265,9 @@ def _check_values(arguments: Sequence[str]) -> None:
         parser.add_argument(*flags, nargs="+", action=StoreDict)
     parser.add_argument("-i", "--trained-agent", type=Path)
     given, _ = _parse(parser, arguments)
-    if given.trained_agent is not None and not given.trained_agent.is_file():
-        raise UsageError(missing_file(given.trained_agent))
+    agent = given.trained_agent
+    if agent is not None and not (agent.suffix == ".zip" and agent.is_file()):
+        raise UsageError(missing_file(agent) if agent.suffix == ".zip" else f"-i {agent} must be a model, a .zip file.")
 
 
 def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:

@@ -43,6 +43,7 @@ TYPOS = {
     f"{TRAIN} --algo cure_tcq": "'cure_tqc'",
     f"{TRAIN} --sede 1": "unrecognized arguments: --sede",
     f"{TRAIN} -i model.zip": "there is no model.zip",
+    f"{TRAIN} -i .": "-i . must be a model, a .zip file",
     f"{TRAIN} --trial-id 0": "--study-name",
     f"enjoy {CARTPOLE} --no-render": "No model found|was not found",
     "record --env dmc_pixels/cartpol-swingup-v0": "did you mean dmc_pixels/cartpole-swingup-v0",
