@@ -50,6 +50,15 @@ class Episode:
         return float(self.rewards.sum())
 
 
+def chunks(n: int) -> list[slice]:
+    """Split observations into parts of ``CHUNK``, of which one at a time is encoded.
+
+    :param n: Number of observations
+    :return: Where each part is, in order
+    """
+    return [slice(start, start + CHUNK) for start in range(0, n, CHUNK)]
+
+
 def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples) -> np.ndarray:
     """Errors of transitions without training noise or augmentation.
 
@@ -63,8 +72,8 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples) -> np
     policy.set_training_mode(False)
     errors = []
     with th.no_grad():
-        for start in range(0, len_of(batch.observations), CHUNK):
-            part: Any = (None if each is None else rows_of(each, slice(start, start + CHUNK)) for each in batch[:5])
+        for chunk in chunks(len_of(batch.observations)):
+            part: Any = (None if each is None else rows_of(each, chunk) for each in batch[:5])
             errors.append(policy.error(policy.samples(Samples(*part), random=False)).float().cpu().numpy())
     return np.concatenate(errors)
 
@@ -247,8 +256,8 @@ def highest_errors(model: BaseAlgorithm, k: int = 16, *, gap: int = 25) -> Highe
     rows, env_inds, ages = stored_places(buffer)
     if len(rows) == 0:
         raise ValueError("the replay buffer is empty.")
-    parts = [slice(start, start + CHUNK) for start in range(0, len(rows), CHUNK)]
-    batches = (transitions(buffer, rows[part], env_inds[part], model.get_vec_normalize_env()) for part in parts)
+    normalizer, places = model.get_vec_normalize_env(), chunks(len(rows))
+    batches = (transitions(buffer, rows[chunk], env_inds[chunk], normalizer) for chunk in places)
     errors = np.concatenate([srl_errors(model, batch) for batch in batches])
     chosen: list[int] = []
     for candidate in np.argsort(-errors, kind="stable"):
@@ -311,7 +320,7 @@ def state_probe(
         if len(episode.states) != len(episode.rewards):
             raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
         seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
-        parts = [rows_of(seen, slice(start, start + CHUNK)) for start in range(0, len(episode.states), CHUNK)]
+        parts = [rows_of(seen, chunk) for chunk in chunks(len(episode.states))]
         with th.no_grad():
             latents.append(np.concatenate([encode(part).double().cpu().numpy() for part in parts]))
         states.append(episode.states)

@@ -17,7 +17,7 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.evaluation.rollouts import CHUNK, Episode, balanced_negatives, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import Episode, balanced_negatives, chunks, run_episodes, trained_actors
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE
@@ -87,8 +87,8 @@ def roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool 
 def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
     """Targets of an autoencoder, float32 [n, ...], in batches."""
     head = getattr(model.policy, "srl", None)
-    for start in range(0, len(observations), CHUNK):
-        images = th.as_tensor(observations[start : start + CHUNK], device=model.device)
+    for chunk in chunks(len(observations)):
+        images = th.as_tensor(observations[chunk], device=model.device)
         if isinstance(head, RAE):
             yield head.target(images, dither=False).cpu().numpy()
         elif not is_image_space(model.observation_space):
