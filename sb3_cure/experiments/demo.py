@@ -10,6 +10,7 @@ Writes ``agent.gif``, ``learning_curve.csv/png``, ``sees_and_holds.png``, ``curi
 import argparse
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,27 @@ from sb3_cure.evaluation.callbacks import ReconstructionCallback
 from sb3_cure.evaluation.result_files import describe_run, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, run_episodes
 from sb3_cure.evaluation.video import frame_rate, write_gif, write_video
+
+
+@dataclass(frozen=True)
+class LateFall:
+    """Learning rate that is held for two thirds of training, then falls: without that, the return jumps in the end.
+
+    :param rate: At first
+    :param last: In the end
+    """
+
+    rate: float
+    last: float
+
+    def __call__(self, remaining: float) -> float:
+        """Compute the rate.
+
+        :param remaining: Progress that remains, from 1 to 0
+        :return: Learning rate
+        """
+        return min(self.rate, 3 * self.rate * remaining + self.last)
+
 
 DOMAIN, TASK = "cartpole", "swingup"
 # The camera that follows the cart: the usual one is far away, and the cart drives out of its view.
@@ -48,14 +70,14 @@ SETTINGS: dict[str, Any] = dict(
     intrinsic_kwargs=dict(n_filters=8, n_layers=2),  # a fifth of an update less than with four layers
     curious_interval=4,  # the task's agent gets most of the time
     curiosity_encoder_grad=False,  # in so few updates the curious critic's gradient slows the task down
-    # Curious by episodes, ever fewer: among single curious steps the task's agent hardly sees a pole that stays up.
-    curiosity_prob=LinearSchedule(0.2, 0, 1),
+    # Curious by episodes: among single curious steps the task's agent hardly sees a pole that stays up. Ever fewer, in
+    # the first half alone: then all that is collected is the task's.
+    curiosity_prob=LinearSchedule(0.2, 0, 0.5),
     curiosity_bout="episode",
-    # A step costs a tenth of an update: two steps for each. Without smaller learning rates in the end the return jumps.
-    learning_starts=1500,
+    # A step costs a tenth of an update: two steps for each.
     train_freq=2,
     gradient_steps=1,
-    learning_rate=LinearSchedule(1.5e-3, 2e-5, 1),
+    learning_rate=LateFall(1e-3, 2e-5),
     n_steps=3,
 )
 TOTAL_STEPS = 22_000
@@ -101,6 +123,15 @@ class Progress(BaseCallback):
         print(f"  step {steps:,} of {self.steps:,}, return {np.mean(returns):.0f} of 1000, {left}", flush=True)
 
 
+def save(model: CuReSAC, out: Path) -> None:
+    """Save the model, without its learning rate, as no archive holds a class of the demo.
+
+    :param model: The model
+    :param out: Folder to write ``model.zip`` into
+    """
+    model.save(out / "model.zip", exclude=["learning_rate"])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo.
 
@@ -129,14 +160,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         model.learn(options.steps, callback=[progress, rows])
     except KeyboardInterrupt:
-        model.save(out / "model.zip")
+        save(model, out)
         print(f"Stopped: {out / 'model.zip'} keeps the model of step {model.num_timesteps:,}; the demo begins anew.")
         return 130
     seconds = time.monotonic() - start
     if not progress.rows or progress.rows[-1]["agent_steps"] < model.num_timesteps:
         progress.evaluate()
         rows.draw(model)
-    model.save(out / "model.zip")
+    save(model, out)
     (out / "reconstructions.png").replace(out / "sees_and_holds.png")
 
     print("\nMeasuring the random, task and curious policies")
