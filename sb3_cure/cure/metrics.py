@@ -5,7 +5,6 @@ from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure.cure.reconstructions import reconstruction_strips
-from sb3_cure.data.buffers import infer_frame_stack
 from sb3_cure.data.samples import Samples
 
 #: Detached scalars of one update, by name
@@ -41,7 +40,9 @@ def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: in
     """
     keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
     if keeps and (model._n_updates - 1) % RECONSTRUCTION_INTERVAL < n_updates:
-        strips = reconstruction_strips(model.policy, batch, infer_frame_stack(model.get_env()))  # type: ignore[arg-type]
+        # Not asked of the environments: overlapped updates are made while these make a step.
+        frame_stack = model.replay_buffer_kwargs.get("frame_stack", 1)
+        strips = reconstruction_strips(model.policy, batch, frame_stack)  # type: ignore[arg-type]
         for key, strip in strips.items():
             name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
             model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))

@@ -12,6 +12,7 @@ from envs_for_tests import PixelBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_cure import CuReSAC
@@ -140,6 +141,17 @@ def test_callbacks_at_the_end_see_all_updates(counting: SubprocVecEnv) -> None:
     callback = AtTheEnd()
     tiny_model("MlpPolicy", counting, overlap=True, warmup_updates=5).learn(12, callback=callback)
     assert callback.n_updates == 5 + 2
+
+
+def test_pictures_of_an_update_do_not_read_from_stepping_workers(tmp_path: Path) -> None:
+    """Their answer would be that to the step."""
+    venv = SubprocVecEnv([PixelBox])
+    try:
+        tiny_model("CnnPolicy", venv, overlap=True, tensorboard_log=str(tmp_path)).learn(20, log_interval=1)
+        (folder,) = tmp_path.iterdir()
+        assert EventAccumulator(str(folder)).Reload().Tags()["images"] == ["srl/reconstructions"]
+    finally:
+        venv.close()
 
 
 def test_overlap_needs_worker_processes(counting: SubprocVecEnv, tmp_path: Path) -> None:
