@@ -125,7 +125,8 @@ class Generations:
             self._newest = draft.number
             flush_to_disk(self.path)
         finally:
-            self._remove_all_but(keep)
+            # Where this one failed, no other goes for it: the newest of them may be damaged.
+            self._remove_all_but(keep if self._newest == draft.number else len(self.numbers()))
 
     def _remove_all_but(self, keep: int) -> None:
         """Remove older generations and what no generation needs; what could not be removed is removed the next time."""
