@@ -95,12 +95,22 @@ class Persistence(SavesModels, SavesReplayBuffers):
     ) -> tuple[int, BaseCallback]:
         run = self._run
         run.before_rollout = []
+        if run.resumed is not None and run.resumed.is_over:
+            load_random_state(self, run.resumed.state["random"])
+            run.resumed = None
         resumed = run.resumed
         if resumed is not None and resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
             resumed = run.resumed = None
         continues = resumed is not None and reset_num_timesteps
         if resumed is not None and continues:
-            total_timesteps, reset_num_timesteps = resumed.left_of(total_timesteps), False
+            given, total_timesteps, reset_num_timesteps = total_timesteps, resumed.left_of(total_timesteps), False
+            resumed.is_over = total_timesteps <= 0
+            if resumed.is_over:
+                warnings.warn(
+                    f"learn({given}) trains nothing, as the resumed training has made {self.num_timesteps} agent "
+                    "steps: the next learn is a call of its own.",
+                    stacklevel=5,
+                )
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

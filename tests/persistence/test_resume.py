@@ -282,10 +282,30 @@ def test_finished_training_is_continued(tmp_path: Path) -> None:
     for resumes in (False, True):
         model = train(CASES["vectors"], tmp_path / str(resumes))
         if resumes:
-            model = CuReSAC.resume(tmp_path / "True", vectors(), device="cpu").learn(60)
+            with pytest.warns(UserWarning, match="trains nothing"):
+                model = CuReSAC.resume(tmp_path / "True", vectors(), device="cpu").learn(60)
         assert model.num_timesteps == 60
         results.append(outcome(model.learn(20, reset_num_timesteps=False)))
     assert differences(*results) == []
+
+
+def test_call_after_a_finished_one_is_a_call_of_its_own(tmp_path: Path) -> None:
+    """A script of two calls that was killed between them; also if it is killed again in the second."""
+    results = []
+    for kill in (None, 0, 15):
+        folder = tmp_path / str(kill)
+        model = train(CASES["vectors"], folder)
+        if kill is not None:
+            model = CuReSAC.resume(folder, vectors(), device="cpu")
+            with pytest.warns(UserWarning, match="trains nothing, as the resumed training has made 60 agent steps"):
+                model.learn(60)
+        if kill:
+            with pytest.raises(Killed):
+                model.learn(20, callback=[ExactCheckpoint(10, folder), KillAt(kill)])
+            model = CuReSAC.resume(folder, vectors(), device="cpu")
+        results.append(outcome(model.learn(20)))
+    assert results[0]["counters"][0] == 20
+    assert differences(results[0], results[1]) == [] == differences(results[0], results[2])
 
 
 def test_learn_ends_interrupted_pretraining(tmp_path: Path) -> None:
@@ -528,6 +548,21 @@ def test_hostile_checkpoint_runs_no_code(name: str, tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_failed_attempt_removes_no_older_checkpoint(tmp_path: Path) -> None:
+    """The newest one may be damaged."""
+    kept = Generations(tmp_path)
+    for content in "ab":
+        with kept.writing(keep=2) as draft:
+            (draft.folder / "file").write_text(content)
+    (tmp_path / "generation-000001" / "file").write_text("damaged")
+    with pytest.raises(OSError, match="full"), Generations(tmp_path).writing(keep=1) as draft:
+        (kept.segments / "frames").touch()
+        raise OSError("full")
+    with pytest.warns(UserWarning, match="damaged"):
+        assert kept.newest_whole().name == "generation-000000"
+    assert not draft.folder.exists() and not list(kept.segments.iterdir())
 
 
 def test_other_trainings_checkpoints_are_kept(tmp_path: Path) -> None:
