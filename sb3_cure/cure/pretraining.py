@@ -22,9 +22,6 @@ from sb3_cure.persistence.archive import archived_networks
 
 Self = TypeVar("Self", bound="Pretraining")
 
-#: How far training is
-_COUNTERS = ("num_timesteps", "_n_updates", "_n_batches", "_n_rl_batches", "_warmed_up", "_last_obs", "_is_pretrained")
-
 
 class Pretraining(CuRe):
     """Adds to CuRe: ``pretrain``, ``load_transitions`` and ``fit_representation``, and ``transfer_from``."""
@@ -83,7 +80,7 @@ class Pretraining(CuRe):
             raise ValueError("fit_representation has no transitions to learn from: call load_transitions before it.")
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "fit_representation")
-        counters = {name: getattr(self, name) for name in _COUNTERS}
+        counted = self._n_updates, self._n_batches
         self._begin_pretraining("random")
         try:
             for done in range(0, updates, log_interval):
@@ -91,9 +88,9 @@ class Pretraining(CuRe):
                 self.train(min(log_interval, updates - done), self.batch_size)
                 self.logger.dump(self._n_updates)
         finally:
-            self._end_pretraining(keep_transitions=True)
-            if counters["num_timesteps"] > 0:  # training goes on where it was
-                vars(self).update(counters)
+            self._restore_settings()
+            self._n_updates, self._n_batches = counted  # training goes on where it was
+            self._is_pretrained = self._is_pretrained or self.num_timesteps == 0
         return self
 
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
@@ -219,18 +216,23 @@ class Pretraining(CuRe):
             self._set_temperature("curious")
         self.policy.default_agent = "curious"
 
-    def _end_pretraining(self, keep_transitions: bool = False) -> None:
-        if self._before_pretraining is None:
-            return
+    def _restore_settings(self) -> None:
+        """Restore what ``_begin_pretraining`` has changed."""
         policy, before = self.policy, self._before_pretraining
+        assert before is not None
         self.task, self.curiosity, self._before_pretraining = before["task"], before["curiosity"], None
         if policy.curious is not None and not self._has_curious_agent:
             policy.remove_curious_agent(keep_reward=self.curiosity == "bonus")
         policy.default_agent = "task" if self.task or policy.curious is None else "curious"
-        if not keep_transitions:
-            _empty(self.replay_buffer)  # type: ignore[arg-type]
-            if policy.intrinsic is not None:
-                policy.intrinsic.forget()
+
+    def _end_pretraining(self) -> None:
+        """End a pretraining, if there is one: forget what was collected, and count anew."""
+        if self._before_pretraining is None:
+            return
+        self._restore_settings()
+        _empty(self.replay_buffer)  # type: ignore[arg-type]
+        if self.policy.intrinsic is not None:
+            self.policy.intrinsic.forget()
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
         self._warmed_up = False
         self._last_obs = None
