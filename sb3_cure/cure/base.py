@@ -388,14 +388,10 @@ class CuReBase(OffPolicyAlgorithm):
         return {"mixer": self._mixer}
 
     def _before_save(self) -> None:
-        """Refuse to save parameters that are not finite."""
-        self._guard.report()
-
-    def _before_checkpoint(self) -> None:
-        """Finish deferred updates, and refuse what ``save`` refuses."""
+        """Finish deferred updates, and refuse to save parameters that are not finite."""
         if self._overlapped is not None:
             self._overlapped.finish()
-        self._before_save()
+        self._guard.report()
 
     def _excluded_save_params(self) -> list[str]:
         made_anew = ["_guard", "_metrics", "_mixer", "_overlapped", "_computed_precision", "ent_coef_tensor"]

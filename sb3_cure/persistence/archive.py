@@ -8,7 +8,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Iterator
-from typing import Any, BinaryIO, Protocol, TypeVar, cast
+from typing import Any, BinaryIO, TypeVar, cast
 
 import stable_baselines3
 import torch as th
@@ -43,22 +43,6 @@ _TEMPERATURES = {
     setting: [prefix + name for name in ("log_ent_coef", "ent_coef_tensor", "ent_coef_optimizer")]
     for setting, prefix in (("ent_coef", ""), ("curiosity_ent_coef", "policy.curious."))
 }
-
-
-class Stateful(Protocol):
-    """A part of a model with a state besides tensors and settings."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Get the state.
-
-        :return: Values that ``encode`` knows
-        """
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Set the state.
-
-        :param state: Result of ``state_dict``
-        """
 
 
 class ModelArchive:
@@ -140,10 +124,13 @@ def archived_networks(path: PathOrFile) -> tuple[dict[str, th.Tensor], th.Tensor
 class SavesModels(OffPolicyAlgorithm):
     """Mixin for an algorithm of SB3: ``save``, ``load`` and ``set_parameters`` without pickle."""
 
-    def _stateful_parts(self) -> dict[str, Stateful]:
-        """Objects with a state besides tensors and settings, such as a generator, by name: saved and resumed."""
-        parts: dict[str, Stateful] = getattr(super(), "_stateful_parts", dict)()
-        return parts
+    def _stateful_parts(self) -> dict[str, Any]:
+        """Objects with ``state_dict`` and ``load_state_dict``, such as a generator, by name: saved and resumed."""
+        return getattr(super(), "_stateful_parts", dict)()  # type: ignore[no-any-return]
+
+    def _before_save(self) -> None:
+        """Finish what is under way, and refuse to save what is broken."""
+        getattr(super(), "_before_save", lambda: None)()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule"]  # which set-up makes of learning_rate
@@ -161,7 +148,7 @@ class SavesModels(OffPolicyAlgorithm):
         :param include: Names of settings that are saved although they are in ``exclude``
         :raises ValueError: if ``include`` names parts of the running model
         """
-        getattr(self, "_before_save", lambda: None)()  # raises if parameters are not finite
+        self._before_save()
         included, (state_dicts, variables) = {*(include or ())}, self._get_torch_save_params()
         left_out = {*self._excluded_save_params(), *(name.split(".")[0] for name in [*state_dicts, *variables])}
         if impossible := sorted(left_out & included):

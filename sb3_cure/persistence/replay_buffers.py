@@ -93,4 +93,3 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
                     f"{name} is no replay buffer that was saved without pickle, and unpickling runs any code that is "
                     "in a file: if you know where it comes from, load it with trusted=True."
                 )
-        self.replay_buffer.device = self.device  # type: ignore[union-attr]
