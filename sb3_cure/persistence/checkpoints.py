@@ -136,7 +136,6 @@ class ExactCheckpoint(BaseCallback):
             raise ValueError(f"save_freq and keep must be at least 1 (save_freq={save_freq}, keep={keep})")
         self.save_freq, self.path, self.keep = save_freq, Path(path), keep
         self._last_saved = self._last_tried = 0
-        self._said: set[str] = set()
 
     @staticmethod
     def exists(path: str | Path) -> bool:
@@ -212,10 +211,7 @@ class ExactCheckpoint(BaseCallback):
             self._save()
 
     def _save(self) -> None:
-        model: Any = self.model
-        self.num_timesteps = self._last_tried = model.num_timesteps
-        # Finishes updates under way, and raises if parameters are not finite
-        getattr(model, "_before_checkpoint", lambda: None)()
+        self.num_timesteps = self._last_tried = self.model.num_timesteps
         try:
             self._write()
         except OSError as error:
@@ -230,18 +226,14 @@ class ExactCheckpoint(BaseCallback):
             print(f"Checkpoint in {self.path} after {self.num_timesteps} agent steps")
 
     def _write(self) -> None:
-        """Write a checkpoint, and say once what it cannot hold."""
-        run = self._run
-        state = self._writer.write(self.model, run, self.keep)  # type: ignore[arg-type]
+        """Write a checkpoint, and warn of what it cannot hold; Python shows a warning of equal text once."""
+        state = self._writer.write(self.model, self._run, self.keep)  # type: ignore[arg-type]
         reason = saved_error(state["environments"])
-        if reason is not None and not run.new_episode_said:
-            run.new_episode_said = True
+        if reason is not None:
             warnings.warn(
                 f"checkpoints cannot keep the state of the environments, as {reason}: a resumed training begins a new "
                 "episode (state_dict() and load_state_dict(state) avoid this).",
-                stacklevel=2,
+                stacklevel=1,
             )
-        missing = {name for own in state["callbacks"] for name in own["missing"]} - self._said
-        if missing:
-            self._said |= missing
-            warnings.warn(f"checkpoints do not keep {', '.join(sorted(missing))}.", stacklevel=2)
+        for name in sorted({name for own in state["callbacks"] for name in own["missing"]}):
+            warnings.warn(f"checkpoints do not keep {name}.", stacklevel=1)

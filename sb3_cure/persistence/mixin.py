@@ -79,7 +79,6 @@ class Persistence(SavesModels, SavesReplayBuffers):
         run.writers[Path(path).resolve()] = writer
         run.resumed = Resumption(model, state)
         if run.resumed.restore_error is not None:
-            run.new_episode_said = True
             warnings.warn(f"the training begins a new episode, as {run.resumed.restore_error}.", stacklevel=2)
         if model.verbose >= 1:
             print(f"Resumed from {folder}, after {model.num_timesteps} agent steps")

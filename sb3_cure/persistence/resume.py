@@ -30,8 +30,6 @@ class Run:
         self.callbacks: list[BaseCallback] = []
         #: Called before each rollout, between an update and the next step
         self.before_rollout: list[Callable[[], None]] = []
-        #: Whether the user knows that a new episode begins after resuming
-        self.new_episode_said = False
 
 
 def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
