@@ -153,6 +153,14 @@ class ExactCheckpoint(BaseCallback):
         """
         return self.num_timesteps // self.save_freq > self._last_tried // self.save_freq
 
+    def save_if_due(self) -> None:
+        """Write a checkpoint if one is due; called before each rollout, between an update and the next step.
+
+        ``_on_rollout_start`` would be too late: other callbacks may have been called, and would be again when resumed.
+        """
+        if self.is_due():
+            self._save()
+
     def state_dict(self) -> dict[str, Any]:
         """Get the state of this callback, which is none.
 
@@ -187,8 +195,6 @@ class ExactCheckpoint(BaseCallback):
             )
         path.mkdir(parents=True, exist_ok=True)
         self._writer = self._run.writers.setdefault(path, CheckpointWriter(path))
-        # Not in `_on_rollout_start`: other callbacks may have been called by then, and would be again when resumed.
-        self._run.before_rollout.append(self._before_rollout)
 
     def _on_training_start(self) -> None:
         if getattr(self.model, "overlap", False):
@@ -196,10 +202,6 @@ class ExactCheckpoint(BaseCallback):
         self._last_saved = self._last_tried = self.num_timesteps
         if self._run.resumed is None:
             self._write()
-
-    def _before_rollout(self) -> None:
-        if self.is_due():
-            self._save()
 
     def _on_step(self) -> bool:
         return True

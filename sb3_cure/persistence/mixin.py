@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_cure.persistence.archive import SavesModels
 from sb3_cure.persistence.callback_state import list_callbacks
-from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter
+from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, ExactCheckpoint
 from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
 from sb3_cure.persistence.resume import Resumption, Run, load_random_state
 
@@ -93,7 +93,6 @@ class Persistence(SavesModels, SavesReplayBuffers):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         run = self._run
-        run.before_rollout = []
         if run.resumed is not None and run.resumed.is_over:
             load_random_state(self, run.resumed.state["random"])
             run.resumed = None
@@ -128,8 +127,9 @@ class Persistence(SavesModels, SavesReplayBuffers):
         resumed, self._run.resumed = self._run.resumed, None
         if resumed is not None:  # last of all, so that nothing can disturb them
             load_random_state(self, resumed.state["random"])
-        for act in self._run.before_rollout:
-            act()
+        for callback in self._run.callbacks:
+            if isinstance(callback, ExactCheckpoint):
+                callback.save_if_due()
         return super().collect_rollouts(*args, **kwargs)
 
 

@@ -1,7 +1,6 @@
 """What a training depends on besides the model and its replay buffer, and how a resumed model gets it back."""
 
 import copy
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,6 @@ class Run:
         self.resumed: Resumption | None = None
         #: All callbacks of the running ``learn``
         self.callbacks: list[BaseCallback] = []
-        #: Called before each rollout, between an update and the next step
-        self.before_rollout: list[Callable[[], None]] = []
 
 
 def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
