@@ -280,15 +280,16 @@ class FrameStackReplayBuffer(ReplayBuffer):
         )
 
     def state_dict(self, frames: bool = True) -> dict[str, Any]:
-        """State as counters and views of the used part of all arrays.
+        """State as plain values and views of the used part of all arrays.
 
         :param frames: Whether the frames are among the arrays, as ``frames/<key>``
-        :return: ``counters`` and ``arrays`` by name
+        :return: ``size`` and ``n_envs``, ``counters`` and ``arrays`` by name
         """
         arrays = {name: array[: super(FrameStackReplayBuffer, self).size()] for name, array in self.rows.items()}
         if frames:
             arrays |= {f"frames/{key}": ring.frames[: self.counts[key]] for key, ring in self.rings.items()}
-        return {"counters": {name: getattr(self, name) for name in _COUNTERS}, "arrays": arrays}
+        counters = {name: getattr(self, name) for name in _COUNTERS}
+        return {"size": self.buffer_size, "n_envs": self.n_envs, "counters": counters, "arrays": arrays}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over the state of another buffer; frames that are not among its arrays are left to be written.

@@ -14,6 +14,9 @@ from numpy import ndarray
 #: holds, images of 84x84 stay below 1.05 frames per transition.
 SPARE_FRAMES = 0.04
 
+#: Size of the pieces in which frames are written to files and read, unless a frame is larger
+PIECE_BYTES = 2**22
+
 
 class FrameRing:
     """Memory for the frames of one image, each kept once; the newest frame replaces the oldest one.
@@ -122,16 +125,15 @@ class FrameRing:
         frames = th.from_numpy(self.frames).index_select(0, th.from_numpy(slots.ravel()))
         return frames.view(*slots.shape[:-1], *self.shape).numpy()
 
-    def pieces(self, first: int, last: int, max_bytes: int = 2**22) -> Iterator[memoryview]:
+    def pieces(self, first: int, last: int) -> Iterator[memoryview]:
         """Memory of the frames with the numbers ``first`` to ``last - 1``, to be read or written.
 
         :param first: Number of the first frame
         :param last: Number after the last frame
-        :param max_bytes: Size of a piece (at least one frame)
         :return: Contiguous bytes
         """
         self.reserve()
-        at_once = max(max_bytes // math.prod(self.frame_shape), 1)
+        at_once = max(PIECE_BYTES // math.prod(self.frame_shape), 1)
         while first < last:
             start = first % self.capacity
             piece = self.frames[start : min(start + min(last - first, at_once), self.capacity)]

@@ -15,7 +15,7 @@ from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
 from sb3_cure.persistence.files import flush_to_disk
 from sb3_cure.persistence.generations import CheckpointError, Generations
-from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
+from sb3_cure.persistence.replay_buffers import buffer_from_state
 from sb3_cure.persistence.resume import Run, training_state
 
 MODEL, STATE = "model.zip", "state.safetensors"
@@ -59,7 +59,7 @@ class CheckpointWriter:
             for place, (key, ring) in enumerate(buffer.rings.items()):
                 segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{draft.number:06d}")
                 draft.sums.update({f"../segments/{each.name}": each.digest for each in segments[key]})
-            state["buffer"] = buffer_state(buffer, frames=False)
+            state["buffer"] = buffer.state_dict(frames=False)
             state["segments"] = {key: [list(each) for each in own] for key, own in segments.items()}
             write_state(draft.folder / STATE, state)
         self.rings, self.segments = buffer.rings, segments

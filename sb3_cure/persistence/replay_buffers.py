@@ -14,21 +14,11 @@ from sb3_cure.persistence.encoding import ArchiveError, is_state, read_state, re
 from sb3_cure.persistence.files import PathOrFile, reading, writing
 
 
-def buffer_state(buffer: FrameStackReplayBuffer, frames: bool = True) -> dict[str, Any]:
-    """Get the state of a replay buffer as plain values and views of the used part of its arrays.
-
-    :param buffer: A replay buffer
-    :param frames: Whether its frames are among the arrays
-    :return: Size, number of environments, counters and arrays
-    """
-    return {"size": buffer.buffer_size, "n_envs": buffer.n_envs, **buffer.state_dict(frames)}
-
-
 def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: str) -> FrameStackReplayBuffer:
     """Make a replay buffer of a model with the state of another one.
 
     :param model: The model that the replay buffer is for
-    :param state: From ``buffer_state``, with frames or without
+    :param state: Of ``FrameStackReplayBuffer.state_dict``, with frames or without
     :param name: Name of its file in messages
     :return: A replay buffer of the size that was saved; without frames, they have to follow
     :raises ArchiveError: If it does not fit the model or is damaged
@@ -71,7 +61,7 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
             super().save_replay_buffer(path)
             return
         with writing(path, "pkl") as file:
-            write_state(file, buffer_state(buffer))
+            write_state(file, buffer.state_dict())
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
         """Load a replay buffer, also one from a stranger.

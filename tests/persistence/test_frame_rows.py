@@ -12,7 +12,7 @@ from twins_for_tests import ACTIONS, EVENTS, Twins, random_events, streams
 
 from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.persistence import ArchiveError, read_state, write_state
-from sb3_cure.persistence.replay_buffers import buffer_from_state, buffer_state
+from sb3_cure.persistence.replay_buffers import buffer_from_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:Frames do not slide")
 
@@ -32,7 +32,7 @@ def model_of(twins: Twins) -> Any:
 
 def through_a_file(twins: Twins, change: Any = lambda state: None, model: Any = None) -> FrameStackReplayBuffer:
     file = io.BytesIO()
-    write_state(file, buffer_state(twins.ours))
+    write_state(file, twins.ours.state_dict())
     state = read_state(file)
     change(state)
     return buffer_from_state(model or model_of(twins), state, "the file")  # type: ignore[return-value]
