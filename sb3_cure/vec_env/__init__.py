@@ -3,8 +3,8 @@
 from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
 from sb3_cure.vec_env.checks import check_environments
 from sb3_cure.vec_env.finite_check import BadTransitionError, FiniteCheck
-from sb3_cure.vec_env.frame_watch import FrameWatch
-from sb3_cure.vec_env.workers import EnvFaultError, FaultTolerantSubprocVecEnv, restarts_workers
+from sb3_cure.vec_env.frame_watch import EnvFaultError, FrameWatch
+from sb3_cure.vec_env.workers import FaultTolerantSubprocVecEnv, restarts_workers
 
 __all__ = [
     "BadTransitionError",

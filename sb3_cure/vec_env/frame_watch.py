@@ -10,13 +10,20 @@ from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.envs.copy_observations import CopyObservations
 from sb3_cure.envs.wrappers import positive_attribute
 
+#: Least change of a coordinate in one agent step that counts as motion, metres or radians
+FROZEN_MOTION = 0.01
 
-class FrameFaultError(RuntimeError):
-    """A frame that cannot be right."""
 
+class EnvFaultError(RuntimeError):
+    """An environment failed. The worker's own traceback, if there is one, is a note.
 
-class FrozenFramesError(FrameFaultError):
-    """Frames that stay the same while the physics moves: earlier transitions are wrong, too, and may be stored."""
+    :param what: What happened
+    :param restartable: Whether another worker may take its place
+    """
+
+    def __init__(self, what: str, restartable: bool = True) -> None:
+        super().__init__(what)
+        self.restartable = restartable
 
 
 class FrameWatch(CopyObservations):
@@ -29,7 +36,6 @@ class FrameWatch(CopyObservations):
     :param frozen_steps: Environment steps (agent steps times ``action_repeat``) with equal pixels and moving physics
         that raise an error; None: never. In the DeepMind Control suite a cartpole that leaves the view of its camera
         shows equal pixels for up to 100 environment steps
-    :param frozen_motion: Least change of a coordinate in one agent step that counts as motion, metres or radians
     :param state: Visible part of an environment's state, [d]; by default the joint positions of dm_control. Frames of
         other environments are never taken to be frozen
     """
@@ -39,7 +45,6 @@ class FrameWatch(CopyObservations):
         env: gym.Env,
         allow_black_frames: bool = False,
         frozen_steps: int | None = 200,
-        frozen_motion: float = 0.01,
         state: Callable[[gym.Env], np.ndarray] | None = None,
     ) -> None:
         super().__init__(env)
@@ -51,7 +56,6 @@ class FrameWatch(CopyObservations):
         self._state = None if frozen_steps is None or not image_spaces(env.observation_space) else state
         # In agent steps
         self._patience = (frozen_steps or 0) / positive_attribute(env, "action_repeat")
-        self._motion = frozen_motion
         # Latest frame of each image, and during how many moving steps it has stayed the same
         self._frames: dict[str, np.ndarray] = {}
         self._n_frozen: dict[str, int] = {}
@@ -62,13 +66,13 @@ class FrameWatch(CopyObservations):
 
         :param observation: An array, or a dictionary of arrays
         :return: Copy
-        :raises FrameFaultError: If an image is black or frozen
+        :raises EnvFaultError: If an image is black or frozen
         """
         observation = super().observation(observation)
         images = images_of(observation, self.observation_space)
         frames = {key: self._newest(image) for key, image in images.items()}
         if not self._allow_black_frames and not all(frame.any() for frame in frames.values()):
-            raise FrameFaultError(
+            raise EnvFaultError(
                 "returned a black frame, so that rendering has failed (pass allow_black_frames=True if it may be dark)"
             )
         if self._state is not None:
@@ -76,7 +80,7 @@ class FrameWatch(CopyObservations):
         return observation
 
     def _check_frozen(self, frames: dict[str, np.ndarray], position: np.ndarray) -> None:
-        moves = self._position is not None and bool(np.abs(position - self._position).max(initial=0.0) > self._motion)
+        moves = self._position is not None and bool(np.abs(position - self._position).max(initial=0.0) > FROZEN_MOTION)
         self._position = position
         for key, frame in frames.items():
             if np.array_equal(frame, self._frames.get(key, np.zeros(0))):
@@ -84,9 +88,10 @@ class FrameWatch(CopyObservations):
             else:
                 self._frames[key], self._n_frozen[key] = frame.copy(), 0
             if self._n_frozen[key] >= self._patience:
-                raise FrozenFramesError(
+                raise EnvFaultError(
                     f"returned the same pixels in {self._n_frozen[key]} steps while its physics moved, so that "
-                    "rendering is stuck (raise frozen_steps if its camera sees so little)"
+                    "rendering is stuck (raise frozen_steps if its camera sees so little)",
+                    restartable=False,  # earlier transitions are wrong, too, and may be stored
                 )
 
     def _newest(self, image: np.ndarray) -> np.ndarray:

@@ -23,19 +23,12 @@ from stable_baselines3.common.vec_env.patch_gym import _patch_env
 from stable_baselines3.common.vec_env.subproc_vec_env import _worker as sb3_worker
 
 from sb3_cure.persistence.env_state import ResumableEnv
-from sb3_cure.vec_env.frame_watch import FrameFaultError, FrameWatch, FrozenFramesError
+from sb3_cure.vec_env.frame_watch import EnvFaultError, FrameWatch
 
 #: Seconds in which workers may leave when the environments are closed, and after SIGKILL or the end of their parent
 CLOSE_SECONDS, KILL_SECONDS = 10.0, 2.0
 # Attributes of a worker that a resumed training needs
 _STATE = ("attributes", "seed", "options", "restarts", "faults_in_a_row", "last_obs")
-
-
-class EnvFaultError(RuntimeError):
-    """An environment failed. The worker's own traceback, if there is one, is a note."""
-
-    #: Whether another worker may take its place
-    restartable = True
 
 
 def _leave_with_parent() -> None:
@@ -66,10 +59,9 @@ def _work(remote: Connection, parent_remote: Connection, make_env: CloudpickleWr
     try:
         sb3_worker(remote, parent_remote, make_env)
     except BaseException as error:
-        is_frame_fault = isinstance(error, FrameFaultError)
-        fault = EnvFaultError(str(error) if is_frame_fault else f"raised {error!r}")
-        fault.restartable = not isinstance(error, FrozenFramesError)
-        if not is_frame_fault:
+        fault = error
+        if not isinstance(error, EnvFaultError):
+            fault = EnvFaultError(f"raised {error!r}")
             fault.add_note(f"Traceback of the worker:\n{traceback.format_exc()}")
         with contextlib.suppress(OSError):
             remote.send(fault)
@@ -274,8 +266,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     :param start_method: As in ``SubprocVecEnv``
     :param start_timeout: Seconds that making an environment, or a reset, may take
     :param max_faults: Faults of one environment without a good step in between, after which ``"restart"`` raises, too
-    :param watch: Further arguments of ``FrameWatch``: ``allow_black_frames``, ``frozen_steps``, ``frozen_motion``,
-        ``state``
+    :param watch: Further arguments of ``FrameWatch``: ``allow_black_frames``, ``frozen_steps``, ``state``
     :raises ValueError: If ``on_env_fault`` is unknown
     :raises EnvFaultError: If an environment cannot be made
     """
