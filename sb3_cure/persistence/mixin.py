@@ -96,25 +96,25 @@ class Persistence(SavesModels, SavesReplayBuffers):
         if run.resumed is not None and run.resumed.is_over:
             load_random_state(self, run.resumed.state["random"])
             run.resumed = None
+        if run.resumed is not None and run.resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
+            run.resumed = None
         resumed = run.resumed
-        if resumed is not None and resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
-            resumed = run.resumed = None
         continues = resumed is not None and reset_num_timesteps
         if resumed is not None and continues:
-            given, total_timesteps, reset_num_timesteps = total_timesteps, resumed.left_of(total_timesteps), False
-            resumed.is_over = total_timesteps <= 0
-            if resumed.is_over:
-                warnings.warn(
-                    f"learn({given}) trains nothing, as the resumed training has made {self.num_timesteps} agent "
-                    "steps: the next learn is a call of its own.",
-                    stacklevel=5,
-                )
+            total_timesteps, reset_num_timesteps = resumed.left_of(total_timesteps), False
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         run.callbacks = list_callbacks(callback)
         if resumed is not None:
             resumed.set_up(self, run.callbacks, continues)
+            resumed.is_over = self.num_timesteps >= total
+            if resumed.is_over:
+                warnings.warn(
+                    f"this call trains nothing, as the resumed training has made {self.num_timesteps} agent steps: the "
+                    "next learn is a call of its own.",
+                    stacklevel=5,
+                )
         return total, callback
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:

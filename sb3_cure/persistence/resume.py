@@ -91,7 +91,7 @@ class Resumption:
         # What SB3's set-up of `learn` changes
         self._num_timesteps_at_start = model._num_timesteps_at_start
         self._action_noise = copy.deepcopy(model.action_noise)
-        #: Whether nothing was left of the interrupted call of ``learn``, and it was repeated
+        #: Whether a ``learn`` came that had nothing left to do
         self.is_over = False
         #: Why a new episode begins, or None
         self.restore_error = load_vec_env_state(model.env, state["environments"])
