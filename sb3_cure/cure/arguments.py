@@ -108,8 +108,9 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
             f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.",
         ),
         (
-            not model.task and model.curiosity not in ("separate", "random"),
-            f"task=False leaves nothing to learn with curiosity={model.curiosity!r}: use 'separate'.",
+            not model.task and not separate and (model.curiosity != "random" or model.srl is None),
+            f"task=False leaves nothing to learn with curiosity={model.curiosity!r} and srl={model.srl!r}: use "
+            "curiosity='separate'.",
         ),
         (
             separate and model.curiosity_gamma == 0 and _judges_observation(model),

@@ -225,7 +225,10 @@ class CuReBase(OffPolicyAlgorithm):
             self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):  # else SB3's `learn` ends an episode in it
             self.optimize_memory_usage = False
-        user_kwargs, self.policy_kwargs = self.policy_kwargs, {**self.policy_kwargs, **self._policy_settings()}
+        user_kwargs, settings = self.policy_kwargs, self._policy_settings()
+        if own := sorted(user_kwargs.keys() & settings.keys()):
+            raise ValueError(f"policy_kwargs has {own}, which the algorithm sets: give it its own arguments instead.")
+        self.policy_kwargs = {**user_kwargs, **settings}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`n_steps=")  # SB3 cannot know that our buffer has returns of n steps
             super()._setup_model()

@@ -67,6 +67,8 @@ def test_bad_values_are_named() -> None:
         (dict(srl=None, srl_kwargs=dict(bits=5), curiosity=None), "srl_kwargs is"),
         (dict(srl=None, intrinsic="srl_error"), "srl is None"),
         (dict(task=False, curiosity="bonus"), "task=False leaves nothing to learn"),
+        (dict(task=False, curiosity="random", srl=None), "task=False leaves nothing to learn"),
+        (dict(policy_kwargs=dict(update="sequential")), r"policy_kwargs has \['update'\]"),
         (dict(curiosity_gamma=0), "curiosity_gamma=0"),
         (dict(n_steps=3, curiosity="bonus"), "n_steps=3"),
         (dict(n_steps=3, replay_buffer_class=ReplayBuffer), "leave replay_buffer_class out, and set n_steps"),
