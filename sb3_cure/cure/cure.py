@@ -189,15 +189,12 @@ class CuRe(CuReBase):
         learners = self._learners() if learns_rl else {}
         srl = self._srl_loss(batch) if learns_srl else None
         reward = policy.intrinsic if "curious" in learners or (learners and self.curiosity == "bonus") else None
-        curious_rewards = None
-        if reward is not None and reward.needs_srl:  # the reward is of the head before its step
-            curious_rewards = self._curious_rewards(batch, srl)
-            if srl is not None and reward.trains_encoder and self.update == "sequential":
-                srl = self._srl_loss(batch)  # of the encoder as the reward's loss has left it
+        # Of head and encoder before their steps
+        curious_rewards = None if reward is None else self._curious_rewards(batch, srl)
         if srl is not None:
+            if reward is not None and reward.trains_encoder and self.update == "sequential":
+                srl = self._srl_loss(batch)  # of the encoder as the reward's loss has left it
             self._update_srl(srl.loss)
-        if reward is not None and not reward.needs_srl:
-            curious_rewards = self._curious_rewards(batch, srl)
         if "task" in learners:
             self._update_task(batch, learners["task"], curious_rewards if self.curiosity == "bonus" else None)
         if "curious" in learners:

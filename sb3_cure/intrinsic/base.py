@@ -94,8 +94,7 @@ class IntrinsicReward(nn.Module):
     :param features_dim: Size of the latents
     """
 
-    #: Whether the reward is computed from the SRL head: it is then computed before the head's step, and ``srl=None`` is
-    #: refused
+    #: Whether the reward is computed from the SRL head: ``srl=None`` is then refused
     needs_srl: bool = False
     #: Whether the latents keep their graph, so that this loss trains the encoder, too
     trains_encoder: bool = False
