@@ -110,10 +110,13 @@ def test_curious_reward_trains_the_encoder_if_allowed(update: str, encoder_grad:
 
 @UPDATES
 @pytest.mark.parametrize("target", ["observation", "next_observation"])
-@pytest.mark.parametrize("per_pixel", [False, True])
-def test_rewards_of_the_head_come_before_its_step(per_pixel: bool, target: str, update: str) -> None:
-    """They are the same however long the steps of head and encoder are."""
-    settings: dict[str, Any] = dict(curiosity_target=target, intrinsic_kwargs={"per_pixel": per_pixel}, update=update)
+@pytest.mark.parametrize(
+    "reward",
+    [{"intrinsic_kwargs": {"per_pixel": False}}, {"intrinsic_kwargs": {"per_pixel": True}}, {"intrinsic": "icm"}],
+)
+def test_rewards_come_before_steps_of_head_and_encoder(reward: dict[str, Any], target: str, update: str) -> None:
+    """They are the same however long these steps are."""
+    settings: dict[str, Any] = dict(curiosity_target=target, update=update, **reward)
     logged = [train_once(filled_model(learning_rate=rate, **settings)) for rate in (0.0, 0.1)]
     assert logged[0]["curious_reward_raw_mean"] == logged[1]["curious_reward_raw_mean"] > 0
 
