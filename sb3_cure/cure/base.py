@@ -23,6 +23,7 @@ from sb3_cure.envs.sharing import share_environment
 from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
+from sb3_cure.persistence.callback_state import nested_callbacks
 from sb3_cure.srl import SRLHead, get_srl_class
 from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments, restarts_workers
 
@@ -323,9 +324,7 @@ class CuReBase(OffPolicyAlgorithm):
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         initialised = super()._init_callback(callback, progress_bar)
-        queue: list[Any] = [initialised]
-        for each in queue:
-            queue += [*getattr(each, "callbacks", []), *filter(None, [getattr(each, "callback", None)])]
+        for each in nested_callbacks(initialised):
             if share_environment(getattr(each, "eval_env", None), self.env):
                 raise ValueError(
                     f"{type(each).__name__} evaluates in the training environment, so that transitions are stored that "

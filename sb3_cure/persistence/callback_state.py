@@ -19,18 +19,22 @@ _INITIAL = "_sb3_cure_initial"
 _OF_THE_RUN = ("parent", "locals", "globals", "num_timesteps", "verbose", _INITIAL)
 
 
-def list_callbacks(callback: BaseCallback) -> list[BaseCallback]:
-    """List a callback and those inside it, and note what their attributes are now.
+def nested_callbacks(callback: BaseCallback) -> list[BaseCallback]:
+    """List a callback and those inside it.
 
-    :param callback: Callback of a ``learn`` that begins
+    :param callback: A callback
     :return: All callbacks, in a fixed order
     """
-    found = [callback]
-    for child in [each for name, value in vars(callback).items() if name != "parent" for each in _callbacks_in(value)]:
-        found += list_callbacks(child)
-    # A callback may serve several calls of `learn`.
+    inside = [each for name, value in vars(callback).items() if name != "parent" for each in _callbacks_in(value)]
+    return [callback, *(each for child in inside for each in nested_callbacks(child))]
+
+
+def note_contents(callback: BaseCallback) -> None:
+    """Note what the attributes are before training; a callback may serve several calls of ``learn``.
+
+    :param callback: Callback, without those inside it
+    """
     vars(callback).setdefault(_INITIAL, {name: _content(value) for name, value in _attributes(callback).items()})
-    return found
 
 
 def callback_state(callback: BaseCallback) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_cure.persistence.archive import SavesModels
-from sb3_cure.persistence.callback_state import list_callbacks
+from sb3_cure.persistence.callback_state import nested_callbacks, note_contents
 from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, ExactCheckpoint
 from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
 from sb3_cure.persistence.resume import Resumption, Run, load_random_state
@@ -105,7 +105,9 @@ class Persistence(SavesModels, SavesReplayBuffers):
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        run.callbacks = list_callbacks(callback)
+        run.callbacks = nested_callbacks(callback)
+        for each in run.callbacks:
+            note_contents(each)
         if resumed is not None:
             resumed.set_up(self, run.callbacks, continues)
             resumed.is_over = self.num_timesteps >= total
