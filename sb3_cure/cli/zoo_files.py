@@ -126,10 +126,9 @@ def check_environment(task: str) -> None:
     if module:
         import_module(module)
     if name not in gym.registry:
-        hint = nearest(name, gym.registry)
-        if hint == "." and not module:
-            hint = f"; name the module that registers it, too, as in my_module:{name}"
-        raise UsageError(f"there is no environment {name!r}{hint}")
+        is_foreign = not module and not name.startswith("dmc_pixels/")
+        hint = f" (name the module that registers it, too, as in my_module:{name})" if is_foreign else ""
+        raise UsageError(f"there is no environment {name!r}{hint}{nearest(name, gym.registry)}")
 
 
 def import_module(name: str) -> Any:

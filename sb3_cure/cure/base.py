@@ -18,8 +18,8 @@ from sb3_cure.cure.critics import LatentCritic
 from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
-from sb3_cure.envs import check_observation_space
 from sb3_cure.envs.sharing import share_environment
+from sb3_cure.envs.spaces_check import check_action_space, check_observation_space
 from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
@@ -219,6 +219,7 @@ class CuReBase(OffPolicyAlgorithm):
         tune_allocator()
         check_arguments(self)
         check_observation_space(self.observation_space, self.policy_class)
+        check_action_space(self.action_space)  # type: ignore[arg-type]
         self._guard = FiniteGuard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
         if self.replay_buffer_class is None:

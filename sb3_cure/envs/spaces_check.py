@@ -1,4 +1,4 @@
-"""Refuse observation spaces whose images would be read as vectors without a word."""
+"""Refuse spaces that would be read as something else without a word, such as images as vectors."""
 
 import numpy as np
 from gymnasium import spaces
@@ -12,8 +12,8 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
     """Refuse spaces that would be read as something else than meant.
 
     An image is a ``Box`` of dtype uint8 with three dimensions and bounds 0 and 255. All other boxes are vectors.
-    Refused are nested dictionaries, boxes that look like images but would be read as vectors, and policies for another
-    kind of space.
+    Refused are nested dictionaries, texts, boxes that look like images but would be read as vectors, and policies for
+    another kind of space.
 
     :param space: Space of observations
     :param policy: Name or class of the policy; None: do not check that it fits
@@ -34,11 +34,29 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
     _check_part(space, "the observation", is_image=name is not None and name.endswith("CnnPolicy"))
 
 
+def check_action_space(space: spaces.Box) -> None:
+    """Refuse actions that are integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1.
+
+    :param space: Space of actions
+    :raises ValueError: If its dtype is no float
+    """
+    if not np.issubdtype(space.dtype, np.floating):
+        raise ValueError(
+            f"actions are {space.dtype} in {space}, but policies give real numbers: let an ActionWrapper, whose "
+            "action_space is a Box of floats, round them for the environment."
+        )
+
+
 def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         raise ValueError(
             f"{name} is a {type(space).__name__} inside of a Dict, which replay buffers cannot store: flatten it in an "
             "ObservationWrapper, so that each part has a key of its own, such as 'pixels_top' for ['pixels']['top']."
+        )
+    if space.shape is None:
+        raise ValueError(
+            f"{name} is a {type(space).__name__}, which is no array: leave it out, as by "
+            "gymnasium.wrappers.FilterObservation with the other keys."
         )
     if not isinstance(space, spaces.Box) or len(space.shape) < 2 or sorted(space.shape)[-2] < MIN_SIDE:
         return

@@ -14,6 +14,7 @@ from PIL import Image
 
 from sb3_cure.data.observations import image_spaces
 from sb3_cure.envs.rendering import choose_backend
+from sb3_cure.envs.spaces_check import check_observation_space
 
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
@@ -188,15 +189,16 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
         :return: uint8 [channels, image_size, image_size]
         :raises ValueError: If the environment renders something else than uint8 RGB frames
         """
-        frame: Any = self.env.render()
-        if not (isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[-1] == 3):
+        frame: Any = self.env.render()  # some of PyBullet's have an alpha channel, which is left out
+        is_image = isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3
+        if not (is_image and frame.shape[-1] in (3, 4)):
             given = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
             raise ValueError(
                 f"Frames must be uint8 [height, width, 3], but {self.env} with render_mode={self.env.render_mode!r} "
                 f"rendered {given}: make it with render_mode='rgb_array' (env_kwargs in YAML), and let its render() "
                 "return such frames."
             )
-        return to_image(frame, self.image_size, self.grayscale)
+        return to_image(frame[..., :3], self.image_size, self.grayscale)
 
 
 class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -220,6 +222,7 @@ class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs)
         images = image_spaces(space)
         self._keys = list(images if keys is None else keys)
         if not self._keys or not set(self._keys) <= set(images):
+            check_observation_space(space)  # says more of images that are nested or floats
             raise ValueError(
                 f"ResizeImages needs images, uint8 with three dimensions, which are {keys or 'not'} in {space}."
             )

@@ -28,6 +28,7 @@ TYPOS = {
     "train --env cartpole-swingup": "did you mean dmc_pixels/cartpole-swingup-v0",
     "train --env my_modul:My-v0": "did you mean my_module?",
     "train --env gym_pusht/PushT-v0": "as in my_module:gym_pusht/PushT-v0",
+    "train --env parking-v0": "as in my_module:parking-v0",  # although CarRacing-v3 is near
     f"train {CARTPOLE} --conf-file fast/cure_sac": "did you mean fast/cure_sac_ae",
     f"train {CARTPOLE} --conf-file fast/curl.yml": "did you mean fast/curl",
     f"train {CARTPOLE} --conf-file mine.yaml": "did you mean mine.yml",

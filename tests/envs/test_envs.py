@@ -476,6 +476,20 @@ def test_bad_arguments_of_tasks_are_refused(kwargs, message):
         make_dmc_env(**{"domain": "cartpole", "task": "swingup", **kwargs})
 
 
+class WithAlpha(Painting):
+    """As some environments of PyBullet render."""
+
+    def render(self):
+        return np.concatenate([super().render(), np.full((80, 120, 1), 99, np.uint8)], axis=2)
+
+
+@pytest.mark.parametrize("grayscale", [False, True])
+def test_alpha_channel_of_frames_is_left_out(grayscale):
+    seen, expected = (make_pixel_env(env(), grayscale=grayscale) for env in (WithAlpha, Painting))
+    assert np.array_equal(seen.reset()[0], expected.reset()[0])
+    assert np.array_equal(seen.step(1)[0], expected.step(1)[0])
+
+
 class Unfinished(Painting):
     def render(self):
         return np.zeros((4, 4, 3))

@@ -93,6 +93,7 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
     [
         (spaces.Dict(top=image(48, 48, 3)), "is a Dict inside of a Dict.* flatten it"),
         (spaces.Tuple([image(48, 48, 3)]), "is a Tuple inside of a Dict"),
+        (spaces.Text(16), "is a Text, .*FilterObservation"),
         (image(84, 84), r"return it as \[H, W, 1\]"),
         (image(1, 84, 84, 3), "StackFrames"),
         (image(84, 84, 3, high=1, dtype=np.float32), "return it as uint8 from 0 to 255, else flatten it"),
@@ -156,6 +157,14 @@ def test_model_refuses_what_it_would_see_wrongly(policy: str, space: spaces.Spac
         tiny_model(policy, Returns(space, value)).learn(1)
 
 
+def test_integer_actions_are_refused() -> None:
+    """Replay buffers would store -1, 0 and 1 for them."""
+    env = VectorBox()
+    env.action_space = spaces.Box(0, 10, (2,), np.int32)
+    with pytest.raises(ValueError, match="actions are int32"):
+        tiny_model("MlpPolicy", env)
+
+
 # ------------------------------------------------------------------------------------------------------------- resize
 
 
@@ -188,6 +197,9 @@ def test_images_of_dictionaries_are_resized_by_key() -> None:
             ResizeImages(camera_and_joints(), 16, keys=keys)
     with pytest.raises(ValueError, match="ResizeImages needs images"):
         ResizeImages(VectorBox(), 16)
+    nested = Returns(spaces.Dict(pixels=spaces.Dict(top=image(48, 64, 3))), None)
+    with pytest.raises(ValueError, match=r"'pixels' is a Dict inside of a Dict.* flatten it"):
+        ResizeImages(nested, 16)
 
 
 def test_own_images_are_resized_and_stacked() -> None:
