@@ -206,8 +206,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
                 "Frames do not slide: fewer than 9 of 10 rows fit into the replay buffer, because "
                 f"observations are seldom frame_stack={self.frame_stack} frames of which all but the newest repeat the "
                 "ones before (give the right number in replay_buffer_kwargs=dict(frame_stack=...), by key in "
-                "dictionaries), or because many episodes have fewer than 25 steps (a larger buffer_size makes up for "
-                "it).",
+                "dictionaries), or because many episodes have fewer than 25 steps: choose a larger buffer_size.",
                 stacklevel=3,
             )
 
