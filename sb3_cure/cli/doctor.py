@@ -137,7 +137,8 @@ def check_rewards(task: str) -> int:
     env.close()
     if len(returns) < MIN_EPISODES:
         raise UsageError(
-            f"{len(returns)} episodes of {task} ended within a minute, too few to say: register it with a lower max_episode_steps."
+            f"{len(returns)} episodes of {task} ended within a minute, too few to say: register it with a lower "
+            "max_episode_steps."
         )
     met, ends = count_rewarded(returns), f"returns {returns.min():.4g} to {returns.max():.4g}"
     if met is None:
