@@ -93,10 +93,10 @@ class Persistence(SavesModels, SavesReplayBuffers):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         run = self._run
-        if run.resumed is not None and run.resumed.is_over:
-            load_random_state(self, run.resumed.state["random"])
-            run.resumed = None
         if run.resumed is not None and run.resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
+            run.resumed = None
+        elif run.resumed is not None and run.resumed.is_over:
+            load_random_state(self, run.resumed.state["random"])
             run.resumed = None
         resumed = run.resumed
         continues = resumed is not None and reset_num_timesteps

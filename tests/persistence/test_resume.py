@@ -318,6 +318,19 @@ def test_learn_ends_interrupted_pretraining(tmp_path: Path) -> None:
     assert (model.num_timesteps, model.replay_buffer.size()) == (15, 15)
 
 
+def test_learn_after_finished_pretraining_begins_as_without_it(tmp_path: Path) -> None:
+    """With the same random warm-up, also if the script was killed between the two calls."""
+    results = []
+    for resumes in (False, True):
+        model = train(CASES["pretraining"], tmp_path / str(resumes))
+        if resumes:
+            with pytest.warns(UserWarning, match="trains nothing"):
+                model = train(CASES["pretraining"], tmp_path / "True", resume=True)
+        model.set_env(pixels()())
+        results.append(outcome(model.learn(15)))
+    assert differences(*results) == []
+
+
 class Unwilling(BaseCallback):
     """Refuses the training at its beginning."""
 
