@@ -15,11 +15,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
+import yaml
 from gymnasium import spaces
 from torch.utils import collect_env
 
 from sb3_cure import __version__
-from sb3_cure.cli.usage import UsageError, install_command
+from sb3_cure.cli.usage import UsageError, install_command, one_sentence
 from sb3_cure.cli.zoo_files import check_environment
 from sb3_cure.envs.dmc import DMCPixels
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
@@ -123,22 +124,26 @@ def count_rewarded(returns: np.ndarray) -> int | None:
     return int((returns > min(common, 0)).sum()) if times > 1 else None
 
 
-def check_rewards(task: str) -> int:
+def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
     """Show how often random actions meet a reward, and what that says of curiosity.
 
     :param task: Gymnasium id
+    :param env_kwargs: Arguments of ``gym.make``
     :return: Exit status 0
-    :raises UsageError: if too few episodes end within a minute
+    :raises UsageError: if the environment takes other arguments, or too few episodes end within a minute
     """
     check_environment(task)
     print(f"{task}: episodes of random actions, for at most a minute", flush=True)
-    env = gym.make(task)
+    try:
+        env = gym.make(task, **env_kwargs)
+    except TypeError as error:
+        raise UsageError(f"{task} wants other --env-kwargs: {one_sentence(error)}") from error
     returns = play_randomly(_without_images(env))
     env.close()
     if len(returns) < MIN_EPISODES:
         raise UsageError(
-            f"{len(returns)} episodes of {task} ended within a minute, too few to say: register it with a lower "
-            "max_episode_steps."
+            f"{len(returns)} episodes of {task} ended within a minute, too few to say: shorten them, as in "
+            "--env-kwargs max_episode_steps:200"
         )
     met, ends = count_rewarded(returns), f"returns {returns.min():.4g} to {returns.max():.4g}"
     if met is None:
@@ -168,8 +173,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser("sb3-cure doctor", description=__doc__)
     parser.add_argument("--env", metavar="ID", help="show how often random actions meet a reward in this environment")
-    task = parser.parse_args(argv).env
-    return check_machine() if task is None else check_rewards(task)
+    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="arguments of the environment")
+    options = parser.parse_args(argv)
+    if options.env is None:
+        return check_machine()
+    pairs = [each.partition(":") for each in options.env_kwargs]
+    return check_rewards(options.env, {key: yaml.safe_load(value) for key, _, value in pairs})
 
 
 def check_machine() -> int:

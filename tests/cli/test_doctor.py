@@ -104,3 +104,17 @@ def test_doctor_needs_episodes_that_end(monkeypatch: pytest.MonkeyPatch, capsys:
     monkeypatch.setattr(doctor.play_randomly, "__defaults__", (60, 0.05))
     assert main(["doctor", "--env", "Walk-v0"]) == 2
     assert "0 episodes" in capsys.readouterr().err
+
+
+def test_doctor_gives_the_environment_its_arguments(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of its own, and ``gym.make``'s limit of an episode; without what it needs it is no traceback."""
+    spec = EnvSpec("Walk-v0", entry_point=Walk, kwargs=dict(length=np.inf))
+    monkeypatch.setitem(gym.registry, "Walk-v0", spec)
+    monkeypatch.setattr(Walk, "step", lambda self, action: (self.place, self.reward_of["each"], False, False, {}))
+    assert main(["doctor", "--env", "Walk-v0"]) == 2
+    assert "missing 1 required positional argument: 'reward_of'" in capsys.readouterr().err
+    arguments = ["--env-kwargs", "reward_of:{each: 2}", "max_episode_steps:7"]
+    assert main(["doctor", "--env", "Walk-v0", *arguments]) == 0
+    assert "in 60 of 60 episodes; returns 14 to 14" in capsys.readouterr().out
