@@ -305,6 +305,8 @@ def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
                 state[key] = value.clone()  # fused steps count in place, and it may be another model's
                 continue
             if value.shape != parameter.shape:
+                if not optimizer.defaults.get("fused"):
+                    continue  # as of Adafactor, which keeps sums of rows and columns
                 optimizer.state.clear()  # a fused step would write beyond them
                 raise ArchiveError(
                     f"an optimiser got {key:.20} of shape {tuple(value.shape)!s:.50} for a parameter of shape "

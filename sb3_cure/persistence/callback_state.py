@@ -23,10 +23,15 @@ def nested_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     """List a callback and those inside it.
 
     :param callback: A callback
-    :return: All callbacks, in a fixed order
+    :return: All callbacks, each once, in a fixed order
     """
-    inside = [each for name, value in vars(callback).items() if name != "parent" for each in _callbacks_in(value)]
-    return [callback, *(each for child in inside for each in nested_callbacks(child))]
+    found, waiting = {id(callback): callback}, [callback]
+    while waiting:
+        values = [value for name, value in vars(waiting.pop(0)).items() if name != "parent"]
+        new = {id(child): child for value in values for child in _callbacks_in(value) if id(child) not in found}
+        found |= new
+        waiting += new.values()
+    return list(found.values())
 
 
 def note_contents(callback: BaseCallback) -> None:

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import filelock
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -51,10 +52,12 @@ class CheckpointWriter:
         :return: The training state that was written
         :raises OSError: if it could not be written; the checkpoints are then as before
         """
+        model._before_save()  # type: ignore[attr-defined]  # deferred updates draw random numbers
         state = training_state(model, run)
         buffer: Any = model.replay_buffer
         segments: dict[str, list[_Segment]] = {}
-        with self.generations.writing(keep) as draft:
+        # Of two trainings in this folder, which is refused, neither removes what the other is about to write.
+        with filelock.FileLock(self.generations.path / ".lock"), self.generations.writing(keep) as draft:
             model.save(draft.folder / MODEL)
             for place, (key, ring) in enumerate(buffer.rings.items()):
                 segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{draft.number:06d}")

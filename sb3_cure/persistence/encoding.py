@@ -323,10 +323,12 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
 def is_state(file: BinaryIO) -> bool:
     """Check whether a file may be one of ``write_state``, rather than a pickle.
 
-    :param file: Binary file at its start
+    :param file: Binary file at its start, where it is left
     :return: Whether it may
     """
-    return file.read(9)[8:] == b"{"
+    may_be = file.read(9)[8:] == b"{"
+    file.seek(0)
+    return may_be
 
 
 def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]:

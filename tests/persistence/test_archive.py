@@ -309,6 +309,16 @@ def test_copies_update_alike_whatever_their_layout(way: str, fused: bool, tmp_pa
         assert other.learn(5, reset_num_timesteps=False).num_timesteps == 19 and model.num_timesteps == 14
 
 
+def test_optimizers_whose_state_has_other_shapes_are_loaded(tmp_path: Path) -> None:
+    """Adafactor keeps sums of rows and columns."""
+    model = tiny_model("MlpPolicy", VectorBox(), policy_kwargs=dict(optimizer_class=th.optim.Adafactor)).learn(14)
+    model.save(tmp_path / "model")
+    loaded = CuReSAC.load(tmp_path / "model", VectorBox(), device="cpu")
+    assert differences(state_of(model), state_of(loaded)) == []
+    assert "row_var" in loaded.critic.optimizer.state[loaded.critic.optimizer.param_groups[0]["params"][0]]
+    assert loaded.learn(14)._n_updates > 0
+
+
 @pytest.mark.parametrize("moment", [th.zeros(()), th.zeros(1), th.zeros(10**4)], ids=lambda moment: str(moment.shape))
 def test_moments_of_other_shapes_are_refused(moment: th.Tensor) -> None:
     """A fused step would read and write beyond them; nothing of them is left."""
@@ -344,6 +354,9 @@ def test_pickled_buffers_need_trust(buffer_class: Any, tmp_path: Path) -> None:
     model.save_replay_buffer(tmp_path / "pickled")
     with pytest.raises(ArchiveError, match=r"pickled' is no replay buffer .* without pickle.*trusted=True"):
         model.load_replay_buffer(tmp_path / "pickled")
+    with (tmp_path / "pickled.pkl").open("rb") as file:
+        model.load_replay_buffer(file, trusted=True)
+    assert model.replay_buffer.pos == 12
     model.load_replay_buffer(tmp_path / "pickled", trusted=True)
     assert type(model.replay_buffer) is buffer_class and model.replay_buffer.pos == 12
     with pytest.raises(ArchiveError, match=r"holds a FrameStackReplayBuffer .* this model has (Her|Dict)ReplayBuffer"):

@@ -10,6 +10,7 @@ import random
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -39,7 +40,9 @@ from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer, stored_places, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
+from sb3_cure.persistence.checkpoints import CheckpointWriter
 from sb3_cure.persistence.generations import Generations
+from sb3_cure.persistence.resume import random_state
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 
@@ -455,6 +458,15 @@ def test_callbacks_continue_from_the_checkpoint(place: str, tmp_path: Path) -> N
     assert type(best.seen) is collections.Counter and len(best._history) == 60
 
 
+def test_callbacks_may_know_each_other(tmp_path: Path) -> None:
+    best, other = Best(), Best("other")
+    best.other, other.other = other, best  # type: ignore[attr-defined]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        tiny_model("MlpPolicy", vectors()).learn(30, callback=[best, ExactCheckpoint(10, tmp_path), other])
+    assert best._best == other._best == 30
+
+
 def test_evaluations_continue(tmp_path: Path) -> None:
     """SB3's callback, and the one inside it."""
 
@@ -521,6 +533,54 @@ def test_frames_of_each_image_are_written_once(tmp_path: Path) -> None:
     found, expected = (transitions(each, rows, env_inds) for each in (resumed.replay_buffer, buffer))
     for key in ("front", "joints", "wrist"):
         np.testing.assert_array_equal(found.next_observations[key], expected.next_observations[key])
+
+
+def test_random_streams_are_those_after_deferred_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With ``overlap=True`` an update waits for the next step; a checkpoint makes it, and draws its numbers."""
+    write, states = CheckpointWriter.write, []
+
+    def written(self: CheckpointWriter, model: Any, run: Any, keep: int) -> dict[str, Any]:
+        state = write(self, model, run, keep)
+        states.append((state["random"], random_state(model)))
+        return state
+
+    monkeypatch.setattr(CheckpointWriter, "write", written)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = workers(SubprocVecEnv)
+        tiny_model("CnnPolicy", env, overlap=True).learn(40, callback=ExactCheckpoint(10, tmp_path))
+    assert len(states) >= 4
+    assert [differences(saved, found) for saved, found in states] == [[] for _ in states]
+
+
+def test_two_trainings_do_not_write_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A requeued job may begin while the former one ends: the second writer waits, and is refused."""
+    first = interrupted(tmp_path)
+    second = CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
+    refused: list[Exception] = []
+    save = CuReSAC.save
+
+    def write_another() -> None:
+        try:
+            second.learn(40, callback=ExactCheckpoint(10, tmp_path))
+        except CheckpointError as error:
+            refused.append(error)
+
+    thread = threading.Thread(target=write_another)
+
+    def slow_save(model: CuReSAC, path: Path) -> None:
+        if not thread.ident:
+            thread.start()
+            time.sleep(1)
+        save(model, path)
+
+    monkeypatch.setattr(CuReSAC, "save", slow_save)
+    first.learn(40, callback=ExactCheckpoint(10, tmp_path))
+    thread.join()
+    assert "another training writes checkpoints" in str(refused)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # every generation is whole
+        assert CuReSAC.resume(tmp_path, VectorBox(), device="cpu").num_timesteps == 40
 
 
 def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
