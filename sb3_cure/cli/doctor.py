@@ -17,6 +17,7 @@ import numpy as np
 import torch as th
 import yaml
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from torch.utils import collect_env
 
 from sb3_cure import __version__
@@ -156,11 +157,12 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
 
 
 def _without_images(env: gym.Env) -> gym.Env:
-    """Return the environment below the camera of a DMC task, whose images nobody looks at."""
+    """Return the environment below the camera of a DMC task, whose images nobody looks at, with its limit of steps."""
     inner: Any = env
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, DMCPixels):
-            return inner.env
+            limit = env.spec.max_episode_steps if env.spec else None
+            return inner.env if limit is None else TimeLimit(inner.env, limit)
         inner = inner.env
     return env
 

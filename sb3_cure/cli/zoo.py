@@ -22,6 +22,7 @@ from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
@@ -31,6 +32,7 @@ from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
     OWN,
+    Loader,
     check_environment,
     find_class,
     import_module,
@@ -128,6 +130,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 raise UsageError(
                     f"{self.config} has no {name!r} for {self.env_name.gym_id}{nearest(name, hyperparams)}"
                 )
+        hyperparams.setdefault("n_timesteps", self.n_timesteps)  # which rl-zoo3 deletes in any case
         hyperparams.update(named_classes(hyperparams))
         processed = super()._preprocess_hyperparams(hyperparams)
         rate = processed[0].get("learning_rate")
@@ -162,9 +165,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
             raise
         finally:
             self._n_ended += 1
-            left = (time.monotonic() - self._start) * ((self.n_trials or 0) / self._n_ended - 1)
+            ended, planned = self._n_ended, self.n_trials or 0
+            if self.max_total_trials is not None:  # of all processes
+                ended, planned = trial.number + 1, self.max_total_trials
+            left = (time.monotonic() - self._start) / self._n_ended * (planned - ended)
             if left > 0:
-                print(f"Trial {self._n_ended} of {self.n_trials} ended, about {time_text(left)} left", flush=True)
+                print(f"Trial {ended} of {planned} ended, about {time_text(left)} left", flush=True)
 
 
 def sample_params(
@@ -224,6 +230,8 @@ def register() -> None:
     for name in ALGORITHMS:
         HYPERPARAMS_CONVERTER[name] = convert_params
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc, attr-defined]
+    # In this program 1e-3 is a number for rl-zoo3's reader, too, as it is in grids.
+    yaml.SafeLoader.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers
 
 
 def train(arguments: Sequence[str]) -> None:
@@ -401,15 +409,21 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
     objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in OWN if vars(args)[name]}
-    # The smallest buffer, of the default class: it is not used, and the run's class may not be in the archive.
-    objects.update(replay_buffer_class=None, replay_buffer_kwargs={}, optimize_memory_usage=False)
+    objects["replay_buffer_class"] = _NoReplayBuffer
     load: Any = ALGORITHMS[args.algo].load
     with _refusals_in_one_sentence(make_dmc_env):
         env = create_test_env(
             task, stats_path=str(folder), should_render=False, hyperparams=settings, env_kwargs=env_kwargs
         )
-        model = load(path, env, args.device, objects, buffer_size=1, seed=args.seed, trusted=args.trusted)
+        model = load(path, env, args.device, objects, seed=args.seed, trusted=args.trusted)
     return model, model.get_env(), path
+
+
+class _NoReplayBuffer(ReplayBuffer):
+    """Takes the place of the run's: nothing is stored, and its class may not be in the archive."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """Allocate nothing."""
 
 
 def _latest_run(args: argparse.Namespace, name: str) -> int:

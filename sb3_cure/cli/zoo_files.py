@@ -52,11 +52,11 @@ def packaged_files(folder: Path = ZOO) -> dict[str, Path]:
     return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
 
 
-class _Loader(yaml.SafeLoader):
+class Loader(yaml.SafeLoader):
     """SafeLoader that reads 1e-6 as a number, as YAML 1.2 does; YAML 1.1 reads it as text."""
 
 
-_Loader.add_implicit_resolver(
+Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )
 
@@ -71,7 +71,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise UsageError(missing_file(path, [*packaged_files(GRIDS), *packaged_files()]))
     try:
-        content = yaml.load(path.read_text(), _Loader)
+        content = yaml.load(path.read_text(), Loader)
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise UsageError(
             f"{path} cannot be read ({one_sentence(error)}): "

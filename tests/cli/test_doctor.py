@@ -118,3 +118,11 @@ def test_doctor_gives_the_environment_its_arguments(
     arguments = ["--env-kwargs", "reward_of:{each: 2}", "max_episode_steps:7"]
     assert main(["doctor", "--env", "Walk-v0", *arguments]) == 0
     assert "in 60 of 60 episodes; returns 14 to 14" in capsys.readouterr().out
+
+
+def test_doctor_shortens_the_episodes_of_dmc_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+    """Also below their camera, which it leaves out: of 1000 steps a minute would not see 60 on a slow machine."""
+    assert (
+        main(["doctor", "--env", "dmc_pixels/cartpole-swingup_sparse-v0", "--env-kwargs", "max_episode_steps:5"]) == 0
+    )
+    assert "in 0 of 60 episodes; returns 0 to 0" in capsys.readouterr().out

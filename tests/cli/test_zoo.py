@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +18,7 @@ import optuna
 import pytest
 import yaml
 from envs_for_tests import PixelBox, VectorBox, tiny_model
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure import CuReSAC
@@ -70,12 +72,17 @@ class Gentle(RAE):
     """A head of the user's own."""
 
 
+class Buffer(ReplayBuffer):
+    """A replay buffer of the user's own."""
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _modules() -> Iterator[None]:
     """The tasks under their ids, and the module ``heads_of_mine``."""
     module = ModuleType("heads_of_mine")
     vars(module)["Gentle"] = Gentle
-    Gentle.__module__ = "heads_of_mine"
+    vars(module)["Buffer"] = Buffer
+    Gentle.__module__ = Buffer.__module__ = "heads_of_mine"
     sys.modules["heads_of_mine"] = module
     gym.register(TASK, Filmed)
     gym.register("tests/Vector-v0", VectorBox)
@@ -140,6 +147,17 @@ def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
     assert (model.curiosity_prob, model.n_envs, model.srl, model.seed) == (0.5, 2, "curl", 3)
     assert model.observation_space.shape == (6, 40, 40)
     assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
+
+
+def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
+    """1e-3 is a number here as in grids, and the flag -n stands in for the file's ``n_timesteps``."""
+    settings = {name: value for name, value in SETTINGS.items() if name != "n_timesteps"}
+    text = yaml.safe_dump({"default": {**settings, "learning_rate": "RATE"}}).replace("RATE", "1e-3")
+    Path("settings.yml").write_text(text)
+    flags = ["--conf-file", "settings.yml", "--device", "cpu", "--eval-freq", "-1", "-n", "14"]
+    assert main(["train", "--env", TASK, *flags]) == 0
+    model = CuReSAC.load(f"logs/cure_sac/{RUN}_1/{RUN}.zip", device="cpu")
+    assert (model.lr_schedule(1), model.num_timesteps) == (1e-3, 14)
 
 
 def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
@@ -232,6 +250,24 @@ def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str
     assert {name: getattr(model, name) for name in asked[0]} == asked[0]
 
 
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        (dict(n_trials=3), "Trial 1 of 3 ended, about 2 min left"),
+        (dict(n_trials=500, max_total_trials=8), "Trial 5 of 8 ended, about 3 min left"),
+    ],
+)
+def test_trials_that_are_left_are_told(
+    numbers: dict[str, int], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A minute each; with ``--max-total-trials`` other processes make some of them."""
+    manager = zoo.ExperimentManager(type("Arguments", (), {"gym_packages": []})(), "cure_sac", TASK, "logs", **numbers)
+    manager._n_ended, manager._start = 0, time.monotonic() - 60
+    monkeypatch.setattr(zoo.exp_manager.ExperimentManager, "objective", lambda manager, trial: 0.0)
+    manager.objective(type("Trial", (), {"number": 4})())  # type: ignore[arg-type]
+    assert told in capsys.readouterr().out
+
+
 # ----------------------------------------------------------------- replaying
 
 
@@ -266,6 +302,15 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
     assert "7 Episodes" in capsys.readouterr().out
     assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle", "--env-kwargs", "size:40") == 2
     assert "Observation spaces do not match" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changes", [{"replay_buffer_kwargs": {"frame_stack": 1}}, {"replay_buffer_class": "heads_of_mine.Buffer"}]
+)
+def test_agent_plays_whatever_buffer_it_had(changes: dict[str, Any], folder: Path) -> None:
+    """Its reward reads the newest frame, whose size is the buffer's to say."""
+    train("--eval-freq", "-1", intrinsic="rnd", **changes)
+    assert replay("enjoy", Path(f"logs/cure_sac/{RUN}_1")) == 0
 
 
 def test_record_writes_a_video(run: Path, tmp_path: Path) -> None:
