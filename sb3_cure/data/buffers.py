@@ -364,7 +364,11 @@ def transitions(
     if isinstance(buffer, FrameStackReplayBuffer):
         obs, next_obs = buffer.observations_at(*inds)
     else:
-        obs, next_obs = rows_of(buffer.observations, inds), rows_of(buffer.next_observations, inds)
+        obs = rows_of(buffer.observations, inds)
+        if buffer.optimize_memory_usage:  # SB3's: the next row's
+            next_obs = rows_of(buffer.observations, ((rows + 1) % buffer.buffer_size, env_inds))
+        else:
+            next_obs = rows_of(buffer.next_observations, inds)
     data = (
         buffer._normalize_obs(obs, env),
         buffer.actions[inds],

@@ -74,7 +74,7 @@ def check_cell(folder: Path, cell: Cell) -> None:
     :param cell: The cell
     :raises UsageError: if they differ
     """
-    keys = ("kind", "budget", "eval_every", "eval_episodes", "coverage", "stop_at_return", *SETTINGS)
+    keys = ("task", "kind", "budget", "eval_every", "eval_episodes", "coverage", "stop_at_return", *SETTINGS)
     check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in keys})
 
 

@@ -401,13 +401,16 @@ def _validation_message(error: Any) -> str:
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
-    """Change the budget, and that of pretraining in proportion."""
+    """Change the budget; that of pretraining, and when cells are counted, in proportion."""
     if file.budget == 0:
         raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
     for method in file.methods.values():
         if method.pretrain is not None:
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
             method.pretrain = replace(method.pretrain, budget=steps)
+    if file.coverage is not None:
+        at = [max(round(step * budget / file.budget), 1) for step in file.coverage.at]
+        file.coverage = replace(file.coverage, at=at)
     file.budget = budget
 
 

@@ -199,9 +199,11 @@ def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) ->
 
 
 def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
+    """Whose error it is: the head's, or that of a reward which reconstructs what its own autoencoder sees."""
     arguments = next(iter(experiment.done(task, arm).values())).config["arguments"]
     per_pixel = arguments.get("intrinsic_kwargs", {}).get("per_pixel")
-    return f"{arguments.get('srl', 'rae')}{', per pixel' if per_pixel else ''}"
+    own = "reconstruction" if arguments.get("intrinsic") == "reconstruction" else arguments.get("srl", "rae")
+    return f"{own}{', per pixel' if per_pixel else ''}"
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:

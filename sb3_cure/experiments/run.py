@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -50,7 +51,8 @@ def run_grid(
     :param cpus_per_cell: Ray: cores per cell or common head, also its threads
     :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU
     :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
-    :return: The cells and common heads that failed; each has its traceback in ``error.txt``
+    :return: The cells and common heads that are not done: those that failed, each with its traceback in ``error.txt``,
+        and those that another process is running
     :raises UsageError: with one sentence, before anything is written, if the grid cannot be run
     """
     if engine not in ENGINES:
@@ -61,6 +63,9 @@ def run_grid(
     resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
     with _ray(address, resources) if engine == "ray" else nullcontext(_run_here) as run_all:
         _write_grid(grid, results / grid.experiment)
+        for cell in grid.cells:
+            if cell.is_done(results):  # and was killed before it removed this
+                shutil.rmtree(results / cell.folder / "checkpoint", ignore_errors=True)
         failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], settings)
         heads = common_heads(grid, results)
         failed += run_all([each for each in heads if not each.is_done(results)], settings)
@@ -115,7 +120,7 @@ def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
     """Run a unit; a failure is written into its folder and does not stop the others.
 
-    :return: Whether it succeeded
+    :return: Whether it is done
     """
     try:
         if isinstance(unit, CommonHeads):
@@ -125,6 +130,7 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
         print(f"{unit.folder}: done", flush=True)
     except CellIsRunning as elsewhere:
         print(elsewhere, flush=True)
+        return False
     except Exception:
         _write_error(unit, results, traceback.format_exc())
         return False
@@ -227,8 +233,7 @@ def _steps(text: str) -> int:
 
 
 def _seed_choice(text: str) -> int | list[int]:
-    numbers = [int(part) for part in text.split(",") if part]
-    return numbers if "," in text else numbers[0]
+    return [int(part) for part in text.split(",") if part] if "," in text else int(text)
 
 
 def _names(text: str) -> list[str]:
@@ -264,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command ``sb3-cure experiment``.
 
     :param arguments: Command line, ``sys.argv`` by default
-    :return: 0 if nothing failed, 1 if something did, 130 after Ctrl-C
+    :return: 0 if all cells are done, 1 if some are not, 130 after Ctrl-C
     :raises UsageError: with one sentence, if the grid cannot be run
     """
     options = vars(_parser().parse_args(arguments))
@@ -283,5 +288,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 130
     for unit in failed:
-        print(f"{unit.folder} failed, see {out / unit.folder / ERROR}")
+        error = out / unit.folder / ERROR
+        print(f"{unit.folder} " + (f"failed, see {error}" if error.exists() else "is run by another process"))
     return 1 if failed else 0

@@ -503,3 +503,14 @@ def test_transitions_of_sb3s_buffers_are_those_it_samples() -> None:
         assert rows.tolist() == [1, 0, 6, 5, 4, 3, 2] and ages.tolist() == list(range(7))
         assert isinstance(twins.sb3, DictReplayBuffer if kind == "dictionary" else ReplayBuffer)
         assert_equal(transitions(twins.sb3, rows, envs), twins.sb3._get_samples(rows))
+
+
+def test_transitions_of_sb3s_compact_buffer_are_those_it_samples() -> None:
+    """It keeps each observation once."""
+    box = spaces.Box(-9, 9, (1,))
+    buffer = ReplayBuffer(5, box, box, "cpu", optimize_memory_usage=True, handle_timeout_termination=False)
+    for step in range(7):
+        now, then = (np.full((1, 1), value, np.float32) for value in (step, step + 1))
+        buffer.add(now, then, now, np.ones(1), np.zeros(1), [{}])
+    rows = np.array([4, 0, 1])
+    assert_equal(transitions(buffer, rows, np.zeros(3, int)), buffer._get_samples(rows))

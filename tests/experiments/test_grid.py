@@ -70,6 +70,8 @@ def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int,
     assert described["both"]["pretrain"] == {"collector": "random", "budget": expected[1]}
     unscaled = load_grid(path).description["methods"]
     assert all(unscaled[name].get("pretrain") == method.get("pretrain") for name, method in methods.items())
+    counted = write_grid(tmp_path, budget=own, coverage=dict(widths=dict(place=1.0), at=[100, own]))
+    assert load_grid(counted, budget=asked).cells[0].coverage.at == [expected[1], asked]  # type: ignore[union-attr]
 
 
 def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:
@@ -155,6 +157,7 @@ def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.Captu
         "--methods none": "'none' is not in",
         "--budget 10m": "'10m' is no number of steps",
         "--seeds x": "argument --seeds: invalid",
+        "--seeds=": "argument --seeds: invalid",
         "--seeds ,": "seeds: List should have at least 1 item",
         "--tasks ,": "'' is not in",
         "--seeds 0": "seeds: List should have at least 1 item",

@@ -148,6 +148,22 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     assert "cure_sac_ae on cartpole-swingup, 2 seeds: it reached 2.00" in text
 
 
+@pytest.mark.parametrize("shorter", ["cure", "random"])
+def test_arm_that_counted_less_often_keeps_its_columns(shorter: str, tmp_path: Path) -> None:
+    """It may have stopped early, and stand first or last."""
+    write_grid(tmp_path, seeds=1, methods={"cure": {}, "random": {}}, baseline="random")
+    for method in ("cure", "random"):
+        cell = write_cell(tmp_path, TASK, method, 0, curve(0, 0))
+        rows = [(steps, 0, steps // 100, 1.0) for steps in (25_000, 50_000, 75_000)[: 2 if method == shorter else 3]]
+        write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
+    assert report.main([str(tmp_path)]) == 0
+    header, *rows = rows_of(tmp_path / "table.md", "Cells of the true state")
+    assert header[3:6] == ["at 25,000", "at 50,000", "at 75,000"]
+    found = {row[1]: row[3:6] for row in rows}
+    assert found.pop(shorter) == ["250", "500", NONE]
+    assert list(found.values()) == [["250", "500", "750"]]
+
+
 def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> None:
     """Arms without a task beside one with returns: the report does not say that there is nothing to compare."""
     write_grid(tmp_path, seeds=1, methods={"cure": {}, "other": {}, "oracle": {}}, baseline="cure")
@@ -182,12 +198,13 @@ def describe(folder: Path, drawn: list[tuple[Any, ...]]) -> dict[str, tuple[Any,
 def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: list[tuple[Any, ...]]) -> None:
     """A panel for each head, and for errors per pixel, but one of returns; constant images have errors of one unit."""
     others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
+    others["drawn"] = {"srl": "curl", "intrinsic": "reconstruction"}  # whose own autoencoder measures
     arms: dict[str, dict[str, Any]] = {"sac_ae": {}, **others}
     write_grid(tmp_path, seeds=1, methods={arm: {} for arm in arms}, baseline="sac_ae")
     for arm, arguments in arms.items():
         write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2, 3, 4), arguments={**CURE, **arguments})
     figures = describe(tmp_path, drawn)
-    panels = [f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel")]
+    panels = [f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel", "reconstruction")]
     assert list(figures["task_srl_error.png"][0]) == panels
     assert list(figures["learning_curves.png"][0]) == [TASK]
 
@@ -198,7 +215,7 @@ def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: l
         write_cell(tmp_path, TASK, arm, 0, {}, arguments={**CURE, **arguments}, visitation=rows)
     bars, lines = describe(tmp_path, drawn)["visitation_own.png"]
     assert list(bars) == panels
-    assert [len(lines.get(panel, ())) for panel in panels] == [2, 0, 0]
+    assert [len(lines.get(panel, ())) for panel in panels] == [2, 0, 0, 0]
 
 
 def test_random_policy_is_drawn_once(tmp_path: Path, drawn: list[tuple[Any, ...]]) -> None:

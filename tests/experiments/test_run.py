@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 from grids_for_tests import method, steps_of, write_grid
 
@@ -61,20 +62,44 @@ def test_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out.count(": done") == 2
 
 
+def test_cell_of_another_process_is_not_done(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The status says so, as a job that waits for it would begin too early; nothing is written into its folder."""
+    path, out = write_grid(tmp_path, **QUICK), tmp_path / "out"
+    command = [str(path), "--out", str(out), "--no-pictures"]
+    folder = out / "tiny" / "PixelBox" / "cure" / "seed0"
+    folder.mkdir(parents=True)
+    with cells.alone_in(folder):
+        assert run.main(command) == 1
+    assert "seed0 is run by another process" in capsys.readouterr().out
+    assert [file.name for file in folder.iterdir()] == [".lock"]
+
+
+def test_checkpoint_of_a_finished_cell_is_removed(tmp_path: Path) -> None:
+    """Killed between its end and that, a cell is never run again, and its replay buffer would stay for ever."""
+    grid, out = load_grid(write_grid(tmp_path, **QUICK)), tmp_path / "out"
+    run.run_grid(grid, out, pictures=False)
+    left = out / grid.cells[0].folder / "checkpoint" / "segments"
+    left.mkdir(parents=True)
+    run.run_grid(grid, out, pictures=False)
+    assert not left.parent.exists() and grid.cells[0].is_done(out)
+
+
 # -------------------------------------------------------------- other settings
 
 
-def test_other_settings_in_the_folder_are_refused(tmp_path: Path) -> None:
+def test_other_settings_in_the_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of whatever seed and arm, as they are compared; what was there stays as it was. Further seeds and arms go in."""
     path, out = write_grid(tmp_path, **QUICK), tmp_path / "out"
     assert run.run_grid(load_grid(path, seeds=[7]), out, pictures=False) == []
     files = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    monkeypatch.setitem(gym.registry, "elsewhere/PixelBox-v3", gym.registry["grids/PixelBox-v0"])
     changed = {"cure": method(batch_size=9)}
     for changes, sentence in (
         (dict(budget=80), "tiny was run with other settings: budget was 40 and is 80 now"),
         (dict(evaluation=dict(every=20, episodes=1)), "evaluation was {'every': 40, .*} and is {'every': 20"),
         (dict(kind="visitation", methods={"other": method()}), "kind was 'curves' and is 'visitation' now"),
         (dict(methods=changed), "seed7 was run with other settings: arguments was {"),
+        (dict(tasks=["elsewhere/PixelBox-v3"]), "seed7 was run with other settings: task was 'grids/PixelBox-v0'"),
     ):
         with pytest.raises(UsageError, match=sentence):
             run.run_grid(load_grid(write_grid(tmp_path, **{**QUICK, **changes}), seeds=[8]), out, pictures=False)
