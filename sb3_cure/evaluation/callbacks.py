@@ -18,13 +18,12 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
 from sb3_cure.data.buffers import infer_frame_stack, stored_places, transitions
-from sb3_cure.data.observations import by_key, image_spaces, len_of, rows_of
+from sb3_cure.data.observations import by_key, image_spaces
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
@@ -263,14 +262,11 @@ class ReconstructionCallback(PeriodicCallback):
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param observations: Images to reconstruct, uint8 [n, C, H, W], or dictionaries with such, by key; the first row is
-        then that of the untrained model, if the head itself reconstructs. By default ``columns`` of the replay buffer,
-        spread over their time when the first row is drawn
-    :param columns: How many observations to take
+    :param columns: How many observations of the replay buffer to draw, spread over their time in the first row
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
     :param verbose: 1 prints the file's name
     :param title: Added to the picture's title, such as the names of task and method
-    :raises ValueError: if the model has no replay buffer, does not learn from images with an encoder, or from others
+    :raises ValueError: if the model has no replay buffer, or does not learn from images with an encoder
     :raises ImportError: if matplotlib is not installed
     """
 
@@ -278,37 +274,24 @@ class ReconstructionCallback(PeriodicCallback):
         self,
         folder: str | Path,
         every: int = 5000,
-        observations: np.ndarray | dict[str, np.ndarray] | None = None,
         columns: int = 8,
         decoder_updates: int = 500,
         verbose: int = 0,
         title: str = "",
     ):
         super().__init__(every, verbose)
-        self.folder, self.observations, self.columns = Path(folder), observations, columns
-        self.decoder_updates, self.title = decoder_updates, title
+        self.folder, self.columns, self.decoder_updates, self.title = Path(folder), columns, decoder_updates, title
+        #: What is drawn, [n, C, H, W] or by key; None before the first row
+        self.observations: Any = None
         #: Agent steps and the reconstructions then, their newest frames by key, uint8 [n, C, H, W]
         self.rows: list[tuple[int, dict[str, np.ndarray]]] = []
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
 
     def _init_callback(self) -> None:
-        space, given = self.model.observation_space, self.observations
-        if encoder_of(self.model.policy) is None or not image_spaces(space):
+        if encoder_of(self.model.policy) is None or not image_spaces(self.model.observation_space):
             raise ValueError("ReconstructionCallback needs a policy with an encoder of uint8 images, which it draws.")
         if not isinstance(self.model, OffPolicyAlgorithm):
             raise ValueError("ReconstructionCallback needs a replay buffer, to which decoders are fitted.")
-        if given is None:
-            return
-        if isinstance(given, np.ndarray) and given.shape[1:] != space.shape:
-            self.observations = given = maybe_transpose(given, space)
-        if not all(space.contains(rows_of(given, i)) for i in range(len_of(given))):
-            raise ValueError(f"observations must be n of {space}, as the model learns from them.")
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        if self.observations is not None and not self.rows and self.num_timesteps == 0:
-            with untouched_randomness(self.model.device):
-                self.on_period()
 
     def on_period(self) -> None:
         """Add a row."""

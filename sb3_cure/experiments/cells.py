@@ -130,8 +130,7 @@ class _CellRun:
                 path = self.folder / "coverage.csv"
                 callbacks.append(CoverageRecorder(cell.coverage.at, record.action_repeat, path))
             if self.pictures:
-                with untouched_randomness(self.model.device, EVAL_SEED):
-                    callbacks += reconstruction_callbacks(cell, record.action_repeat, self.folder)
+                callbacks += reconstruction_callbacks(cell, record.action_repeat, self.folder)
             self.model.learn(record.agent_steps(cell.budget), callback=callbacks)
 
     def _write_results(self) -> None:

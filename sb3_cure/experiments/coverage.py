@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.experiments.visit_statistics import entropy_bits
 
-COLUMNS = ("environment_steps", "agent_steps", "cells", "entropy_bits")
+COLUMNS = ("environment_steps", "agent_steps", "cells")
 
 
 class CoverageRecorder(BaseCallback):
@@ -26,18 +24,15 @@ class CoverageRecorder(BaseCallback):
     def __init__(self, at: Sequence[int], action_repeat: int, path: Path):
         super().__init__()
         self._at, self._action_repeat, self._path = sorted(at), action_repeat, path
-        #: Visits of each cell, by its numbers with commas between them
-        self.visits: dict[str, int] = {}
+        #: Cells reached, each as its numbers with commas between them
+        self.cells: set[str] = set()
         self.rows: list[Row] = []
 
     def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            cell = ",".join(map(str, info["cell"]))
-            self.visits[cell] = self.visits.get(cell, 0) + 1
+        self.cells.update(",".join(map(str, info["cell"])) for info in self.locals["infos"])
         steps = self.num_timesteps * self._action_repeat
         while len(self.rows) < len(self._at) and steps >= self._at[len(self.rows)]:
-            counts = np.array(list(self.visits.values()))
-            values = (steps, self.num_timesteps, len(counts), entropy_bits(counts))
+            values = (steps, self.num_timesteps, len(self.cells))
             self.rows.append(dict(zip(COLUMNS, values, strict=True)))
         return True
 

@@ -19,16 +19,14 @@ from sb3_cure.evaluation.video import frame_rate, write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
 
-#: Seed of films and reconstructed observations, the same in all cells of a task
+#: Seed of films, the same in all cells of a task
 FILM_SEED = 30_000
 FRAMES = 16
 ROWS_OF_RECONSTRUCTIONS = 8
-#: Reconstructed observations, and random agent steps between two of them
-RECONSTRUCTED, STEPS_APART = 8, 50
 
 
 def reconstruction_callbacks(cell: Cell, action_repeat: int, folder: Path) -> list[ReconstructionCallback]:
-    """Callbacks that draw reconstructions during training, of the same observations in all cells of a task.
+    """Callbacks that draw reconstructions during training.
 
     :param cell: A cell that is about to be trained
     :param action_repeat: Environment steps per agent step
@@ -38,31 +36,15 @@ def reconstruction_callbacks(cell: Cell, action_repeat: int, folder: Path) -> li
     if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
         return []
     every = max(cell.budget // action_repeat // ROWS_OF_RECONSTRUCTIONS, 1)
-    return [ReconstructionCallback(folder, every, _random_observations(cell), title=_title(cell))]
+    return [ReconstructionCallback(folder, every, title=_title(cell))]
 
 
 def _title(cell: Cell) -> str:
     return f"{cell.folder.parts[1]}, {cell.method}, seed {cell.seed}"
 
 
-def _random_observations(cell: Cell) -> np.ndarray:
-    """Observations of episodes with random actions, [n, *shape]."""
-    env = cell.make_eval_env()
-    env.action_space.seed(FILM_SEED)
-    observation, _ = env.reset(seed=FILM_SEED)
-    chosen = []
-    for step in range(1, RECONSTRUCTED * STEPS_APART + 1):
-        observation, _, terminated, truncated, _ = env.step(env.action_space.sample())
-        if terminated or truncated:
-            observation, _ = env.reset()
-        if step % STEPS_APART == 0:
-            chosen.append(observation)
-    env.close()
-    return np.stack(chosen)
-
-
 def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
-    """Write ``<actor>_policy.mp4``, ``reconstructions.png``, ``uncomfortable.png`` and ``curiosity_map.png``.
+    """Write ``<actor>_policy.mp4``, ``uncomfortable.png`` and ``curiosity_map.png``.
 
     Those for which a cell lacks images, a trained policy, a head or true states are left out. Videos have
     deterministic actions; the map shows the visits of ``measure_visits``, with sampled ones.
@@ -79,7 +61,7 @@ def draw_cell(model: CuReSAC, cell: Cell, folder: Path) -> None:
     if is_trained and can_film:
         _film(model, cell, repeat, folder)
     if getattr(model.policy, "measures_errors", False) and is_image_space(model.observation_space):
-        _draw_replay_buffer(model, cell, repeat, folder)
+        _draw_replay_buffer(model, cell, folder)
 
 
 def _draw_map(model: CuReSAC, cell: Cell, env: gym.Env, folder: Path) -> None:
@@ -102,12 +84,9 @@ def _film(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -> None:
             write_video(folder / f"{actor}_policy.mp4", {title: episode}, frame_rate(env), repeat)
 
 
-def _draw_replay_buffer(model: CuReSAC, cell: Cell, repeat: int, folder: Path) -> None:
+def _draw_replay_buffer(model: CuReSAC, cell: Cell, folder: Path) -> None:
     if model.replay_buffer.size() == 0:  # type: ignore[union-attr]
         return
-    if not (folder / "reconstructions.png").exists():  # without training
-        for callback in reconstruction_callbacks(cell, repeat, folder):
-            callback.draw(model)
     found = highest_errors(model, FRAMES)
     with th.no_grad():
         pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))

@@ -13,6 +13,7 @@ import jinja2
 import numpy as np
 import pandas as pd
 
+from sb3_cure.cli.progress import time_text
 from sb3_cure.experiments import statistics
 from sb3_cure.experiments.results import NOT_RUN, CellResult, Experiment
 from sb3_cure.experiments.statistics import Estimate, PairedDifference
@@ -166,14 +167,6 @@ def ratio_text(estimate: Estimate) -> str:
 
 def _list(values: Iterable[Any]) -> str:
     return ", ".join(dict.fromkeys(str(value) for value in values if value not in (None, ""))) or NONE
-
-
-def _duration(seconds: float | None) -> str:
-    if seconds is None:
-        return NONE
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
 
 
 # Tables
@@ -348,7 +341,7 @@ def _baselines(experiment: Experiment) -> str:
 
 
 def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
-    """Occupied cells and entropy.
+    """Occupied cells.
 
     :param experiment: An experiment
     :param rows: Coverage by actor
@@ -357,9 +350,8 @@ def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
     shown = []
     for row in rows:
         numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), ratio_text(row.ratio)]
-        numbers += [ratio_text(row.task_ratio), number_text(float(row.entropy.mean()), 2)]
-        shown.append([row.task, row.method, row.actor, *numbers])
-    columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS, ">entropy, bits"])
+        shown.append([row.task, row.method, row.actor, *numbers, ratio_text(row.task_ratio)])
+    columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS])
     dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
     note = render_text("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
     return _table("Coverage of the true state space", columns, shown, note)
@@ -443,7 +435,7 @@ def conditions_table(experiment: Experiment) -> Table:
         pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
         attempts: list[dict[str, Any]] = [*run.get("history", ()), run]
         machine = [_list(each.get(key) for each in attempts) for key in ("device", "precision", "machine")]
-        times = [_duration(run.get(key)) for key in ("seconds", "cpu_seconds")]
+        times = [NONE if run.get(key) is None else time_text(run[key]) for key in ("seconds", "cpu_seconds")]
         row = [cell.task, cell.method, str(cell.seed), trained, pretrained, *times, *machine]
         rows.append([*row, letter, _commits(cell), str(run.get("attempts") or NONE)])
     columns = (

@@ -66,12 +66,10 @@ class ErrorSummary(Measured):
 class Coverage(Measured):
     """Occupied cells of a grid over two coordinates of the true state, averaged over all pairs of them.
 
-    :param entropy: Entropy of the visits over these cells in bits, mean over all pairs, [seeds]
     :param steps: States counted, of each seed and actor alike
     :param dimensions: Dimension of the state
     """
 
-    entropy: np.ndarray
     steps: int
     dimensions: int
 
@@ -141,40 +139,28 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
         steps = min(len(states) for states in visits.values())
         low, width = _grid_of_random(visits, units)
         rng = np.random.default_rng(0)
-        counts = {
-            key: visits_by_pair(rng.choice(states, steps, replace=False), low, width) for key, states in visits.items()
+        occupied = {
+            key: float(np.mean(occupied_cells(rng.choice(states, steps, replace=False), low, width)))
+            for key, states in visits.items()
         }
-        occupied = {key: float(np.mean([len(pair) for pair in pairs])) for key, pairs in counts.items()}
         for row in _compare(experiment, task, occupied):
-            own = [pairs for key, pairs in counts.items() if key[:2] == (row["method"], row["actor"])]
-            bits = np.array([np.mean([entropy_bits(pair) for pair in pairs]) for pairs in own])
-            rows.append(Coverage(**row, entropy=bits, steps=steps, dimensions=len(low)))
+            rows.append(Coverage(**row, steps=steps, dimensions=len(low)))
     return rows
 
 
-def visits_by_pair(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> list[np.ndarray]:
-    """Count states on grids over two coordinates at a time.
+def occupied_cells(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> list[int]:
+    """Count the cells that states occupy on grids over two coordinates at a time.
 
     :param states: True states, [n, d]
     :param low: Lower edge of a cell, [d]; the grid has no end on any side
     :param width: Width of the cells, > 0, [d]
-    :return: For each pair of coordinates (with one coordinate: for it), the states in each occupied cell
+    :return: Of each pair of coordinates (with one coordinate: of it)
     """
     places = np.floor((states - low) / width).astype(np.int64)
     places -= places.min(axis=0)
     ends = places.max(axis=0) + 1
     pairs = itertools.combinations(range(states.shape[1]), 2) if states.shape[1] > 1 else [(0, 0)]
-    return [np.unique(places[:, i] * ends[j] + places[:, j], return_counts=True)[1] for i, j in pairs]
-
-
-def entropy_bits(counts: np.ndarray) -> float:
-    """Entropy of a distribution.
-
-    :param counts: Visits of each cell
-    :return: Entropy in bits
-    """
-    shares = counts / counts.sum()
-    return float(-(shares * np.log2(shares)).sum()) + 0.0
+    return [len(np.unique(places[:, i] * ends[j] + places[:, j])) for i, j in pairs]
 
 
 def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], tuple[str, ...]]:

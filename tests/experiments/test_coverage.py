@@ -56,7 +56,6 @@ def test_cells_of_all_collected_states_are_counted(tmp_path: Path, monkeypatch: 
     for row in rows:
         cells = np.floor(seen[: row["agent_steps"]] / list(WIDTHS.values()))
         assert row["cells"] == len(np.unique(cells, axis=0)) > 3
-        assert 0 < row["entropy_bits"] <= np.log2(row["cells"]) + 1e-9
 
 
 def test_oracle_rewards_training_alone(tmp_path: Path) -> None:

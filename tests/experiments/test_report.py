@@ -135,8 +135,8 @@ def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     for method, seeds in reached.items():
         for seed, cells in seeds.items():
             cell = write_cell(tmp_path, TASK, method, seed, curve(0, 0))
-            rows = [(25_000 * (index + 1), 0, count, 1.0) for index, count in enumerate(cells)]
-            write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
+            rows = [(25_000 * (index + 1), 0, count) for index, count in enumerate(cells)]
+            write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells"), rows)
     assert report.main([str(tmp_path)]) == 0
     header, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Cells of the true state")
     assert header[3:] == ["at 25,000", "at 50,000", "at 75,000", "at 100,000", "/ baseline"]
@@ -154,8 +154,8 @@ def test_arm_that_counted_less_often_keeps_its_columns(shorter: str, tmp_path: P
     write_grid(tmp_path, seeds=1, methods={"cure": {}, "random": {}}, baseline="random")
     for method in ("cure", "random"):
         cell = write_cell(tmp_path, TASK, method, 0, curve(0, 0))
-        rows = [(steps, 0, steps // 100, 1.0) for steps in (25_000, 50_000, 75_000)[: 2 if method == shorter else 3]]
-        write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells", "entropy_bits"), rows)
+        rows = [(steps, 0, steps // 100) for steps in (25_000, 50_000, 75_000)[: 2 if method == shorter else 3]]
+        write_csv(cell / "coverage.csv", ("environment_steps", "agent_steps", "cells"), rows)
     assert report.main([str(tmp_path)]) == 0
     header, *rows = rows_of(tmp_path / "table.md", "Cells of the true state")
     assert header[3:6] == ["at 25,000", "at 50,000", "at 75,000"]
@@ -170,8 +170,8 @@ def test_arms_without_returns_are_compared_by_cells_alone(tmp_path: Path) -> Non
     for method in ("cure", "other", "oracle"):
         returns = curve(0, 100) if method == "oracle" else dict.fromkeys(curve(0, 0), "")
         cell = write_cell(tmp_path, TASK, method, 0, returns, arguments={**CURE, "task": method == "oracle"})
-        columns = ("environment_steps", "agent_steps", "cells", "entropy_bits")
-        write_csv(cell / "coverage.csv", columns, [(100_000, 0, 10, 1.0)])
+        columns = ("environment_steps", "agent_steps", "cells")
+        write_csv(cell / "coverage.csv", columns, [(100_000, 0, 10)])
     assert report.main([str(tmp_path)]) == 0
     text = (tmp_path / "table.md").read_text()
     assert "times the cells of cure" in text and "nothing to compare" not in text
@@ -314,7 +314,7 @@ def test_visitation_tables(results: Path) -> None:
     assert by_key["mean image", "curious"][4] == "1.00 [1.00, 1.00]"
     random, curious = rows_of(results / "visitation" / "table.md", "Coverage of the true state space")[1:]
     assert (random[2], curious[2], random[4], curious[4]) == ("random", "curious", "200", "200")
-    assert float(curious[6].split()[0]) > 1.1 and float(curious[8]) > float(random[8])
+    assert float(curious[6].split()[0]) > 1.1
     assert "4.00 \\[4.00, 4.00\\] times the SRL error under the own head" in (results / "summary.md").read_text()
 
 
@@ -322,8 +322,8 @@ def test_conditions_and_plots(results: Path) -> None:
     """Seeds that were run alike share a row; a pair whose arms were not is named; pretraining is told."""
     _, row, *_ = rows_of(results / "curves" / "table.md", "Run conditions")
     machine = ["cpu", "bf16", "x86_64, 2 threads, AVX512"]
-    none = "\N{EN DASH}"
-    assert row[2:] == ["0, 1", "100,000", none, "1.0 h, 1.0 h", f"{none}, {none}", *machine, "A", "abc1234", "1"]
+    none, hour = "\N{EN DASH}", "1 h 00 min"
+    assert row[2:] == ["0, 1", "100,000", none, f"{hour}, {hour}", f"{none}, {none}", *machine, "A", "abc1234", "1"]
     text = (results / "curves" / "table.md").read_text()
     assert "Versions A: sb3\\_cure 0.1.0, torch 2.13.0." in text and "different commits" not in text
     rows = rows_of(results / "pretraining" / "table.md", "Run conditions")[1:]
