@@ -230,10 +230,10 @@ def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
 
     :param experiment: An experiment
     :param thresholds: Returns
-    :return: The table; without rows for a return that no arm reaches on a task
+    :return: The table; without rows for a return that no arm reaches on a task, or above that which ends a cell
     """
-    rows = []
-    for task, limit in itertools.product(experiment.tasks, thresholds):
+    rows, end = [], experiment.grid.get("stop_at_return") or math.inf
+    for task, limit in itertools.product(experiment.tasks, [each for each in thresholds if each <= end]):
         arms = {arm: statistics.summarise_arm(experiment, task, arm, [limit]) for arm in experiment.methods}
         if not any(np.isfinite(arm.reached[limit]).any() for arm in arms.values()):
             continue
