@@ -353,7 +353,7 @@ def write_report(
     :raises UsageError: with one sentence, if the results cannot be read
     """
     sections = [describe(experiment, thresholds, media) for experiment in read_results(results)]
-    facts = {"title": results.resolve().name, "sections": sections, "media": media}
+    facts = {"title": results.resolve().name, "sections": sections, "results": results, "media": media}
     facts |= {"version": sb3_cure.__version__, "now": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")}
     texts = {
         out: tables.render("report.html.j2", **facts),
@@ -362,7 +362,7 @@ def write_report(
     files = {path: text.encode() for path, text in texts.items()}
     for section in sections:
         folder = section.experiment.folder
-        text = tables.render("experiment.md.j2", section=section, level=1, plots_beside=True)
+        text = tables.render("experiment.md.j2", section=section)
         files[folder / "table.md"] = text.encode()
         files |= {folder / part.name: part.content for part in section.parts if isinstance(part, Figure)}
     for path, content in files.items():

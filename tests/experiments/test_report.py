@@ -291,16 +291,17 @@ def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
 def test_overview_comes_first(results: Path) -> None:
     """What was run, and what it says, before any experiment: in the page with links, in the summary as a table."""
     summary = (results / "summary.md").read_text()
-    rows = [line.replace("\\", "").split(" | ") for line in summary.split("\n## ")[0].splitlines() if "| " in line][1:]
+    rows = [line.replace("\\", "").split(" | ") for line in summary.splitlines() if "| " in line][1:]
+    done = {"curves": "4 of 8", "later": "0 of 4", "pretraining": "2 of 3", "visitation": "3 of 3"}
     assert [(row[0].strip("| "), row[1]) for row in rows] == [
-        ("curves", "4 of 8"), ("later", "0 of 4"), ("pretraining", "2 of 3"), ("visitation", "3 of 3"),
-    ]  # fmt: skip
+        (f"[{name}]({name}/table.md)", count) for name, count in done.items()
+    ]
     assert rows[0][2].startswith("cure_sac_ae minus sac_ae: area under the curve 75.0")
     assert rows[1][2].startswith("Not run")
     assert rows[3][2].startswith("cure_only on cartpole-swingup, 3 seeds: compared to the random policy")
     page = (results / "report.html").read_text().split("<section>")[0]
-    for index, (name, done, *_) in enumerate(rows):
-        assert f'<a href="#e{index}">{name.strip("| ")}</a></td><td>{done}</td>' in page
+    for index, (name, count) in enumerate(done.items()):
+        assert f'<a href="#e{index}">{name}</a></td><td>{count}</td>' in page
 
 
 def test_unfinished_cells_enter_nothing(results: Path) -> None:
@@ -374,6 +375,9 @@ def test_names_are_text_only(tmp_path: Path) -> None:
         text = path.read_text()
         assert "<" not in text and not re.search(r"(?<!\\)\]\(b\)", text)
         lines = [line for line in text.splitlines() if line.startswith("|")]
+        if path.name == "summary.md":
+            assert len(lines) == 3
+            continue
         header = next(line for line in lines if "area under curve" in line)
         first = lines.index(header)
         rows = lines[first : first + 4]
