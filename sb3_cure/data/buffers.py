@@ -344,7 +344,10 @@ def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
     :param buffer: SB3's ``ReplayBuffer``, ``DictReplayBuffer`` or a ``FrameStackReplayBuffer``
     :return: Rows, environments and ages (in rows), newest first, [n] each
     """
-    ages, env_inds = np.divmod(np.arange(buffer.size() * buffer.n_envs), buffer.n_envs)
+    size = buffer.size()
+    if buffer.full and buffer.optimize_memory_usage and not isinstance(buffer, FrameStackReplayBuffer):
+        size -= 1  # the oldest one's observation is the newest one's successor now
+    ages, env_inds = np.divmod(np.arange(size * buffer.n_envs), buffer.n_envs)
     return (buffer.pos - 1 - ages) % buffer.buffer_size, env_inds, ages
 
 

@@ -29,6 +29,7 @@ from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_json
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
+from sb3_cure.persistence.files import locked
 
 #: Seed of evaluations, which start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
@@ -361,17 +362,12 @@ def alone_in(folder: Path, wait: bool = False) -> Iterator[None]:
     :param wait: Whether to wait for another process that holds it
     :raises CellIsRunning: if another process holds it
     """
-    lock = filelock.FileLock(folder / ".lock")
-    try:
-        lock.acquire(timeout=-1 if wait else 1)  # not 0: `is_held` holds it for a moment, too
-    except filelock.Timeout:
-        raise CellIsRunning(f"{folder} is being run by another process: wait, or choose another --out.") from None
-    except OSError as error:
-        print(f"{folder} cannot be locked ({error.strerror}): make sure that no other process runs this cell.")
-    try:
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder, -1 if wait else 1))  # not 0: `is_held` holds it for a moment, too
+        except filelock.Timeout:
+            raise CellIsRunning(f"{folder} is being run by another process: wait, or choose another --out.") from None
         yield
-    finally:
-        lock.release()
 
 
 def is_held(folder: Path) -> bool:

@@ -297,6 +297,7 @@ class SavesModels(OffPolicyAlgorithm):
 
 def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
     """Give moments the strides of their parameters: fused Adam steps both in the order of memory."""
+    has_moments = isinstance(optimizer, th.optim.Adam) or any(group.get("fused") for group in optimizer.param_groups)
     for parameter, state in optimizer.state.items():
         for key, value in state.items():
             if not isinstance(value, th.Tensor):
@@ -305,8 +306,9 @@ def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
                 state[key] = value.clone()  # fused steps count in place, and it may be another model's
                 continue
             if value.shape != parameter.shape:
-                if not optimizer.defaults.get("fused"):
-                    continue  # as of Adafactor, which keeps sums of rows and columns
+                if not has_moments:  # as Adafactor, which keeps sums of rows and columns
+                    state[key] = value.clone()
+                    continue
                 optimizer.state.clear()  # a fused step would write beyond them
                 raise ArchiveError(
                     f"an optimiser got {key:.20} of shape {tuple(value.shape)!s:.50} for a parameter of shape "

@@ -25,12 +25,17 @@ def nested_callbacks(callback: BaseCallback) -> list[BaseCallback]:
     :param callback: A callback
     :return: All callbacks, each once, in a fixed order
     """
-    found, waiting = {id(callback): callback}, [callback]
-    while waiting:
-        values = [value for name, value in vars(waiting.pop(0)).items() if name != "parent"]
-        new = {id(child): child for value in values for child in _callbacks_in(value) if id(child) not in found}
-        found |= new
-        waiting += new.values()
+    found: dict[int, BaseCallback] = {}
+
+    def visit(each: BaseCallback) -> None:
+        if id(each) in found:
+            return
+        found[id(each)] = each
+        for name, value in vars(each).items():
+            for child in _callbacks_in(value) if name != "parent" else []:
+                visit(child)
+
+    visit(callback)
     return list(found.values())
 
 

@@ -5,7 +5,6 @@ import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import filelock
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -14,12 +13,14 @@ from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.data.frame_ring import FrameRing
 from sb3_cure.persistence.encoding import read_state, write_state
 from sb3_cure.persistence.env_state import saved_error
-from sb3_cure.persistence.files import flush_to_disk
+from sb3_cure.persistence.files import flush_to_disk, locked
 from sb3_cure.persistence.generations import CheckpointError, Generations
 from sb3_cure.persistence.replay_buffers import buffer_from_state
 from sb3_cure.persistence.resume import Run, training_state
 
 MODEL, STATE = "model.zip", "state.safetensors"
+#: How long a checkpoint waits for one that another process writes
+LOCK_SECONDS = 300
 
 
 class _Segment(NamedTuple):
@@ -57,7 +58,7 @@ class CheckpointWriter:
         buffer: Any = model.replay_buffer
         segments: dict[str, list[_Segment]] = {}
         # Of two trainings in this folder, which is refused, neither removes what the other is about to write.
-        with filelock.FileLock(self.generations.path / ".lock"), self.generations.writing(keep) as draft:
+        with locked(self.generations.path, LOCK_SECONDS), self.generations.writing(keep) as draft:
             model.save(draft.folder / MODEL)
             for place, (key, ring) in enumerate(buffer.rings.items()):
                 segments[key] = self._write_frames(ring, buffer.counts[key], key, f"{place}-{draft.number:06d}")

@@ -5,10 +5,12 @@ import io
 import os
 import platform
 import threading
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias, cast
 
+import filelock
 from stable_baselines3.common.save_util import open_path
 
 PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
@@ -45,6 +47,27 @@ def flush_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, seconds: float) -> Iterator[None]:
+    """Hold a folder's lock, which ends with the process. Where the file system has no locks, a warning says so.
+
+    :param folder: A folder that exists
+    :param seconds: How long to wait for another process that holds it; -1: for ever
+    :raises filelock.Timeout: (an ``OSError``) if it holds it still
+    """
+    lock = filelock.FileLock(folder / ".lock")
+    try:
+        lock.acquire(timeout=seconds)
+    except filelock.Timeout:
+        raise
+    except (OSError, NotImplementedError) as error:
+        warnings.warn(f"{folder} cannot be locked ({error}): make sure that nobody else writes there.", stacklevel=4)
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ Layout::
         generation-000003/     one checkpoint: its own files, and SHA256SUMS, which lists all files that it needs
         generation-000004/
         segments/              files that several generations share and that are never changed
+        .lock                  held while one is written
 
 A generation is written under another name, flushed to the disk file by file, and renamed when all of it is there. It is
 whole if its files have the checksums of ``SHA256SUMS`` (which ``sha256sum -c`` understands).

@@ -512,5 +512,6 @@ def test_transitions_of_sb3s_compact_buffer_are_those_it_samples() -> None:
     for step in range(7):
         now, then = (np.full((1, 1), value, np.float32) for value in (step, step + 1))
         buffer.add(now, then, now, np.ones(1), np.zeros(1), [{}])
-    rows = np.array([4, 0, 1])
-    assert_equal(transitions(buffer, rows, np.zeros(3, int)), buffer._get_samples(rows))
+    rows, env_inds, _ = stored_places(buffer)
+    assert rows.tolist() == [1, 0, 4, 3]  # and not 2, where the newest one's successor is
+    assert_equal(transitions(buffer, rows, env_inds), buffer._get_samples(rows))

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import filelock
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -459,12 +460,20 @@ def test_callbacks_continue_from_the_checkpoint(place: str, tmp_path: Path) -> N
 
 
 def test_callbacks_may_know_each_other(tmp_path: Path) -> None:
-    best, other = Best(), Best("other")
-    best.other, other.other = other, best  # type: ignore[attr-defined]
+    """Each is kept once."""
+
+    def pair() -> tuple[Best, Best]:
+        best, other = Best(), Best("other")
+        best.other, other.other = other, best  # type: ignore[attr-defined]
+        return best, other
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        tiny_model("MlpPolicy", vectors()).learn(30, callback=[best, ExactCheckpoint(10, tmp_path), other])
-    assert best._best == other._best == 30
+        with pytest.raises(Killed):
+            tiny_model("MlpPolicy", vectors()).learn(30, callback=[*pair(), ExactCheckpoint(10, tmp_path), KillAt(25)])
+        best, other = pair()
+        CuReSAC.resume(tmp_path, vectors()).learn(30, callback=[best, other, ExactCheckpoint(10, tmp_path)])
+    assert len(best._history) == len(other._history) == 30
 
 
 def test_evaluations_continue(tmp_path: Path) -> None:
@@ -555,10 +564,15 @@ def test_random_streams_are_those_after_deferred_updates(tmp_path: Path, monkeyp
 
 def test_two_trainings_do_not_write_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A requeued job may begin while the former one ends: the second writer waits, and is refused."""
-    first = interrupted(tmp_path)
-    second = CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
+    first, second = interrupted(tmp_path), CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
+    tries = threading.Event()
     refused: list[Exception] = []
-    save = CuReSAC.save
+    save, write = CuReSAC.save, CheckpointWriter.write
+
+    def note_write(self: CheckpointWriter, model: Any, *args: Any) -> Any:
+        if model is second:
+            tries.set()
+        return write(self, model, *args)
 
     def write_another() -> None:
         try:
@@ -566,21 +580,37 @@ def test_two_trainings_do_not_write_at_once(tmp_path: Path, monkeypatch: pytest.
         except CheckpointError as error:
             refused.append(error)
 
-    thread = threading.Thread(target=write_another)
+    thread = threading.Thread(target=write_another, daemon=True)
 
     def slow_save(model: CuReSAC, path: Path) -> None:
-        if not thread.ident:
+        if model is first and not thread.ident:
             thread.start()
-            time.sleep(1)
+            assert tries.wait(60)
+            thread.join(0.5)
+            assert thread.is_alive(), "it waits"
         save(model, path)
 
     monkeypatch.setattr(CuReSAC, "save", slow_save)
+    monkeypatch.setattr(CheckpointWriter, "write", note_write)
     first.learn(40, callback=ExactCheckpoint(10, tmp_path))
-    thread.join()
+    thread.join(60)
     assert "another training writes checkpoints" in str(refused)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # every generation is whole
         assert CuReSAC.resume(tmp_path, VectorBox(), device="cpu").num_timesteps == 40
+
+
+@pytest.mark.parametrize("error", [OSError(95, "Operation not supported"), NotImplementedError("no flock")])
+def test_file_systems_without_locks_take_checkpoints(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
+    with pytest.warns(UserWarning, match="cannot be locked"):
+        train(CASES["vectors"], tmp_path)
+    assert CuReSAC.resume(tmp_path, vectors(), device="cpu").num_timesteps == 60
 
 
 def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
