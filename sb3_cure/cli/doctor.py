@@ -5,6 +5,7 @@ instead how often random actions meet a reward there, on which it depends whethe
 """
 
 import argparse
+import ast
 import re
 import time
 from collections import Counter, defaultdict
@@ -15,7 +16,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-import yaml
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from torch.utils import collect_env
@@ -177,10 +177,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--env", metavar="ID", help="show how often random actions meet a reward in this environment")
     parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="arguments of the environment")
     options = parser.parse_args(argv)
-    if options.env is None:
+    if options.env is None and not options.env_kwargs:
         return check_machine()
-    pairs = [each.partition(":") for each in options.env_kwargs]
-    return check_rewards(options.env, {key: yaml.safe_load(value) for key, _, value in pairs})
+    if options.env is None or not all(":" in pair for pair in options.env_kwargs):
+        parser.error("--env-kwargs takes KEY:VALUE of the environment that --env names")
+    return check_rewards(options.env, dict(map(_parse_pair, options.env_kwargs)))
+
+
+def _parse_pair(text: str) -> tuple[str, Any]:
+    """Read KEY:VALUE, where the value is Python's, or else text."""
+    key, _, value = text.partition(":")
+    try:
+        return key, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        return key, value
 
 
 def check_machine() -> int:

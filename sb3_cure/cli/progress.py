@@ -13,6 +13,8 @@ def time_text(seconds: float) -> str:
     :param seconds: Seconds
     :return: Such as ``"3 h 20 min"``
     """
+    if seconds < 59.5:
+        return f"{max(round(seconds), 1)} s"
     hours, minutes = divmod(max(round(seconds / 60), 1), 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
 

@@ -22,7 +22,6 @@ from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
@@ -40,6 +39,7 @@ from sb3_cure.cli.zoo_files import (
     read_yaml,
     zoo_file,
 )
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
@@ -72,6 +72,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``--conf-file fast/cure_sac_ae`` is one of the package's files;
     - an entry ``dmc_pixels:`` of a YAML file holds for the tasks of this namespace that have none of their own, and
       ``my_module:My-v0:`` for an environment that this module registers;
+    - in a file 1e-3 is a number, as in grids;
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
@@ -88,14 +89,15 @@ class ExperimentManager(exp_manager.ExperimentManager):
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
         self.config = str(zoo_file(self.config))
-        env_name = self.env_name
+        env_name, resolvers = self.env_name, yaml.SafeLoader.yaml_implicit_resolvers
         if self.config.endswith((".yml", ".yaml")):
             # rl-zoo3 looks for the environment's own id, then for "default".
             self.env_name = EnvironmentName(self._entry(read_yaml(Path(self.config))))
+        yaml.SafeLoader.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers  # rl-zoo3 reads by it
         try:
             return super().read_hyperparameters()
         finally:
-            self.env_name = env_name
+            self.env_name, yaml.SafeLoader.yaml_implicit_resolvers = env_name, resolvers
 
     def _entry(self, entries: dict[str, Any]) -> str:
         task = self.env_name.gym_id
@@ -148,7 +150,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             curiosity = self._hyperparams.get("curiosity", "separate")
             sampler = partial(sample_params, curiosity=curiosity, quantiles=self.algo == "cure_tqc")
             HYPERPARAMS_SAMPLER[self.algo] = sampler
-        self._n_ended, self._start = 0, time.monotonic()
+        self._start, self._first = time.monotonic(), 0
         try:
             super().hyperparameters_optimization()
         except ValueError as error:
@@ -157,6 +159,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             print(f"No trial was completed in {time_text(time.monotonic() - self._start)}.")
 
     def objective(self, trial: optuna.Trial) -> float:
+        self._first = self._first or trial.number + 1
         try:
             return super().objective(trial)
         except KeyboardInterrupt:  # which rl-zoo3 catches further out
@@ -164,13 +167,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
             print(f"Stopped: {kept if self.storage else 'without --storage no trial is kept for another call'}.")
             raise
         finally:
-            self._n_ended += 1
-            ended, planned = self._n_ended, self.n_trials or 0
-            if self.max_total_trials is not None:  # of all processes
-                ended, planned = trial.number + 1, self.max_total_trials
-            left = (time.monotonic() - self._start) / self._n_ended * (planned - ended)
+            # Of a study that several processes work on, those of all of them since this one began.
+            number, ended = trial.number + 1, trial.number + 2 - self._first
+            last = self.max_total_trials or self._first - 1 + (self.n_trials or 0)
+            left = (time.monotonic() - self._start) / ended * (last - number)
             if left > 0:
-                print(f"Trial {ended} of {planned} ended, about {time_text(left)} left", flush=True)
+                print(f"Trial {number} of {last} ended, about {time_text(left)} left", flush=True)
 
 
 def sample_params(
@@ -230,8 +232,6 @@ def register() -> None:
     for name in ALGORITHMS:
         HYPERPARAMS_CONVERTER[name] = convert_params
     rl_zoo3.train.ExperimentManager = ExperimentManager  # type: ignore[misc, attr-defined]
-    # In this program 1e-3 is a number for rl-zoo3's reader, too, as it is in grids.
-    yaml.SafeLoader.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers
 
 
 def train(arguments: Sequence[str]) -> None:
@@ -419,7 +419,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     return model, model.get_env(), path
 
 
-class _NoReplayBuffer(ReplayBuffer):
+class _NoReplayBuffer(FrameStackReplayBuffer):
     """Takes the place of the run's: nothing is stored, and its class may not be in the archive."""
 
     def __init__(self, *args: Any, **kwargs: Any):

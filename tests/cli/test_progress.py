@@ -17,6 +17,8 @@ def test_time_left_is_printed_at_the_speed_of_late(
     assert lines[1] == "mine: step 14 of 20, 0.1 steps/s, about 2 min left" and len(lines) == 5
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(5, "1 min"), (3599, "1 h 00 min"), (12_000, "3 h 20 min")])
-def test_time_is_rounded_to_minutes(seconds: float, text: str) -> None:
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0, "1 s"), (5, "5 s"), (59.7, "1 min"), (3599, "1 h 00 min"), (12_000, "3 h 20 min")]
+)
+def test_time_is_rounded(seconds: float, text: str) -> None:
     assert time_text(seconds) == text

@@ -158,6 +158,7 @@ def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
     assert main(["train", "--env", TASK, *flags]) == 0
     model = CuReSAC.load(f"logs/cure_sac/{RUN}_1/{RUN}.zip", device="cpu")
     assert (model.lr_schedule(1), model.num_timesteps) == (1e-3, 14)
+    assert yaml.safe_load("1e-3") == "1e-3", "that of others is as it was"
 
 
 def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
@@ -251,21 +252,28 @@ def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "trials", "told"),
     [
-        (dict(n_trials=3), "Trial 1 of 3 ended, about 2 min left"),
-        (dict(n_trials=500, max_total_trials=8), "Trial 5 of 8 ended, about 3 min left"),
+        (dict(n_trials=3), [0], "Trial 1 of 3 ended, about 2 min left"),
+        (dict(n_trials=3), [4, 5], "Trial 6 of 7 ended, about 30 s left"),  # a study that had four
+        (dict(n_trials=500, max_total_trials=8), [4], "Trial 5 of 8 ended, about 3 min left"),
+        (dict(n_trials=500, max_total_trials=8), [2, 5], "Trial 6 of 8 ended, about 30 s left"),
     ],
 )
 def test_trials_that_are_left_are_told(
-    numbers: dict[str, int], told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    numbers: dict[str, int],
+    trials: list[int],
+    told: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A minute each; with ``--max-total-trials`` other processes make some of them."""
+    """All of them have taken a minute; with ``--max-total-trials`` other processes make some."""
     manager = zoo.ExperimentManager(type("Arguments", (), {"gym_packages": []})(), "cure_sac", TASK, "logs", **numbers)
-    manager._n_ended, manager._start = 0, time.monotonic() - 60
+    manager._start, manager._first = time.monotonic() - 60, 0
     monkeypatch.setattr(zoo.exp_manager.ExperimentManager, "objective", lambda manager, trial: 0.0)
-    manager.objective(type("Trial", (), {"number": 4})())  # type: ignore[arg-type]
-    assert told in capsys.readouterr().out
+    for number in trials:
+        manager.objective(type("Trial", (), {"number": number})())  # type: ignore[arg-type]
+    assert capsys.readouterr().out.splitlines()[-1] == told
 
 
 # ----------------------------------------------------------------- replaying
@@ -305,10 +313,15 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(
-    "changes", [{"replay_buffer_kwargs": {"frame_stack": 1}}, {"replay_buffer_class": "heads_of_mine.Buffer"}]
+    "changes",
+    [
+        {"replay_buffer_kwargs": {"frame_stack": 1}},
+        {"replay_buffer_class": "heads_of_mine.Buffer"},
+        {"n_steps": 3},
+    ],
 )
 def test_agent_plays_whatever_buffer_it_had(changes: dict[str, Any], folder: Path) -> None:
-    """Its reward reads the newest frame, whose size is the buffer's to say."""
+    """Its reward reads the newest frame, whose size is the buffer's to say; returns of n steps are not needed."""
     train("--eval-freq", "-1", intrinsic="rnd", **changes)
     assert replay("enjoy", Path(f"logs/cure_sac/{RUN}_1")) == 0
 
