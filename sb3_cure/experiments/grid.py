@@ -409,7 +409,7 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
             steps = max(round(method.pretrain.budget * budget / file.budget), 1)
             method.pretrain = replace(method.pretrain, budget=steps)
     if file.coverage is not None:
-        at = [max(round(step * budget / file.budget), 1) for step in file.coverage.at]
+        at = sorted({max(round(step * budget / file.budget), 1) for step in file.coverage.at})
         file.coverage = replace(file.coverage, at=at)
     file.budget = budget
 

@@ -201,9 +201,10 @@ def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) ->
 def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
     """Whose error it is: the head's, or that of a reward which reconstructs what its own autoencoder sees."""
     arguments = next(iter(experiment.done(task, arm).values())).config["arguments"]
-    per_pixel = arguments.get("intrinsic_kwargs", {}).get("per_pixel")
-    own = "reconstruction" if arguments.get("intrinsic") == "reconstruction" else arguments.get("srl", "rae")
-    return f"{own}{', per pixel' if per_pixel else ''}"
+    options = arguments.get("intrinsic_kwargs", {})
+    rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
+    own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")
+    return f"{own}{', per pixel' if options.get('per_pixel') else ''}"
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:

@@ -72,7 +72,7 @@ def run_grid(
     lacking = {cell.task for cell in grid.cells if grid.kind == "visitation"} - {each.task for each in heads}
     for task in sorted(lacking):
         print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
-    return failed
+    return [unit for unit in failed if not unit.is_done(results)]  # by another process meanwhile
 
 
 def check_grid(grid: Grid, results: Path) -> None:
@@ -252,7 +252,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--seeds", type=_seed_choice, metavar="SEEDS", help=seeds)
     add("--tasks", type=_names, help="some of the grid's tasks: cartpole-swingup,finger-spin")
     add("--methods", type=_names, help="some of the grid's methods")
-    budget = "environment steps of training, for example 100k; those of pretraining change in proportion"
+    budget = "environment steps of training, such as 100k; those of pretraining and coverage change in proportion"
     add("--budget", type=_steps, help=budget)
     add("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
     add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
@@ -288,6 +288,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 130
     for unit in failed:
-        error = out / unit.folder / ERROR
-        print(f"{unit.folder} " + (f"failed, see {error}" if error.exists() else "is run by another process"))
+        folder = out / unit.folder
+        print(f"{unit.folder} " + ("is run by another process" if is_held(folder) else f"failed, see {folder / ERROR}"))
     return 1 if failed else 0

@@ -182,15 +182,22 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
 
 
 def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
-    """Cells of the true state that an arm reached in the end, over those of its baseline, see ``paired_ratio``.
+    """Cells of the true state that an arm reached, over those of its baseline, see ``paired_ratio``.
+
+    In each pair of seeds by the last step at which both were counted.
 
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
     :return: The ratio
     """
-    arms = method, experiment.baseline_of(method)
-    return paired_ratio(*(final_values(experiment, task, arm, "cells") for arm in arms))
+    ours, theirs = (
+        {seed: cell.curve("cells")[1] for seed, cell in experiment.done(task, arm).items()}
+        for arm in (method, experiment.baseline_of(method))
+    )
+    last = {seed: min(len(ours[seed]), len(theirs[seed])) - 1 for seed in ours.keys() & theirs.keys()}
+    counts = ({seed: float(arm[seed][end]) for seed, end in last.items() if end >= 0} for arm in (ours, theirs))
+    return paired_ratio(*counts)
 
 
 def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Estimate:

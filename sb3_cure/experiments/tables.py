@@ -366,15 +366,15 @@ def cells_reached_table(
     :param curves: By task and arm: environment steps [n], and cells reached until then [seeds, n]
     :return: The table
     """
-    steps = sorted({step for arms in curves.values() for own, _ in arms.values() for step in own.tolist()})
+    steps = max((own for arms in curves.values() for own, _ in arms.values()), key=len)
     shown = []
     for task, arms in curves.items():
-        for method, (own, cells) in arms.items():
+        for method, (_, cells) in arms.items():
             ratio = NONE
             if method != experiment.baseline_of(method):
                 ratio = ratio_text(statistics.cells_ratio(experiment, task, method))
-            by_step = dict(zip(own.tolist(), map(_mean_std, cells.T), strict=True))
-            shown.append([task, method, str(len(cells)), *(by_step.get(step, NONE) for step in steps), ratio])
+            numbers = [*map(_mean_std, cells.T), *[NONE] * (len(steps) - cells.shape[1])]  # of an arm that ended early
+            shown.append([task, method, str(len(cells)), *numbers, ratio])
     columns = "; ".join(["task; arm; >seeds", *(f">at {number_text(step)}" for step in steps), ">/ baseline"])
     return _table("Cells of the true state", columns, shown, render_text("cells_note", _baselines(experiment)))
 

@@ -71,7 +71,7 @@ def test_another_budget_scales_pretraining(tmp_path: Path, own: int, asked: int,
     unscaled = load_grid(path).description["methods"]
     assert all(unscaled[name].get("pretrain") == method.get("pretrain") for name, method in methods.items())
     counted = write_grid(tmp_path, budget=own, coverage=dict(widths=dict(place=1.0), at=[100, own]))
-    assert load_grid(counted, budget=asked).cells[0].coverage.at == [expected[1], asked]  # type: ignore[union-attr]
+    assert load_grid(counted, budget=asked).cells[0].coverage.at == sorted({expected[1], asked})  # type: ignore[union-attr]
 
 
 def test_most_specific_zoo_entry_counts(tmp_path: Path) -> None:

@@ -169,6 +169,7 @@ def test_arm_that_counted_less_often_keeps_its_columns(shorter: str, tmp_path: P
     assert report.main([str(tmp_path)]) == 0
     header, *rows = rows_of(tmp_path / "table.md", "Cells of the true state")
     assert header[3:6] == ["at 25,000", "at 50,000", "at 75,000"]
+    assert {row[1]: row[6] for row in rows}["cure"] == "1.00 (one seed)"  # after 50 000 steps, which both have
     found = {row[1]: row[3:6] for row in rows}
     assert found.pop(shorter) == ["250", "500", NONE]
     assert list(found.values()) == [["250", "500", "750"]]

@@ -62,7 +62,9 @@ def test_failing_cell_does_not_stop_the_others(
     assert capsys.readouterr().out.count(": done") == 2
 
 
-def test_cell_of_another_process_is_not_done(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_cell_of_another_process_is_not_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
     """The status says so, as a job that waits for it would begin too early; nothing is written into its folder."""
     path, out = write_grid(tmp_path, **QUICK), tmp_path / "out"
     command = [str(path), "--out", str(out), "--no-pictures"]
@@ -72,6 +74,13 @@ def test_cell_of_another_process_is_not_done(tmp_path: Path, capsys: pytest.Capt
         assert run.main(command) == 1
     assert "seed0 is run by another process" in capsys.readouterr().out
     assert [file.name for file in folder.iterdir()] == [".lock"]
+
+    def run_elsewhere(cell: Any, results: Path, *args: Any) -> None:
+        (folder / "DONE").touch()
+        raise cells.CellIsRunning("is being run")
+
+    monkeypatch.setattr(run, "run_cell", run_elsewhere)
+    assert run.main(command) == 0, "it is done by now"
 
 
 def test_checkpoint_of_a_finished_cell_is_removed(tmp_path: Path) -> None:
