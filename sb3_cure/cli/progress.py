@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -31,19 +30,6 @@ class TimeLeft(BaseCallback):
         super().__init__()
         self.label, self.seconds, self.best_return = name, seconds, best_return
         self._last_time, self._last_step = 0.0, 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Get the state of this callback, which is none: a resumed training has another clock.
-
-        :return: An empty dictionary
-        """
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take back the state, which is none.
-
-        :param state: Result of ``state_dict``
-        """
 
     def _on_training_start(self) -> None:
         self._last_time, self._last_step = time.monotonic(), self.num_timesteps

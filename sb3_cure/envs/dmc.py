@@ -1,6 +1,5 @@
 """DeepMind Control tasks as Gymnasium environments that are seen through pixels."""
 
-import difflib
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from sb3_cure.envs.backgrounds import Background, Seed
 from sb3_cure.envs.physics import Proprioception
-from sb3_cure.envs.registration import DMC_TASKS, ENTRY_POINT, dmc_env_id
+from sb3_cure.envs.registration import ENTRY_POINT, dmc_env_id
 from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, StackFrames, at_least_one, to_image
 
 # PlaNet's (Hafner et al., 2019), which SAC-AE, CURL and DrQ use too; 4 for all other domains.
@@ -196,17 +195,11 @@ def make_dmc_env(
         of objects and targets nor where the robot is (see :class:`~sb3_cure.envs.physics.Proprioception`)
     :return: The environment; ``get_wrapper_attr`` finds its ``image_size``, ``frame_stack``, ``action_repeat`` and
         ``renderer``
-    :raises ValueError: If there is no such task or an argument is out of range
+    :raises ValueError: If an argument is out of range
+    :raises gymnasium.error.UnregisteredEnv: If there is no such task (``sb3_cure.envs.DMC_TASKS`` has all)
     :raises GLUnavailableError: If OpenGL is missing
     """
     arguments = dict(locals())
-    if task not in DMC_TASKS.get(domain, ()):
-        known = [f"{each}-{its_task}" for each, tasks in DMC_TASKS.items() for its_task in tasks]
-        close = ", ".join(difflib.get_close_matches(f"{domain}-{task}", known, cutoff=0.0))
-        raise ValueError(
-            f"'{domain}-{task}' is not a task of the DeepMind Control suite; the closest are {close} "
-            "(sb3_cure.envs.DMC_TASKS has all)."
-        )
     if renderer not in RENDER_FLAGS:
         raise ValueError(f"renderer must be 'dmc', or 'fast' for no shadows and reflections, not {renderer!r}.")
     if render_mode not in (None, "rgb_array"):

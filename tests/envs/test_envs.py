@@ -462,7 +462,6 @@ def test_workers_give_the_same_stream():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"domain": "cartpol"}, "'cartpol-swingup' is not .*cartpole-swingup"),
         ({"image_size": 84.0}, "image_size must be an integer of at least 1, not 84.0"),
         ({"frame_stack": True}, "frame_stack must be an integer"),
         ({"action_repeat": 0}, "action_repeat must be an integer"),
