@@ -302,13 +302,11 @@ def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
         for key, value in state.items():
             if not isinstance(value, th.Tensor):
                 continue
-            if key in _COUNTS and value.dim() == 0:
-                state[key] = value.clone()  # fused steps count in place, and it may be another model's
+            is_count, fits = key in _COUNTS and value.dim() == 0, value.shape == parameter.shape
+            if is_count or not (fits or has_moments):  # the latter as Adafactor's sums of rows and columns
+                state[key] = value.clone()  # steps change it in place, and it may be another model's
                 continue
-            if value.shape != parameter.shape:
-                if not has_moments:  # as Adafactor, which keeps sums of rows and columns
-                    state[key] = value.clone()
-                    continue
+            if not fits:
                 optimizer.state.clear()  # a fused step would write beyond them
                 raise ArchiveError(
                     f"an optimiser got {key:.20} of shape {tuple(value.shape)!s:.50} for a parameter of shape "
