@@ -18,7 +18,7 @@ class RewardInputs:
     """What an intrinsic reward may read in one update; latents are computed when they are first read.
 
     :param batch: The true transitions
-    :param judge: Returns the SRL error of each sample; None unless the reward says ``needs_srl``
+    :param srl_error: Returns the SRL error of each sample; None unless the reward says ``needs_srl``
     :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
     :param replay_buffer: The replay buffer, which has just drawn the batch
     :param look_up: Returns stored transitions by rows and environments, [n] each
@@ -28,7 +28,7 @@ class RewardInputs:
     def __init__(
         self,
         batch: Samples,
-        judge: Callable[[], th.Tensor] | None,
+        srl_error: Callable[[], th.Tensor] | None,
         read: Callable[[str], th.Tensor],
         replay_buffer: ReplayBuffer,
         look_up: Callable[[np.ndarray, np.ndarray], Samples],
@@ -36,14 +36,14 @@ class RewardInputs:
     ):
         self.batch = batch
         self.replay_buffer, self.look_up, self.encode = replay_buffer, look_up, encode
-        self._judge, self._read = judge, read
+        self._srl_error, self._read = srl_error, read
 
     @cached_property
     def srl_error(self) -> th.Tensor:
         """SRL error of each sample, before the head's step, detached, [B]; only for rewards that say ``needs_srl``."""
-        if self._judge is None:
+        if self._srl_error is None:
             raise ValueError("inputs.srl_error is for rewards that set needs_srl = True.")
-        return self._judge()
+        return self._srl_error()
 
     @cached_property
     def latents(self) -> th.Tensor:
@@ -211,7 +211,7 @@ class RewardScale(nn.Module):
             least = 1e-6 * reward.square().mean()
             reward = reward - reward.mean() if center else reward
             move_average(self.variance, self.weight, th.maximum(reward.square().mean(), least), self.decay)
-            # NaN until the first finite batch: rewards that are not finite reach no critic.
             deviation = (self.variance / self.weight).sqrt() + 1e-8
-            reward = (reward / deviation).clamp(-self.clip, self.clip)
+            # Infinite rewards become NaN, which the check of losses finds, and not the clip's largest.
+            reward = (reward / deviation).clamp(-self.clip, self.clip) + 0 * reward
         return beta * reward.unsqueeze(1)

@@ -110,6 +110,10 @@ def test_the_agents_reward_is_centred_the_bonus_is_not(curiosity: str, centred: 
 
 
 @pytest.mark.parametrize("center", [True, False])
-def test_first_rewards_that_are_not_finite_stay_so(center: bool) -> None:
+@pytest.mark.parametrize("batches_before", [0, 1])
+def test_rewards_that_are_not_finite_stay_so(batches_before: int, center: bool) -> None:
     """Clipped they would pass for rewards, and the look at the critics' loss would see nothing."""
-    assert not np.isfinite(scaled(RewardScale(), np.float32([1.0, np.inf]), center=center)).any()
+    scale = RewardScale()
+    for _ in range(batches_before):
+        scaled(scale, np.float32([1.0, 2.0]), center=center)
+    assert not np.isfinite(scaled(scale, np.float32([1.0, np.inf]), center=center)[1])
