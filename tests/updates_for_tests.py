@@ -57,7 +57,7 @@ def train_once(model: CuReSAC, srl: bool = True, rl: bool = True, actors: bool =
     :param actors: Whether actors and temperatures follow their critics
     :return: What was logged
     """
-    model._phase = lambda: (srl and model.srl is not None, rl)  # type: ignore[method-assign]
+    model._plan = lambda: (srl and model.srl is not None, rl, 1)  # type: ignore[method-assign]
     model._n_rl_batches = 0 if actors else 1
     np.random.seed(1)
     th.manual_seed(1)

@@ -55,8 +55,8 @@ class CuReBase(OffPolicyAlgorithm):
     :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
         gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
     :param srl_period: Gradient steps per phase when alternating
-    :param srl_interval: Updates between two of head and encoder by the SRL loss; each of them in the burst, and where
-        nothing else is learned
+    :param srl_interval: Updates between two of head and encoder by the SRL loss; each of them in the burst, where
+        nothing else is learned, and when alternating
     :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
         novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
@@ -80,8 +80,9 @@ class CuReBase(OffPolicyAlgorithm):
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
-    :param warmup_updates: Updates in one burst after ``learning_starts``; None: what the head wants (RAE: 1000), or 0
-        where there is no warm-up. In each of them actors, temperatures and targets are updated, as in SAC-AE's code
+    :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: what the head wants (RAE:
+        1000), or 0 where there is no warm-up. In each of them actors, temperatures and targets are updated, as in
+        SAC-AE's code
     :param actor_update_interval: Updates of critics between two of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder

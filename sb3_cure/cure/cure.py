@@ -36,7 +36,7 @@ class CuRe(CuReBase):
     Ulmer and Triebel), Algorithm 1. Arguments are described at ``CuReBase``.
     """
 
-    # ---------------------------------------------- acting: lines 2 to 7 of Algorithm 1
+    # ---------------------------------------------- acting: lines 2 to 8 of Algorithm 1
 
     def predict_curious(
         self,
@@ -111,7 +111,7 @@ class CuRe(CuReBase):
                 self._in_burst = False
         self._warmed_up = True
 
-    # -------------------------------------------- learning: lines 8 to 12 of Algorithm 1
+    # -------------------------------------------- learning: lines 9 to 12 of Algorithm 1
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update now or, with ``overlap=True`` in ``learn``, while the environments make their next step.
@@ -131,8 +131,8 @@ class CuRe(CuReBase):
         self.policy.set_learning_rate(learning_rate, self.ent_coef_lr_factor)
         metrics = []
         for _ in range(gradient_steps):
-            learns_srl, learns_rl = self._phase()
-            for _ in range(2 if self._alternates else 1):
+            learns_srl, learns_rl, n_batches = self._plan()
+            for _ in range(n_batches):
                 batch = self._sample_batch(batch_size, learns_rl)
                 self._guard.update = self._n_updates
                 with crash_report(self, batch), compute_in(self.policy, self._computed_precision):
@@ -157,26 +157,20 @@ class CuRe(CuReBase):
             batch = batch._replace(n_step=buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env))
         return batch
 
-    @property
-    def _learns(self) -> tuple[bool, bool]:
-        """Whether there is a representation to train, and whether there are actors and critics."""
-        trains_srl = self.srl is not None and not self.policy.representation_frozen
-        return trains_srl, self.task or self._has_curious_agent
+    def _plan(self) -> tuple[bool, bool, int]:
+        """Whether the next update trains the representation, whether actors and critics, and its number of batches."""
+        learns_srl = self.srl is not None and not self.policy.representation_frozen
+        learns_rl = self.task or self._has_curious_agent
+        if not (learns_srl and learns_rl):
+            return learns_srl, learns_rl, 1
+        if self.srl_schedule == "simultaneous":
+            return self._is_due(self._n_updates, self.srl_interval), True, 1
+        srl_phase = self._n_updates // self.srl_period % 2 == 0
+        return srl_phase, not srl_phase, 2
 
-    @property
-    def _alternates(self) -> bool:
-        """Whether SRL and RL take turns, which takes one of each."""
-        return self.srl_schedule == "alternating" and all(self._learns)
-
-    def _phase(self) -> tuple[bool, bool]:
-        """Whether the next update trains the representation, and whether it trains actors and critics."""
-        learns_srl, learns_rl = self._learns
-        if learns_rl and not self._in_burst:
-            learns_srl = learns_srl and self._n_updates % self.srl_interval == 0
-        if not self._alternates:
-            return learns_srl, learns_rl
-        srl_phase = bool(self._n_updates // self.srl_period % 2 == 0)  # the period may be a number of NumPy
-        return learns_srl and srl_phase, not srl_phase
+    def _is_due(self, n_before: int, interval: int) -> bool:
+        """Whether something that is done once per interval is done now; in the burst everything is."""
+        return self._in_burst or n_before % interval == 0
 
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
         """UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1 on one batch."""
@@ -188,17 +182,18 @@ class CuRe(CuReBase):
         self._metrics = {}
         learners = self._learners() if learns_rl else {}
         srl = self._srl_loss(batch) if learns_srl else None
-        reward = policy.intrinsic if "curious" in learners or (learners and self.curiosity == "bonus") else None
+        rewarded = "task" if self.curiosity == "bonus" else "curious"
         # Of head and encoder before their steps
-        curious_rewards = None if reward is None else self._curious_rewards(batch, srl)
+        rewards = self._intrinsic_rewards(batch, srl) if rewarded in learners else None
         if srl is not None:
-            if reward is not None and reward.trains_encoder and self.update == "sequential":
+            reward: Any = policy.intrinsic
+            if rewards is not None and reward.trains_encoder and self.update == "sequential":
                 srl = self._srl_loss(batch)  # of the encoder as the reward's loss has left it
             self._update_srl(srl.loss)
         if "task" in learners:
-            self._update_task(batch, learners["task"], curious_rewards if self.curiosity == "bonus" else None)
+            self._update_task(batch, learners["task"], rewards if rewarded == "task" else None)
         if "curious" in learners:
-            self._update_curious(batch, learners["curious"], curious_rewards)
+            self._update_curious(batch, learners["curious"], rewards)
         encoder.finish()
         self._update_targets(learners)
         return self._metrics | encoder.metrics
@@ -216,11 +211,11 @@ class CuRe(CuReBase):
 
     def _learners(self) -> dict[str, int]:
         """Agents that learn from this batch, and how many batches each of them has learned from before."""
-        learners, interval = {}, 1 if self._in_burst else self.curious_interval
+        learners = {}
         if self.task:
             learners["task"] = self._n_rl_batches
-        if self._has_curious_agent and self._n_rl_batches % interval == 0:
-            learners["curious"] = self._n_rl_batches // interval
+        if self._has_curious_agent and self._is_due(self._n_rl_batches, self.curious_interval):
+            learners["curious"] = self._n_rl_batches // self.curious_interval
         return learners
 
     def _srl_loss(self, batch: Samples, learns: bool = True) -> SRLOutput:
@@ -240,7 +235,7 @@ class CuRe(CuReBase):
         self._note({"srl_loss": loss, "srl_error": error.mean(), "latent_variance": variance})
         return SRLOutput(loss.float(), error.float())
 
-    def _judged_error(self, batch: Samples, srl_output: SRLOutput | None) -> th.Tensor:
+    def _srl_error(self, batch: Samples, srl_output: SRLOutput | None) -> th.Tensor:
         """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
         srl: Any = self.policy.srl
         if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
@@ -264,7 +259,7 @@ class CuRe(CuReBase):
             )
         srl.after_step()
 
-    def _curious_rewards(self, batch: Samples, srl: SRLOutput | None) -> th.Tensor:
+    def _intrinsic_rewards(self, batch: Samples, srl: SRLOutput | None) -> th.Tensor:
         """Scaled intrinsic reward of this batch, [B, 1], never stored, so never stale; and the step of its own loss."""
         reward: Any = self.policy.intrinsic
         loss, raw = reward.loss(self._reward_inputs(batch, srl))
@@ -285,9 +280,9 @@ class CuRe(CuReBase):
 
     def _update_task(self, batch: Samples, n_before: int, bonus: th.Tensor | None) -> None:
         """UpdateTaskAC, with returns of one step or of several."""
-        n_step = batch.n_step or batch
-        rewards = n_step.rewards if bonus is None else n_step.rewards + bonus
-        discounts = (1 - n_step.dones) * (self.gamma if n_step.discounts is None else n_step.discounts)
+        returns = batch.n_step or batch
+        rewards = returns.rewards if bonus is None else returns.rewards + bonus
+        discounts = (1 - returns.dones) * (self.gamma if returns.discounts is None else returns.discounts)
         next_view = "next_observations" if batch.n_step is None else "n_step"
         self._update_actor_critic("task", n_before, batch.actions, rewards, discounts, next_view)
 
@@ -323,7 +318,7 @@ class CuRe(CuReBase):
         critic_loss = agent.critic.loss(encoder.latents(name), actions, target)
         self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
         self._note({f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()})
-        if self._in_burst or n_before % self.actor_update_interval == 0:
+        if self._is_due(n_before, self.actor_update_interval):
             self._update_actor(name, agent)
 
     def _update_actor(self, name: str, agent: ActorCritic) -> None:
@@ -341,11 +336,11 @@ class CuRe(CuReBase):
 
     def _update_targets(self, learners: dict[str, int]) -> None:
         """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
-        policy, interval = self.policy, 1 if self._in_burst else self.target_update_interval
-        if self._n_batches % interval == 0:
+        policy = self.policy
+        if self._is_due(self._n_batches, self.target_update_interval):
             _polyak_step(policy.encoder, policy.encoder_target, self.encoder_tau)
         for name, n_before in learners.items():
-            if n_before % interval == 0:
+            if self._is_due(n_before, self.target_update_interval):
                 _polyak_step(policy.agents[name].critic, policy.agents[name].critic_target, self.tau)
 
     def _note(self, metrics: Metrics) -> None:
@@ -389,8 +384,8 @@ class CuRe(CuReBase):
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]
             return policy.samples(sampled, random=False)
 
-        judge = partial(self._judged_error, batch, srl) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
-        return RewardInputs(batch, judge, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
+        srl_error = partial(self._srl_error, batch, srl) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
+        return RewardInputs(batch, srl_error, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
 
 
 @th.no_grad()

@@ -100,6 +100,12 @@ def test_head_and_curious_agent_skip_updates(task: bool, update: str) -> None:
     assert moved == [0, 4, 8]  # target_update_interval=2, of its own updates
 
 
+def test_phases_of_the_head_skip_nothing() -> None:
+    model = model_with_transitions(srl_schedule="alternating", srl_interval=2)
+    model.train(2 * PERIOD, batch_size=8)
+    assert steps(model)["srl"] == 2 * PERIOD  # one period, of two updates each
+
+
 def test_head_alone_makes_each_update() -> None:
     model = model_with_transitions(srl_interval=3)
     model.fit_representation(6)
@@ -127,7 +133,7 @@ def test_targets_follow_every_few_updates(interval: int) -> None:
     phases = [(True, True), (True, False), (True, True), (True, True), (True, False), (True, True)]
     for index, phase in enumerate(phases):
         before = groups(model)
-        model._phase = lambda phase=phase: phase  # type: ignore[misc]
+        model._plan = lambda phase=phase: (*phase, 1)  # type: ignore[misc]
         model.train(1, 8)
         after = groups(model)
         for name in times:

@@ -121,7 +121,7 @@ def test_an_autoencoder_that_learns_is_better_than_the_mean_image(monkeypatch: p
     monkeypatch.setattr(diagnostics, "AUTOENCODER_UPDATES", 700)
     _, early = watch(model, 100)
     assert early["autoencoder"] < 0
-    model._phase = lambda: (True, False)  # type: ignore[method-assign]  # the head alone, which is quicker
+    model._plan = lambda: (True, False, 1)  # type: ignore[method-assign]  # the head alone, which is quicker
     model.train(700, 16)
     warned, late = watch(model, 110)
     assert warned == []

@@ -193,7 +193,7 @@ def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[
     updates, batch_size, learning_rate = LEARNS[srl]
     model = model_of_cups(env, srl, learning_rate=learning_rate).learn(1)
     model.replay_buffer = buffer
-    model._phase = lambda: (True, False)  # type: ignore[method-assign]
+    model._plan = lambda: (True, False, 1)  # type: ignore[method-assign]
     untrained = r2_of_positions(model, env, episodes)
     model.train(updates, batch_size)
     trained = r2_of_positions(model, env, episodes)
