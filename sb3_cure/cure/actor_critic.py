@@ -23,7 +23,7 @@ class TrunkActor(MixedPrecision, Actor):
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         """Compute mean and log standard deviation before squashing.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
         :return: Mean and log standard deviation, [B, action_dim] each, and an empty dictionary
         """
         latent = run_mlp(self.latent_pi, self.features_extractor(obs), self.compute_dtype)
@@ -35,7 +35,7 @@ class TrunkActor(MixedPrecision, Actor):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Choose actions.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
         :param deterministic: Whether to return the mean actions
         :return: Actions in [-1, 1], [B, action_dim]
         """
@@ -45,7 +45,7 @@ class TrunkActor(MixedPrecision, Actor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Choose actions and compute their log-probabilities.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
         :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B, 1]
         """
         mean, log_std, _ = self.get_action_dist_params(obs)

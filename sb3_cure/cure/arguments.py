@@ -91,7 +91,7 @@ def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
     return get_intrinsic_class("srl_error" if tells else AUTO_WITHOUT_NOVELTY)
 
 
-def _judges_observation(model: Any) -> bool:
+def _depends_on_observation_alone(model: Any) -> bool:
     """Whether a transition's intrinsic reward depends on the observation that it begins with alone."""
     is_error = issubclass(choose_intrinsic(model), SRLError) and model.srl is not None
     return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
@@ -113,7 +113,7 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
             "curiosity='separate'.",
         ),
         (
-            separate and model.curiosity_gamma == 0 and _judges_observation(model),
+            separate and model.curiosity_gamma == 0 and _depends_on_observation_alone(model),
             "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
             "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0.",
         ),

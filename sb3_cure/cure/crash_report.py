@@ -22,7 +22,7 @@ class NonFiniteError(ValueError):
     """A loss or a gradient was not finite.
 
     :param source: Name of the step, e.g. ``"task critic"``
-    :param loss: Value of the loss
+    :param loss: Value of the loss; 0 of the encoder, which follows several
     :param norm: Norm of its gradient
     :param update: Number of the update
     """
@@ -64,9 +64,8 @@ class FiniteGuard:
         :param loss: Scalar
         :raises NonFiniteError: if something is not finite, unless that is found out later
         """
-        zero = gradients[0].new_zeros(()) if gradients else th.zeros(())
-        norm = th.stack(th._foreach_norm(gradients)).norm().float() if gradients else zero
-        value = zero if loss is None else loss.detach().float()
+        norm = th.stack(th._foreach_norm(gradients)).norm().float() if gradients else th.zeros(())
+        value = norm.new_zeros(()) if loss is None else loss.detach().float()
         if self.deferred:
             self._seen.append((name, self.update, th.stack([value.to(norm.device), norm])))
         elif not (math.isfinite(value) and norm <= LARGEST_NORM):

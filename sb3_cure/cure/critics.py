@@ -1,6 +1,6 @@
 """Critics on the latents of the shared encoder: SAC's twin Q-values and TQC's truncated quantiles.
 
-Wherever a value is formed, [B, K] are K values of each sample: K = 1 for SAC, the quantiles that are kept for TQC.
+In targets, [B, K] are K values of each sample: K = 1 for SAC, the quantiles that are kept for TQC.
 """
 
 from collections.abc import Iterable

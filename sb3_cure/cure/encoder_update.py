@@ -28,8 +28,8 @@ class EncoderUpdate:
     gradient there. ``"sequential"`` (Algorithm 1 of the paper) then steps at once, with an optimiser for each source.
     ``"joint"`` steps once, in ``finish``: the gradient of each source is divided by its running root-mean-square norm,
     and their sum goes back through the encoder in one pass. Its learning rate is multiplied by the square root of the
-    number of sources: Adam divides by the size of the sum, which for uncorrelated gradients of equal size is that root
-    times the size of each.
+    number of sources of this update: Adam divides by the size of the sum, which for uncorrelated gradients of equal
+    size is that root times the size of each.
 
     Views are made, and the encoder runs, when something reads them; again only after it has been stepped.
 
@@ -96,7 +96,7 @@ class EncoderUpdate:
         """Features of the trunk without their graph, which actors read.
 
         :param name: Name of the views
-        :return: [B, trunk_dim]
+        :return: [B, trunk_dim]; of dictionaries a tuple of such parts
         """
         if name not in self._features:
             with th.no_grad():
@@ -170,19 +170,19 @@ class EncoderUpdate:
     def _step(self) -> None:
         """Step along the gradients that were collected since the last step, if there are any, and drop all graphs."""
         if self._gradients:
-            joint, source = self.mode == "joint", next(iter(self._gradients))  # sequential: the only one
-            optimizer = self.optimizers["joint" if joint else source]
+            joint, first = self.mode == "joint", next(iter(self._gradients))  # sequential: the only one
+            optimizer = self.optimizers["joint" if joint else first]
             update_learning_rate(optimizer, self.learning_rate * len(self._gradients) ** 0.5)
             measures = self._n_updates % MEASURE_INTERVAL == 1
             if measures and joint:
                 self._measure_shares()
             before = [parameter.detach().clone() for parameter in self._parameters] if measures and not joint else []
             # The last source first, which is the order in which autograd would add up their losses.
-            self._check("encoder", self._backward([self._gradients[source] for source in reversed(self._gradients)]))
+            self._check("encoder", self._backward(list(reversed(self._gradients.values()))))
             optimizer.step()
             if before:
                 steps = [parameter.detach() - old for parameter, old in zip(self._parameters, before, strict=True)]
-                self.metrics[f"encoder_step_norm_{source}"] = _norm(steps)
+                self.metrics[f"encoder_step_norm_{first}"] = _norm(steps)
         self._forget()
 
     def _backward(self, gradients: Sequence[dict[str, th.Tensor]], retain_graph: bool = False) -> list[th.Tensor]:

@@ -58,13 +58,13 @@ class CuRePolicy(BasePolicy):
     :param intrinsic_class: Class of the intrinsic reward, or None
     :param intrinsic_kwargs: Its arguments
     :param reward_settings: What rewards may need to know: ``frame_stack``, ``curiosity_target``
-    :param task: Whether there is a task to learn
+    :param task: Whether there is a task to learn (its actor-critic is there either way)
     :param curious: Whether there is a curious actor-critic
     :param curiosity_encoder_grad: Whether the curious critics train the encoder
     :param update: ``"sequential"`` or ``"joint"``, see ``EncoderUpdate``
     """
 
-    #: Encoder by default, for vectors or for images
+    #: Class of the encoder by default
     default_encoder: ClassVar[type[BaseFeaturesExtractor]] = PixelEncoder
 
     encoder: Encoder
@@ -108,7 +108,7 @@ class CuRePolicy(BasePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor_class or self.choose_encoder(observation_space),
+            features_extractor_class or self._choose_encoder(observation_space),
             features_extractor_kwargs,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
@@ -156,13 +156,10 @@ class CuRePolicy(BasePolicy):
     # -------------------------------------------------------------- building
 
     @classmethod
-    def choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-        """Choose the class of the encoder where the user names none.
-
-        :param observation_space: Observation space
-        :return: The class
-        """
-        return cls.default_encoder
+    def _choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
+        """Of dictionaries without images the one for vectors."""
+        joined = isinstance(observation_space, spaces.Dict) and not image_spaces(observation_space)
+        return VectorEncoder if joined else cls.default_encoder
 
     def _encoder_kwargs(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> dict[str, Any]:
         """Head defaults, overridden by the user's kwargs."""
@@ -170,11 +167,11 @@ class CuRePolicy(BasePolicy):
         if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
             return {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
         if srl_class is not None and issubclass(self.features_extractor_class, DictEncoder):
-            by_key = dict(kwargs.pop("by_key", {}))
+            kwargs_by_key = dict(kwargs.pop("by_key", {}))
             for key in image_spaces(self.sensed_space):
                 defaults = srl_class.configure_encoder(self.augmentation.of(key), **srl_kwargs)
-                by_key[key] = {**defaults, **kwargs, **by_key.get(key, {})}
-            return {"by_key": by_key}
+                kwargs_by_key[key] = {**defaults, **kwargs, **kwargs_by_key.get(key, {})}
+            return {"by_key": kwargs_by_key}
         return kwargs
 
     def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
@@ -217,19 +214,18 @@ class CuRePolicy(BasePolicy):
 
     def _make_actor_critic(self) -> ActorCritic:
         encoder = self.encoder
-        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
+        actor_layers, critic_layers = get_actor_critic_arch(self.net_arch)
         actor = TrunkActor(
             self.observation_space,
             self.action_space,  # type: ignore[arg-type]
-            actor_arch,
+            actor_layers,
             encoder.make_projection(),  # type: ignore[arg-type]
             encoder.features_dim,
             activation_fn=self.activation_fn,
         )
-        critic = self._make_critic(
-            encoder.features_dim, get_action_dim(self.action_space), critic_arch, self.activation_fn
-        )
-        agent = ActorCritic(init_weights(actor), init_weights(critic)).to(self.device)
+        action_dim = get_action_dim(self.action_space)
+        critic = self._make_critic(encoder.features_dim, action_dim, critic_layers, self.activation_fn)
+        agent = ActorCritic(init_weights(actor), critic).to(self.device)
         actor.optimizer = self._make_optimizer(actor.parameters())
         critic.optimizer = self._make_optimizer(critic.parameters())
         return agent
@@ -484,14 +480,7 @@ class MlpPolicy(CuRePolicy):
 class MultiInputPolicy(CuRePolicy):
     """``CuRePolicy`` for dictionaries of images and vectors; one without images acts as one vector."""
 
-    @classmethod
-    def choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-        """Choose the class of the encoder.
-
-        :param observation_space: Dictionary of images and vectors
-        :return: The class
-        """
-        return DictEncoder if image_spaces(observation_space) else VectorEncoder
+    default_encoder = DictEncoder
 
 
 def _kinds(space: spaces.Space) -> Any:

@@ -44,13 +44,13 @@ def check_images(observations: Any, space: spaces.Space) -> None:
             raise ValueError(f"images must be uint8, not {image.dtype}: do not divide them by 255.")
 
 
-def by_key(images: Any) -> dict[str, Any]:
-    """Name the parts of an observation.
+def by_key(value: Any) -> dict[str, Any]:
+    """Name the parts of an observation, or of what there is for each of them.
 
-    :param images: Images, or a dictionary of them
-    :return: The dictionary; a single image has the key ``""``, as in ``image_spaces``
+    :param value: Anything, or a dictionary
+    :return: The dictionary; anything else has the key ``""``, as in ``image_spaces``
     """
-    return images if isinstance(images, dict) else {"": images}
+    return value if isinstance(value, dict) else {"": value}
 
 
 def copied(observation: Any) -> Any:

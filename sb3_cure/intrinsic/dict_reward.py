@@ -59,13 +59,14 @@ class DictReward(IntrinsicReward):
 
     def __init__(self, reward_class: type[IntrinsicReward], *args: Any, settings: dict[str, Any], **kwargs: Any):
         super().__init__(*args)
-        observation_space, srl = args[0], settings.get("srl")
+        srl: Any = settings.get("srl")
         heads, self.rewards = heads_by_key(srl), nn.ModuleList()
-        stacks = stacks_by_key(observation_space, {"frame_stack": 1, **settings, **kwargs}["frame_stack"])
+        frame_stack = kwargs.get("frame_stack", settings.get("frame_stack", 1))
+        stacks = stacks_by_key(self.observation_space, frame_stack)
         for key, stack in stacks.items():
             own = {**settings, "frame_stack": stack, "srl": heads.get(key, srl)}
             given = {**kwargs, "frame_stack": stack} if "frame_stack" in kwargs else kwargs
-            space = observation_space[key]
+            space = self.observation_space[key]  # type: ignore[index]
             self.rewards.append(make_reward(reward_class, space, self.action_space, self.features_dim, own, given))
         self.mean_reward = MeanError(len(stacks))
         self.slices = dict.fromkeys(stacks, slice(None))

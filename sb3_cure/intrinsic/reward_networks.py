@@ -48,20 +48,19 @@ class MLP(nn.Sequential):
         return super().forward(inputs.float())
 
 
-def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16, n_layers: int = 3) -> nn.Sequential:
-    """Make a network for inputs as ``scaled`` returns them: convolutions of stride 2 (images), then an ``MLP``.
+def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16) -> nn.Sequential:
+    """Make a network for inputs as ``scaled`` returns them: of images three convolutions of stride 2, then an ``MLP``.
 
     :param space: Space of the observations
     :param sizes: Of the hidden layers and the output
     :param n_filters: Channels of the convolutions
-    :param n_layers: Number of convolutions
     :return: The network
     """
     if not is_image_space(space, check_channels=False):
         return MLP([get_flattened_obs_dim(space), *sizes])
     channels, *size = space.shape  # type: ignore[misc]
     layers: list[nn.Module] = []
-    for _ in range(n_layers):
+    for _ in range(3):
         layers += [nn.Conv2d(channels, n_filters, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
         channels, size = n_filters, [(side + 1) // 2 for side in size]
     convolutions = init(Convolutions(*layers, FlattenImage()))

@@ -23,7 +23,8 @@ class RND(IntrinsicReward):
 
     Inputs are whitened pixel by pixel and clipped to +-5, as there. The statistics are those of the replay buffer's
     contents at the first update, which is the random warm-up, and then frozen: drift would move the target. After a
-    warm-up of less than ``ENOUGH`` transitions they are computed anew in each update, until there are as many.
+    warm-up of less than ``ENOUGH`` transitions they are computed anew in each update, until there are as many
+    or the buffer is full.
 
     :param args: As of ``IntrinsicReward``
     :param frame_stack: Frames per image, of which the newest is read

@@ -231,11 +231,10 @@ class Conv2dReLU(nn.Conv2d):
 class ConvTranspose2dReLU(nn.ConvTranspose2d):
     """torch's transposed convolution of stride 1 and a ReLU, in the number format of the images."""
 
-    def forward(self, images: th.Tensor, output_size: list[int] | None = None) -> th.Tensor:
+    def forward(self, images: th.Tensor) -> th.Tensor:  # type: ignore[override]
         """Apply transposed convolution and ReLU.
 
         :param images: In NHWC memory order, [B, in_channels, H, W]
-        :param output_size: Must be None
         :return: [B, out_channels, H', W']
         """
         return convolve(images, self.weight, self.bias, transposed=True, relu=True)
@@ -350,7 +349,7 @@ class RunningStandardize(nn.Module):
         mean, variance = vectors.mean(dim=0), vectors.var(dim=0, correction=0)
         finite = (mean + variance).isfinite()
         weight = self.weight + (1 - self.decay) * (1 - self.weight)
-        # 1 at first, then 1 / 2, 1 / 3, ... down to 1 - decay: averages without the bias of their initial values.
+        # 1 at first, then about 1 / 2, 1 / 3, ... down to 1 - decay: averages without the bias of their initial values.
         rate = (1 - self.decay) / weight
         shift = mean - self.mean
         spread = (1 - rate) * (self.variance + rate * shift.square()) + rate * variance
@@ -377,15 +376,16 @@ class MeanError(nn.Module):
     Without it the sensor with the largest errors would decide which states are worth visiting.
 
     :param n: Number of sensors
-    :param decay: Weight of the past in the running variances, per update
     """
+
+    #: Weight of the past in the running variances, per update
+    decay = 0.99
 
     variances: th.Tensor
     weight: th.Tensor
 
-    def __init__(self, n: int, decay: float = 0.99):
+    def __init__(self, n: int):
         super().__init__()
-        self.decay = decay
         self.register_buffer("variances", th.zeros(n))
         self.register_buffer("weight", th.zeros(()))
 

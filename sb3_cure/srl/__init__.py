@@ -3,8 +3,6 @@
 ``SRLHead`` is the contract, ``SRL_HEADS`` has the names of what is built in; any subclass can be passed as ``srl=``.
 """
 
-import inspect
-
 from sb3_cure.networks.decoders import PixelDecoder
 from sb3_cure.srl.autoencoder import RAE
 from sb3_cure.srl.base import SRLHead, SRLOutput
@@ -33,7 +31,7 @@ def get_srl_class(srl: str | type[SRLHead]) -> type[SRLHead]:
     """
     if isinstance(srl, str) and srl in SRL_HEADS:
         return SRL_HEADS[srl]
-    if inspect.isclass(srl) and issubclass(srl, SRLHead):
+    if isinstance(srl, type) and issubclass(srl, SRLHead):
         return srl
     # A module's own repr takes many lines.
     given = f"an instance of {type(srl).__name__}" if isinstance(srl, SRLHead) else repr(srl)

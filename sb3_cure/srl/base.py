@@ -52,8 +52,9 @@ class SRLHead(nn.Module):
         self.observation_space = observation_space
         self.optimizer_kwargs = {}
         # In tuples, so that the encoders are not registered as submodules: the head does not train or save them.
-        self._encoder = (encoder,)
-        self.bind(encoder, Augmentation(observation_space))
+        self._encoder = self._target_encoder = (encoder,)
+        #: Draws another view of stored observations: ``self.augment(batch.observations)``
+        self.augment = Augmentation(observation_space)
 
     @classmethod
     def choose_augmentation(cls, observation_space: spaces.Space) -> str | None:
@@ -91,7 +92,6 @@ class SRLHead(nn.Module):
         :param augmentation: The policy's
         """
         self._target_encoder = (target_encoder,)
-        #: Draws another view of stored observations: ``self.augment(batch.observations)``
         self.augment = augmentation
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:

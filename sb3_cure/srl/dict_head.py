@@ -26,9 +26,6 @@ class DictHead(SRLHead):
     :raises ValueError: if the encoder does not keep the images apart
     """
 
-    #: Keys of the images
-    keys: tuple[str, ...] = ()
-
     def __init__(self, head_class: type[SRLHead], encoder: Encoder, observation_space: spaces.Dict, **kwargs: Any):
         if not isinstance(encoder, DictEncoder):
             raise ValueError(
@@ -39,6 +36,7 @@ class DictHead(SRLHead):
         self.heads = nn.ModuleList(
             head_class(image, observation_space[key], **kwargs) for key, image in encoder.images.items()
         )
+        #: Keys of the images, and their parts of the latents
         self.keys, self.slices = tuple(encoder.images), tuple(encoder.slices.values())
         self.mean_error = MeanError(len(self.keys))
         self.optimizer_kwargs = self.heads[0].optimizer_kwargs  # type: ignore[assignment]
