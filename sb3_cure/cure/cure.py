@@ -127,6 +127,9 @@ class CuRe(CuReBase):
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         """Sample, update, repeat."""
         self.policy.set_training_mode(True)
+        task = self.policy.task  # callbacks that anneal its temperature set SB3's attributes, the model's
+        task.log_ent_coef, task.ent_coef_optimizer = self.log_ent_coef, self.ent_coef_optimizer
+        task.ent_coef_tensor = self.ent_coef_tensor
         learning_rate = self.lr_schedule(self._progress_remaining)
         self.policy.set_learning_rate(learning_rate, self.ent_coef_lr_factor)
         metrics = []

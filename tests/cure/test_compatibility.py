@@ -121,6 +121,22 @@ def test_temperature(extras: dict[str, Any], ent_coef: str | float, initial: flo
     ] * len(agents)
 
 
+@pytest.mark.parametrize("ent_coef", [0.3, "auto_0.3"])
+def test_callbacks_set_the_temperature(ent_coef: str | float) -> None:
+    """By the attributes that SB3's own ``train`` reads; ``save`` writes the same ones."""
+
+    def anneal(variables: dict[str, Any], _: dict[str, Any]) -> bool:
+        model = variables["self"]
+        if isinstance(ent_coef, str):
+            model.log_ent_coef = th.tensor([0.007]).log().requires_grad_(True)
+        else:
+            model.ent_coef_tensor = th.tensor(0.007)
+        return True
+
+    model = vector_model(ent_coef=ent_coef).learn(14, anneal)
+    assert model.policy.task.temperature().item() == pytest.approx(0.007, rel=1e-5)
+
+
 # -------------------------------------------------------------------- acting
 
 
