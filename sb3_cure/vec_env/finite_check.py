@@ -3,8 +3,6 @@
 import contextlib
 import copy
 from collections.abc import Iterator
-from functools import partial
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -71,11 +69,9 @@ class FiniteCheck(VecEnvWrapper):
         if self._normalizer is None:
             yield
             return
+        # Not for good: SB3 compares the wrappers of training and evaluation one by one.
         venv = self._normalizer.venv
-        checked: Any = SimpleNamespace(
-            reset=partial(self._reset, venv, False), step_wait=partial(self._step_wait, venv, False)
-        )
-        self._normalizer.venv = checked
+        self._normalizer.venv = _Originals(venv, self)  # type: ignore[assignment]
         try:
             yield
         finally:
@@ -113,6 +109,22 @@ class FiniteCheck(VecEnvWrapper):
             f"{source} {number} in the {kind}{f' {key!r}' if key else ''} at agent step {self.n_steps}, but numbers "
             f"must be finite in float32: nothing of this step was stored; {fix}."
         )
+
+
+class _Originals:
+    """The environments under a ``VecNormalize``, checked by the ``FiniteCheck`` around it."""
+
+    def __init__(self, venv: VecEnv, check: FiniteCheck) -> None:
+        self._venv, self._finite_check = venv, check
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._venv, name)
+
+    def reset(self) -> VecEnvObs:
+        return self._finite_check._reset(self._venv, False)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self._finite_check._step_wait(self._venv, False)
 
 
 def _find_bad(values: Any) -> tuple[int, str, float] | None:

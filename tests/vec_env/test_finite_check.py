@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_cure import CuReSAC
 from sb3_cure.vec_env import BadTransitionError, FiniteCheck, check_environments
@@ -124,6 +124,24 @@ def test_spoilt_statistics_are_not_the_environments_fault() -> None:
     venv.obs_rms.mean[:] = NAN
     with pytest.raises(BadTransitionError, match=r"VecNormalize made nan in the first obs.* load or make a new"):
         FiniteCheck(venv).reset()
+
+
+class Asking(VecEnvWrapper):
+    """Asks the environments for something at each reset and step, as SB3's ``VecVideoRecorder`` asks for pictures."""
+
+    def reset(self) -> Any:
+        self.found = [self.venv.env_method("get_wrapper_attr", "episode_length")]
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        self.found.append(self.venv.env_method("get_wrapper_attr", "episode_length"))
+        return self.venv.step_wait()
+
+
+def test_wrappers_around_normalization_reach_the_environments() -> None:
+    venv = Asking(VecNormalize(DummyVecEnv([VectorBox])))
+    tiny_model("MlpPolicy", venv).learn(5)
+    assert venv.found == [[VectorBox().episode_length]] * 6
 
 
 class OneBuffer(DummyVecEnv):
