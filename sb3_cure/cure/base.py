@@ -225,9 +225,9 @@ class CuReBase(OffPolicyAlgorithm):
         self._mixer = CuriousMixer(self.seed)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
+        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
-        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):  # else SB3's `learn` ends an episode in it
-            self.optimize_memory_usage = False
+            self.optimize_memory_usage = False  # else SB3's `learn` ends an episode in it
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
         if own := sorted(user_kwargs.keys() & settings.keys()):
             raise ValueError(f"policy_kwargs has {own}, which the algorithm sets: give it its own arguments instead.")

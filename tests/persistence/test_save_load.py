@@ -1,5 +1,6 @@
 """What is saved and loaded acts alike and learns on alike, whatever is switched on."""
 
+import functools
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,13 @@ def test_load_without_environment(tmp_path: Path) -> None:
     assert (loaded.num_timesteps, loaded._n_updates) == (20, 10)
     tiny_model("MlpPolicy", "Pendulum-v1").save(tmp_path / "model")
     assert CuReSAC.load(tmp_path / "model", env="Pendulum-v1").learn(5).num_timesteps == 5
+
+
+def test_load_keeps_the_frame_stack_beside_other_arguments_of_the_buffer(tmp_path: Path) -> None:
+    make = functools.partial(PixelBox, frame_stack=2)
+    tiny_model("CnnPolicy", make()).save(tmp_path / "model.zip")
+    loaded = CuReSAC.load(tmp_path / "model.zip", make(), replay_buffer_kwargs=dict(frames_dir=tmp_path / "frames"))
+    assert loaded.replay_buffer.frame_stack == loaded.policy._arguments["reward_settings"]["frame_stack"] == 2
 
 
 def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
