@@ -220,14 +220,13 @@ class CuReBase(OffPolicyAlgorithm):
         tune_allocator()
         check_arguments(self)
         check_observation_space(self.observation_space, self.policy_class)
-        check_action_space(self.action_space)  # type: ignore[arg-type]
         self._guard = FiniteGuard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
-        if self.replay_buffer_class is None:
+        if self.replay_buffer_class in (None, FrameStackReplayBuffer):
             self.replay_buffer_class = FrameStackReplayBuffer
-        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
-            self.optimize_memory_usage = False  # else SB3's `learn` ends an episode in it
+        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):  # else SB3's `learn` ends an episode in it
+            self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
         if own := sorted(user_kwargs.keys() & settings.keys()):
             raise ValueError(f"policy_kwargs has {own}, which the algorithm sets: give it its own arguments instead.")
@@ -289,6 +288,7 @@ class CuReBase(OffPolicyAlgorithm):
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         check_observation_space(env.observation_space)
+        check_action_space(env.action_space)
         return check_environments(OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
 
     def get_env(self) -> VecEnv | None:
