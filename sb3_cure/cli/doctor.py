@@ -25,6 +25,7 @@ from sb3_cure.cli.usage import UsageError, install_command, one_sentence
 from sb3_cure.cli.zoo_files import check_environment
 from sb3_cure.envs.dmc import DMCPixels
 from sb3_cure.envs.render_check import find_gpus, is_software_renderer, judge_renderer, try_rendering
+from sb3_cure.envs.spaces_check import check_action_space
 from sb3_cure.networks.precision import resolve_precision
 
 PACKAGE = "sb3-cure"
@@ -40,7 +41,10 @@ EXTRAS = {
 }
 #: What to do, by the share of random episodes that meet a reward at most
 ADVICE = {
-    0.05: "Hardly any: exploration decides. Try curiosity (fast/cure_sac_ae); it is not known to learn such tasks.",
+    0.05: (
+        "Hardly any: exploration decides. Try curiosity in bouts (--conf-file fast/cure_sac_ae -params "
+        "curiosity_bout:25); it is not known to learn such tasks."
+    ),
     0.5: (
         "Some: try it with curiosity (fast/cure_sac_ae) and without (fast/best). On one such task curiosity met three "
         "times the rewards in training; returns were still zero."
@@ -137,8 +141,11 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
     print(f"{task}: episodes of random actions, for at most a minute", flush=True)
     try:
         env = gym.make(task, **env_kwargs)
+        check_action_space(env.action_space)
     except TypeError as error:
         raise UsageError(f"{task} wants other --env-kwargs: {one_sentence(error)}") from error
+    except (ValueError, gym.error.Error) as error:
+        raise UsageError(f"{task} cannot be trained: {one_sentence(error)}") from error
     returns = play_randomly(_without_images(env))
     env.close()
     if len(returns) < MIN_EPISODES:

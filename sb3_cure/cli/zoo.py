@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import optuna
 import rl_zoo3.train
@@ -57,7 +58,7 @@ def _refusals_in_one_sentence(*functions: Any) -> Iterator[None]:
         yield
     except UsageError:
         raise
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, gym.error.Error) as error:
         if isinstance(error, TypeError) and "unexpected keyword argument" not in str(error):
             raise
         raise UsageError(one_sentence(error, *functions)) from error
@@ -108,7 +109,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         algorithm = ALGOS[self.algo]
         with _refusals_in_one_sentence(algorithm, *algorithm.policy_aliases.values(), make_dmc_env):
-            return super().setup_experiment()
+            experiment = super().setup_experiment()
+        self._updates_before = 0 if experiment is None else getattr(experiment[0], "_n_updates", 0)
+        return experiment
 
     def create_callbacks(self) -> None:
         super().create_callbacks()
@@ -123,7 +126,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 f"Stopped at step {model.num_timesteps:,} of {self.n_timesteps:,}: {path} keeps the model, and "
                 f"the same command with -i {path} begins a new training from its weights."
             )
-        elif isinstance(model, OffPolicyAlgorithm) and model._n_updates == 0:
+        elif isinstance(model, OffPolicyAlgorithm) and model._n_updates == self._updates_before:
             print(f"Nothing was learned: no update is made before step learning_starts={model.learning_starts:,}.")
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple:
@@ -134,6 +137,9 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 )
         hyperparams.setdefault("n_timesteps", self.n_timesteps)  # which rl-zoo3 deletes in any case
         hyperparams.update(named_classes(hyperparams))
+        for wrappers in (hyperparams.get("env_wrapper"), hyperparams.get("vec_env_wrapper")):
+            for each in wrappers if isinstance(wrappers, list) else [wrappers] if wrappers else []:
+                find_class(each if isinstance(each, str) else next(iter(each)))  # with the nearest names
         processed = super()._preprocess_hyperparams(hyperparams)
         rate = processed[0].get("learning_rate")
         if isinstance(rate, SimpleLinearSchedule):  # which archives do not know
@@ -249,6 +255,8 @@ def train(arguments: Sequence[str]) -> None:
     given, rest = parser.parse_known_args(arguments)
     for package in given.gym_packages:
         import_module(package)
+    if given.env is None and not {"-h", "--help"} & {*rest}:
+        raise UsageError("--env must name an environment, such as dmc_pixels/cartpole-swingup-v0.")
     if given.env is not None:
         check_environment(given.env)
         module, _, task = given.env.rpartition(":")

@@ -34,16 +34,16 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
     _check_part(space, "the observation", is_image=name is not None and name.endswith("CnnPolicy"))
 
 
-def check_action_space(space: spaces.Box) -> None:
+def check_action_space(space: spaces.Space) -> None:
     """Refuse actions that are integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1.
 
     :param space: Space of actions
-    :raises ValueError: If its dtype is no float
+    :raises ValueError: If it is no box of floats
     """
-    if not np.issubdtype(space.dtype, np.floating):
+    if not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
         raise ValueError(
-            f"actions are {space.dtype} in {space}, but policies give real numbers: let an ActionWrapper, whose "
-            "action_space is a Box of floats, round them for the environment."
+            f"actions are {space}, but policies give real numbers: let an ActionWrapper, whose action_space is a Box "
+            "of floats, make the environment's of them."
         )
 
 

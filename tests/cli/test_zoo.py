@@ -197,7 +197,9 @@ def test_interrupted_training_keeps_its_model(
         train("--eval-freq", "-1")
     (path,) = re.findall(r"Stopped at step \d+ of 20: (\S+\.zip) keeps the model", capsys.readouterr().out)
     train("--eval-freq", "-1", "-i", path)
-    assert "Stopped" not in capsys.readouterr().out
+    assert "Stopped" not in (said := capsys.readouterr().out) and "Nothing was learned" not in said
+    train("--eval-freq", "-1", "-i", path, "-n", "2")  # less than the warm-up, which is made again
+    assert "Nothing was learned" in capsys.readouterr().out
 
 
 # -------------------------------------------------------------------- tuning
