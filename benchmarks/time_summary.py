@@ -20,6 +20,8 @@ from sb3_cure.experiments.tables import NONE, Table
 
 #: The arm that the others are compared with
 OURS = "best"
+#: What arms are called in the picture
+NAMES = {"best": "fast/best (ours)", "public_curl": "CURL's code", "drqv2": "DrQ-v2's code"}
 TRIAL_TASK, TRIAL_SEEDS = "cartpole-swingup", (0,)
 TARGETS = (300, 500, 700)
 #: Minutes after which returns are shown
@@ -261,12 +263,13 @@ def draw(path: Path, runs: Runs) -> None:
             first, last = max(run.minutes[0] for run in seeds.values()), min(run.minutes[-1] for run in seeds.values())
             grid = np.linspace(first, last, 400)
             mean = np.mean([np.interp(grid, run.minutes, run.returns) for run in seeds.values()], axis=0)
-            (handles[arm],) = axes.plot(grid, mean, color=colors[arm], linewidth=2.4)
+            (handles[NAMES.get(arm, arm)],) = axes.plot(grid, mean, color=colors[arm], linewidth=2.4)
         for target in TARGETS:
             axes.axhline(target, color="#333333", linestyle="--", linewidth=0.9, alpha=0.7, zorder=1)
-        labels = {"xlabel": "CPU minutes of training", "ylabel": "return (deterministic actions)"}
+        labels = {"xlabel": "CPU minutes of training", "ylabel": "return of ten episodes (higher: better)"}
         axes.set(title=f"{task}, one thread", **labels, xlim=(0, None), ylim=(0, None))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=max(1, min(len(handles), 6)))
+    marks = "thin lines: seeds; thick ones: their means; dashed: the returns of the table"
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 6), title=marks)
     save(figure, path, 120)
 
 

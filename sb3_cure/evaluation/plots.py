@@ -31,6 +31,8 @@ COLORS = {
     **{"curl": "#2ca02c", "drq": "#ff7f0e", "per_pixel": "#9467bd", "oracle": "#8c564b"},
 }
 _BASELINE_COLOR = "#222222"
+#: Of lines across, the same in all pictures
+_DASHES = {"always drawing grey": "--", "always drawing the mean image": ":"}
 #: Colours of other arms
 _ARM_COLORS = ["#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
@@ -226,10 +228,10 @@ def actor_bars(
             position += 0.7
         axes.set_xticks(list(ticks.values()), list(ticks), rotation=15 if len(ticks) > 3 else 0)
         axes.set(title=_plain(title), xlim=(-0.7, position - 1))
-        for (label, compared), dashes in zip((lines or {}).get(title, {}).items(), ("--", ":", "-."), strict=False):
+        for label, compared in (lines or {}).get(title, {}).items():
             color, known = COLORS.get(label, _BASELINE_COLOR), np.atleast_1d(compared)
             name = f"{label} policy" if label in COLORS else _plain(label)
-            axes.axhline(known.mean(), color=color, linewidth=1.2, linestyle=dashes, label=name)
+            axes.axhline(known.mean(), color=color, linewidth=1.2, linestyle=_DASHES.get(label, "-."), label=name)
             axes.axhspan(known.min(), known.max(), color=color, alpha=0.15, linewidth=0)
         means = [float(values.mean()) for *_, values, _ in rows]
         if logarithmic and max(means) > 0:
@@ -240,10 +242,10 @@ def actor_bars(
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
     if lines or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
-        marks = "thick dashes (thin lines: least to greatest)" if logarithmic else "bars"
+        marks = "thick marks: their means (thin lines: least to greatest step)" if logarithmic else "bars: their means"
         legends = [axes.get_legend_handles_labels() for axes in places]
         handles = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
-        _legend(figure, handles, f"{marks} and lines across: means of the dots and bands")
+        _legend(figure, handles, f"dots: seeds; {marks}; in brackets: 95 % interval")
     save(figure, path)
 
 

@@ -227,7 +227,7 @@ def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float
             row = {"policy": actor, "episode": number, "return": episode.total_reward}
             kept.append({**row, "mean_error": means[number], "max_error": episode.srl_errors.max()})
     write_csv(out / "errors.csv", list(kept[0]), kept)
-    label = "mean squared error of images\ndrawn from the latents"
+    label = "mean squared error of images drawn\nfrom the latents (more: less well known)"
     title = f"What the latents do not hold, where each policy goes\n(bars: means, dots: {EPISODES} episodes)"
     plots.actor_bars(out / "errors.png", {title: bars}, label)
     shown = {actor: visits[actor] for actor in ("random", "curious")}
