@@ -1,6 +1,7 @@
 """Roll out one policy alone (task, curious or random), and measure its returns and SRL errors."""
 
 import contextlib
+import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_cure.data.buffers import stored_places, transitions
-from sb3_cure.data.observations import copied, images_of, len_of, rows_of, stacked
+from sb3_cure.data.observations import by_key, images_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
 from sb3_cure.evaluation.encoding import encoder_of
@@ -34,7 +35,7 @@ class Episode:
     :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty without a head
     :param observations: Observations before each step, [T, *shape], or such by key; images channels first, as the
         model gets them
-    :param frames: ``env.render()`` after each step, if requested
+    :param frames: ``env.render()`` before each step, if requested
     :param states: True state of the environment before each step, [T, d], if requested; else empty
     """
 
@@ -72,7 +73,7 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples) -> np
     policy.set_training_mode(False)
     errors = []
     with th.no_grad():
-        for chunk in chunks(len_of(batch.observations)):
+        for chunk in chunks(len(next(iter(by_key(batch.observations).values())))):
             part: Any = (None if each is None else rows_of(each, chunk) for each in batch[:5])
             errors.append(policy.error(policy.samples(Samples(*part), random=False)).float().cpu().numpy())
     return np.concatenate(errors)
@@ -147,7 +148,7 @@ def run_episodes(
     :param deterministic: Whether policies act by their mean
     :param seed: Seed of the first reset and of random actions. The environment's random numbers decide where later
         episodes start: equal for all policies if ``step`` draws none, as in DeepMind Control
-    :param render: Whether to keep ``env.render()`` of each step
+    :param render: Whether to keep ``env.render()`` before each step
     :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
         (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]
     :return: The episodes
@@ -176,14 +177,14 @@ def run_episodes(
                 )
             if state_of:
                 true_states.append(np.array(state_of(env)))
+            if render:
+                frames.append(env.render())
             actions.append(np.array(action))
             observation, reward, terminated, truncated, _ = env.step(action)
             finished = terminated or truncated
             observations.append(_own_keys(observation, model.observation_space))
             rewards.append(float(reward))
             dones.append(terminated)
-            if render:
-                frames.append(env.render())
         seen: Any = _channels_first(stacked(observations), model.observation_space)
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):
@@ -194,7 +195,8 @@ def run_episodes(
 
 def _own_keys(observation: Any, space: spaces.Space) -> Any:
     """Copy an observation without keys that its space does not have, as SB3's VecEnvs do."""
-    return copied({key: observation[key] for key in space.spaces} if isinstance(space, spaces.Dict) else observation)
+    own = {key: observation[key] for key in space.spaces} if isinstance(space, spaces.Dict) else observation
+    return copy.deepcopy(own)
 
 
 def _channels_first(observations: Any, space: spaces.Space) -> Any:

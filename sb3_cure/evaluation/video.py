@@ -79,9 +79,9 @@ def annotated_frames(episode: Episode, action_repeat: int, title: str, top: floa
     :param top: Error at the upper end of the curve
     :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
-    returns = episode.rewards.cumsum()
+    returns = episode.rewards.cumsum() - episode.rewards  # so far
     for step, frame in enumerate(episode.frames):
-        caption = f"environment step {(step + 1) * action_repeat}, return {returns[step]:.0f}"
+        caption = f"environment step {step * action_repeat}, return {returns[step]:.0f}"
         errors = episode.srl_errors[: step + 1]
         yield _with_panel(frame, title, caption, errors, len(episode.frames), top)
 

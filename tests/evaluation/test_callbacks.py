@@ -171,6 +171,14 @@ def test_video_shows_both_policies_with_their_errors(tmp_path: Path) -> None:
         assert not is_red(frames[:, :192]).any()
 
 
+def test_frames_show_what_the_agent_saw() -> None:
+    """Not what came of its action: beside each other they would be a step apart."""
+    env = PixelBox()
+    env.render = lambda: env.frames[-1]  # type: ignore[method-assign]
+    (episode,) = run_episodes(tiny_model("CnnPolicy", PixelBox()), env, 1, seed=4, render=True)
+    np.testing.assert_array_equal(np.stack(episode.frames), episode.observations[:, -3:])
+
+
 def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Path) -> None:
     """Each row is what the head draws then of the observations of the first row, newest frames only."""
     model = tiny_model("CnnPolicy", PixelBox(frame_stack=2))
