@@ -63,7 +63,7 @@ def write_cell(
     states: Mapping[str, np.ndarray] | None = None,
     state_units: Sequence[str] | None = None,
     curious: bool = False,
-    rewards_met: float | str = "",
+    rewards_met: float | str | Sequence[float] = "",
     **config: Any,
 ) -> Path:
     """One cell.
@@ -80,7 +80,7 @@ def write_cell(
     :param states: True states by actor
     :param state_units: Units of their coordinates
     :param curious: Whether the columns of a curious actor are filled
-    :param rewards_met: Rewards that training met
+    :param rewards_met: Rewards that training met, in all rows or until each
     :param config: Further keys of ``config.json``
     :return: Its folder
     """
@@ -97,11 +97,12 @@ def write_cell(
         "seconds": 3600.0, "attempts": 1,
     }  # fmt: skip
     (cell / "run.json").write_text(json.dumps(run))
+    sums = rewards_met if isinstance(rewards_met, list) else [rewards_met] * len(curve)
     rows = [
         [step, step // 8, step // 8, step / 100, value, 5.0, 0.001]
         + ([value / 2, 0.002] if curious else ["", ""])
-        + [rewards_met]
-        for step, value in curve.items()
+        + [met]
+        for (step, value), met in zip(curve.items(), sums, strict=True)
     ]
     write_csv(cell / "eval.csv", EVAL_COLUMNS, rows)
     if visitation or states is not None:

@@ -31,7 +31,7 @@ def reconstruction_callbacks(cell: Cell, action_repeat: int, folder: Path) -> li
     :param cell: A cell that is about to be trained
     :param action_repeat: Environment steps per agent step
     :param folder: Where to write ``reconstructions.png``, one row per time
-    :return: The callbacks; none without images or SRL head
+    :return: The callbacks; none without an SRL head, and of dictionaries
     """
     if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
         return []
@@ -90,6 +90,9 @@ def _draw_replay_buffer(model: CuReSAC, cell: Cell, folder: Path) -> None:
     found = highest_errors(model, FRAMES)
     with th.no_grad():
         pair = model.policy.reconstruct(th.as_tensor(found.observations, device=model.device))
-    title, drawn = f"Highest SRL errors: {_title(cell)}", None if pair is None else pair[1].cpu().numpy()
+    title, drawn = f"Highest SRL errors: {_title(cell)}", None
+    if pair is not None:
+        seen, drawn = (images.cpu().numpy() for images in pair)
+        found = found._replace(observations=seen)  # what was to be drawn, such as a crop
     n_frames = infer_frame_stack(model.env)  # type: ignore[arg-type]
     plots.highest_error_frames(folder / "uncomfortable.png", found, n_frames, title, drawn)

@@ -201,7 +201,7 @@ def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) ->
 def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
     """Whose error it is: the head's, or that of a reward which reconstructs what its own autoencoder sees."""
     arguments = next(iter(experiment.done(task, arm).values())).config["arguments"]
-    options = arguments.get("intrinsic_kwargs", {})
+    options = arguments.get("intrinsic_kwargs") or {}
     rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
     own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")
     return f"{own}{', per pixel' if options.get('per_pixel') else ''}"

@@ -5,7 +5,7 @@ are averaged with equal weights, and the interval is the middle 95 % of the draw
 task. With one task it is the paired t interval, exactly. It is wide with two or three seeds, as it should be.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -184,20 +184,12 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
 def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
     """Cells of the true state that an arm reached, over those of its baseline, see ``paired_ratio``.
 
-    In each pair of seeds by the last step at which both were counted.
-
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
     :return: The ratio
     """
-    ours, theirs = (
-        {seed: cell.curve("cells")[1] for seed, cell in experiment.done(task, arm).items()}
-        for arm in (method, experiment.baseline_of(method))
-    )
-    last = {seed: min(len(ours[seed]), len(theirs[seed])) - 1 for seed in ours.keys() & theirs.keys()}
-    counts = ({seed: float(arm[seed][end]) for seed, end in last.items() if end >= 0} for arm in (ours, theirs))
-    return paired_ratio(*counts)
+    return paired_ratio(*_at_common_end(experiment, task, method, "cells"))
 
 
 def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Estimate:
@@ -208,9 +200,18 @@ def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Es
     :param method: Name of an arm
     :return: Mean over the seeds that both have done, with its t interval
     """
-    arms = method, experiment.baseline_of(method)
-    ours, theirs = (final_values(experiment, task, arm, "rewards_met") for arm in arms)
-    return t_interval([np.array([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours if seed in theirs])])
+    ours, theirs = _at_common_end(experiment, task, method, "rewards_met")
+    return t_interval([np.array([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours])])
+
+
+def _at_common_end(experiment: Experiment, task: str, method: str, column: str) -> Iterator[dict[int, float]]:
+    """Values of an arm, and of its baseline, by seed: of each pair at the last step at which both were counted."""
+    ours, theirs = (
+        {seed: cell.curve(column)[1] for seed, cell in experiment.done(task, arm).items()}
+        for arm in (method, experiment.baseline_of(method))
+    )
+    last = {seed: min(len(ours[seed]), len(theirs[seed])) - 1 for seed in ours if seed in theirs}
+    return ({seed: float(arm[seed][end]) for seed, end in last.items() if end >= 0} for arm in (ours, theirs))
 
 
 def final_values(experiment: Experiment, task: str, method: str, column: str) -> dict[int, float]:
@@ -318,12 +319,11 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
                 same[task] = int(((first == second) | np.isnan(first) | np.isnan(second)).all(axis=1).sum())
         # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
-        left_out = tuple(task for task in by_task if task not in judged)
-        rows: list[tuple[str | None, dict[str, np.ndarray], tuple[str, ...]]]
-        rows = [(task, {task: values}, ()) for task, values in by_task.items()]
+        rows: dict[str | None, dict[str, np.ndarray]] = {task: {task: values} for task, values in by_task.items()}
         if len(rows) > 1:
-            rows.insert(0, (None, judged, left_out))
-        for name, values, without in rows:
+            rows = {None: judged, **rows}
+        for name, values in rows.items():
+            without = () if name else tuple(task for task in by_task if task not in judged)
             interval, starts_alike = t_interval(list(values.values())), sum(same[task] for task in values)
             found.append(PairedDifference(method, other, name, values, interval, starts_alike, without))
     return found

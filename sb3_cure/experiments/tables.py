@@ -120,7 +120,7 @@ def number_text(value: float, digits: int = 0) -> str:
     """
     if not math.isfinite(value):
         return NONE
-    return f"{round(value, digits) + 0.0:,.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:z,.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def return_digits(experiment: Experiment, task: str | None = None) -> int:
@@ -265,10 +265,11 @@ def difference_table(
     """
     columns = "arm; task; >pairs; >same start; >difference; >95 % t; >above; >p; >p, Holm; verdict"
     shown = []
-    for row, corrected in zip(rows, statistics.holm([row.p for row in rows]), strict=True):
+    ps = [row.p for row in rows]
+    for row, p, corrected in zip(rows, ps, statistics.holm(ps), strict=True):
         digits = difference_digits(row, experiment)
         numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, digits), interval_text(row.t, digits)]
-        numbers += [str(row.wins), _p_text(row.p), _p_text(corrected)]
+        numbers += [str(row.wins), _p_text(p), _p_text(corrected)]
         shown.append([difference_label(row, experiment.baseline), tasks_text(row), *numbers, row.t.verdict])
     title = f"Paired difference from {compared_with(rows, experiment)}: {measure}"
     return _table(title, columns, shown, render_text("differences") if note is None else note)
@@ -411,12 +412,8 @@ def pretraining_table(experiment: Experiment) -> Table:
     :param experiment: An experiment of kind ``"pretraining"``
     :return: The table
     """
-    rows = []
-    for task, method in experiment.arms:
-        finals = statistics.summarise_arm(experiment, task, method).finals
-        shown = _mean_std(finals, return_digits(experiment, task)) or _state(experiment, task, method)
-        rows.append([task, method, str(len(finals)), shown])
-    return _table("Final return after pretraining", "task; arm; >seeds; >final return", rows)
+    rows = curves_table(experiment).rows.drop(columns=">area under curve")
+    return Table("Final return after pretraining", rows)
 
 
 def conditions_table(experiment: Experiment) -> Table:
@@ -429,15 +426,16 @@ def conditions_table(experiment: Experiment) -> Table:
     rows = []
     for cell in experiment.finished:
         run, phase, steps = cell.run, cell.config.get("pretrain"), cell.curve("environment_steps")[0]
-        packages = ", ".join(f"{name} {number}" for name, number in run.get("versions", {}).items())
-        letter = letters.setdefault(packages, chr(ord("A") + len(letters))) if packages else NONE
+        attempts: list[dict[str, Any]] = [*run.get("history", ()), run]
+        versions = [each["versions"] for each in attempts if each.get("versions")]
+        packages = [", ".join(f"{name} {number}" for name, number in each.items()) for each in versions]
+        named = _list(letters.setdefault(each, chr(ord("A") + len(letters))) for each in packages)
         trained = number_text(float(steps[-1])) if len(steps) else NONE
         pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
-        attempts: list[dict[str, Any]] = [*run.get("history", ()), run]
         machine = [_list(each.get(key) for each in attempts) for key in ("device", "precision", "machine")]
         times = [NONE if run.get(key) is None else time_text(run[key]) for key in ("seconds", "cpu_seconds")]
         row = [cell.task, cell.method, str(cell.seed), trained, pretrained, *times, *machine]
-        rows.append([*row, letter, _commits(cell), str(run.get("attempts") or NONE)])
+        rows.append([*row, named, _commits(cell), str(run.get("attempts") or NONE)])
     columns = (
         "task; arm; seeds; >environment steps; >pretraining steps; >wall-clock; >CPU time; device; precision; machine"
     )

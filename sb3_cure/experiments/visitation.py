@@ -57,7 +57,7 @@ def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
         arrays[f"{actor}_errors"] = np.concatenate([each.srl_errors for each in seen], dtype=np.float32)
         if has_physics:
             arrays[f"{actor}_states"] = np.concatenate([each.states for each in seen], dtype=np.float32)
-    mean_image = np.mean([mean_target(model, seen) for seen in episodes.values()], axis=0)
+    mean_image = mean_target(model, [each for seen in episodes.values() for each in seen])
     rows: list[Row] = []
     for actor, seen in episodes.items():
         for number, each in enumerate(seen):
@@ -85,10 +85,10 @@ def roll_out(model: CuReSAC, cell: Cell, env: gym.Env, actor: str, states: bool 
 
 
 def _targets(model: CuReSAC, observations: np.ndarray) -> Iterator[np.ndarray]:
-    """Targets of an autoencoder, float32 [n, ...], in batches."""
-    head = getattr(model.policy, "srl", None)
+    """Targets of an autoencoder, which are the centred views, float32 [n, ...], in batches."""
+    head = model.policy.srl
     for chunk in chunks(len(observations)):
-        images = th.as_tensor(observations[chunk], device=model.device)
+        images = model.policy.center(th.as_tensor(observations[chunk], device=model.device))
         if isinstance(head, RAE):
             yield head.target(images, dither=False).cpu().numpy()
         elif not is_image_space(model.observation_space):

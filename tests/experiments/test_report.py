@@ -210,7 +210,7 @@ def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: l
     """A panel for each head, and for errors per pixel, but one of returns; constant images have errors of one unit."""
     others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
     others["drawn"] = {"srl": "curl", "intrinsic": "reconstruction"}  # whose own autoencoder measures
-    arms: dict[str, dict[str, Any]] = {"sac_ae": {}, **others}
+    arms: dict[str, dict[str, Any]] = {"sac_ae": {"intrinsic_kwargs": None}, **others}
     write_grid(tmp_path, seeds=1, methods={arm: {} for arm in arms}, baseline="sac_ae")
     for arm, arguments in arms.items():
         write_cell(tmp_path, TASK, arm, 0, curve(0, 1, 2, 3, 4), arguments={**CURE, **arguments})
@@ -343,6 +343,18 @@ def test_conditions_and_plots(results: Path) -> None:
     for name in ("curves/paired_difference", "visitation/coverage", "visitation/visitation_own"):
         with Image.open(results / f"{name}.png") as image:
             assert min(image.size) > 100
+
+
+def test_versions_of_all_attempts_are_told(tmp_path: Path) -> None:
+    write_grid(tmp_path, seeds=1)
+    path = write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 1)) / "run.json"
+    last = json.loads(path.read_text())
+    first = {**last, "versions": {**last["versions"], "torch": "2.12.0"}}
+    path.write_text(json.dumps({**last, "history": [{"machine": "without versions"}, first, last]}))
+    assert report.main([str(tmp_path)]) == 0
+    _, row = rows_of(tmp_path / "table.md", "Run conditions")
+    assert row[-3] == "A, B"
+    assert "Versions A: sb3\\_cure 0.1.0, torch 2.12.0." in (tmp_path / "table.md").read_text()
 
 
 def test_page_holds_everything_itself(results: Path) -> None:

@@ -151,6 +151,15 @@ def test_order_of_seeds_changes_nothing(groups: list[list[float]], random: objec
     assert first == second
 
 
+def test_rewards_met_are_compared_at_the_last_common_step(tmp_path: Path) -> None:
+    """The second arm has stopped early: there it had met ten times as many."""
+    write_grid(tmp_path, seeds=[0])
+    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 0, 0), rewards_met=[0, 9, 999], stop_at_return=0)
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, {0: 0, 50_000: 0}, rewards_met=[0, 99], stop_at_return=0)
+    found = statistics.rewards_met_difference(read_results(tmp_path)[0], TASK, "cure_sac_ae")
+    assert found.value == pytest.approx(np.log(10))
+
+
 def test_difference_is_from_own_baseline(tmp_path: Path) -> None:
     """Two is above the experiment's baseline, and below the arm that it is compared with."""
     folder = tmp_path / "curves"
