@@ -22,15 +22,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 import sb3_cure
-from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure import CuReSAC, make_dmc_env, recipe
 from sb3_cure.evaluation.callbacks import EvalBothCallback
 from sb3_cure.evaluation.plots import in_style, save
 from sb3_cure.evaluation.result_files import describe_run, write_csv
 from sb3_cure.evaluation.rollouts import run_episodes
-from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, PROFILE, TASK
+from sb3_cure.experiments.demo import DOMAIN, ENV_KWARGS, ID, TASK
 
 MODES = ("sequential", "joint")
-SETTINGS = {**PROFILE, "intrinsic": "srl_error", "intrinsic_kwargs": {}, "curiosity_encoder_grad": False}
+SETTINGS = recipe("fast/curl", ID) | dict(curiosity="separate", intrinsic="srl_error", curiosity_encoder_grad=False)
 HEADS: dict[str, dict[str, Any]] = {
     "curl": {},
     # As in SAC-AE: no augmentation, and the burst of 1000 updates after the warm-up.

@@ -37,6 +37,7 @@ from sb3_cure.cli.zoo_files import (
     find_class,
     import_module,
     named_classes,
+    named_wrappers,
     read_yaml,
     zoo_file,
 )
@@ -137,9 +138,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
                 )
         hyperparams.setdefault("n_timesteps", self.n_timesteps)  # which rl-zoo3 deletes in any case
         hyperparams.update(named_classes(hyperparams))
-        for wrappers in (hyperparams.get("env_wrapper"), hyperparams.get("vec_env_wrapper")):
-            for each in wrappers if isinstance(wrappers, list) else [wrappers] if wrappers else []:
-                find_class(each if isinstance(each, str) else next(iter(each)))  # with the nearest names
+        for name in ("env_wrapper", "vec_env_wrapper"):
+            list(named_wrappers(hyperparams.get(name)))  # or the nearest names
         processed = super()._preprocess_hyperparams(hyperparams)
         rate = processed[0].get("learning_rate")
         if isinstance(rate, SimpleLinearSchedule):  # which archives do not know

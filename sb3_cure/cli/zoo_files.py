@@ -2,7 +2,7 @@
 
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +156,18 @@ def named_classes(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """
     given = {name: arguments.get(name) for name in (*OWN, "replay_buffer_class")}
     return {name: find_class(value) for name, value in given.items() if isinstance(value, str) and "." in value}
+
+
+def named_wrappers(named: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Import the wrappers that settings name.
+
+    :param named: As of rl-zoo3's ``env_wrapper``: None, a name, a name with its arguments, or a list of such
+    :return: Wrappers and their arguments, innermost first
+    :raises UsageError: as ``find_class``
+    """
+    for each in named if isinstance(named, list) else [named] if named else []:
+        [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
+        yield find_class(name), kwargs
 
 
 def find_class(name: str) -> Any:

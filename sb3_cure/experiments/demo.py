@@ -18,7 +18,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_cure import CuReSAC, make_dmc_env
+from sb3_cure import CuReSAC, make_dmc_env, recipe
+from sb3_cure.cli.zoo_files import zoo_entry, zoo_file
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
@@ -48,24 +49,11 @@ class LateFall:
 
 
 DOMAIN, TASK = "cartpole", "swingup"
-# The camera that follows the cart: the usual one is far away, and the cart drives out of its view.
-ENV_KWARGS: dict[str, Any] = dict(image_size=36, grayscale=True, camera_id=1, renderer="fast")
-#: That of ``zoo_configs/fast/curl``. Smaller images and networks than the paper's, and quicker targets, because two
-#: cores allow a fraction of the paper's updates
-PROFILE: dict[str, Any] = dict(
-    srl="curl",
-    augmentation="shift",
-    augmentation_kwargs=dict(pad=2),
-    learning_starts=500,
-    warmup_updates=300,
-    gamma=0.98,
-    tau=0.02,
-    target_update_interval=1,
-    policy_kwargs=dict(net_arch=[256, 256], features_extractor_kwargs=dict(n_filters=16)),
-)
-SETTINGS: dict[str, Any] = dict(
-    PROFILE,
-    srl=None,  # in ten minutes the encoder learns most from the critics alone
+ID = f"dmc_pixels/{DOMAIN}-{TASK}-v0"
+ENV_KWARGS: dict[str, Any] = zoo_entry(zoo_file("fast/best"), ID)["env_kwargs"]
+#: The recipe, with a curious agent that costs little
+SETTINGS: dict[str, Any] = recipe("fast/best", ID) | dict(
+    curiosity="separate",
     intrinsic="reconstruction",
     intrinsic_kwargs=dict(n_filters=8, n_layers=2),  # a fifth of an update less than with four layers
     curious_interval=4,  # the task's agent gets most of the time
@@ -74,11 +62,7 @@ SETTINGS: dict[str, Any] = dict(
     # the first half alone: then all that is collected is the task's.
     curiosity_prob=LinearSchedule(0.2, 0, 0.5),
     curiosity_bout="episode",
-    # A step costs a tenth of an update: two steps for each.
-    train_freq=2,
-    gradient_steps=1,
     learning_rate=LateFall(1e-3, 2e-5),
-    n_steps=3,
 )
 TOTAL_STEPS = 22_000
 EVALUATIONS, ROWS = 8, 4

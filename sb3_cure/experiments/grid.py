@@ -4,7 +4,7 @@ import contextlib
 import copy
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,8 +20,8 @@ from sb3_cure.cli.zoo_files import (
     GRIDS,
     ZOO,
     check_environment,
-    find_class,
     named_classes,
+    named_wrappers,
     read_yaml,
     zoo_entry,
     zoo_file,
@@ -231,7 +231,7 @@ class Cell:
         """
         env = gym.make(self.task, **self.env_kwargs)
         pays_task = True
-        for wrap, kwargs in self._wrappers():
+        for wrap, kwargs in named_wrappers(self.arguments.get("env_wrapper")):
             if pays_task and _changes_rewards(wrap):
                 env, pays_task = TaskReward(env), False
             env = wrap(env, **kwargs)
@@ -245,17 +245,10 @@ class Cell:
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
         """
         env = gym.make(self.task, **{**self.env_kwargs, **env_kwargs})
-        for wrap, kwargs in self._wrappers():
+        for wrap, kwargs in named_wrappers(self.arguments.get("env_wrapper")):
             if not _changes_rewards(wrap):
                 env = wrap(env, **kwargs)
         return env
-
-    def _wrappers(self) -> Iterator[tuple[Any, dict[str, Any]]]:
-        """Wrappers of ``env_wrapper`` and their arguments, innermost first."""
-        named = self.arguments.get("env_wrapper") or []
-        for each in named if isinstance(named, list) else [named]:
-            [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
-            yield find_class(name), kwargs
 
     def custom_objects(self) -> dict[str, Any]:
         """Import the user's classes that the arguments name; a model's archive needs them to be loaded."""
