@@ -6,6 +6,7 @@ An episode of T steps is one ``.npz`` file of five arrays, named and shaped as M
 agent is given: images unscaled, channels first or last. No file is unpickled.
 """
 
+import copy
 import itertools
 import uuid
 import warnings
@@ -20,7 +21,7 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 
-from sb3_cure.data.observations import by_key, copied, rows_of, stacked
+from sb3_cure.data.observations import by_key, rows_of, stacked
 
 #: One array, or one for each key of a dictionary
 Arrays = Any
@@ -62,9 +63,9 @@ def load_episode(path: str | Path) -> RecordedEpisode:
     :return: The episode
     """
     with np.load(path, allow_pickle=False) as file:
-        by_key = {name.partition("/")[2]: file[name] for name in file.files if name.startswith("observations/")}
+        parts = {name.partition("/")[2]: file[name] for name in file.files if name.startswith("observations/")}
         names = RecordedEpisode._fields[1:]
-        return RecordedEpisode(by_key or file["observations"], *(file[name] for name in names))
+        return RecordedEpisode(parts or file["observations"], *(file[name] for name in names))
 
 
 def episodes_of(source: str | Path | Iterable[Any]) -> Iterator[Any]:
@@ -109,7 +110,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         """
         self._write()
         observation, info = self.env.reset(**kwargs)
-        self._observations = [copied(observation)]
+        self._observations = [copy.deepcopy(observation)]
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -120,7 +121,7 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         """
         taken = np.array(action)  # the environment may change it
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._observations.append(copied(observation))
+        self._observations.append(copy.deepcopy(observation))
         self._steps.append([taken, float(reward), bool(terminated), bool(truncated)])
         if terminated or truncated:
             self._write()
@@ -182,11 +183,13 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
                 f"one has for T {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
             )
         actions = scale_action(np.asarray(episode.actions))
-        if actions.shape[1:] != buffer.action_space.shape or np.abs(actions).max(initial=0) > 1 + 1e-6:
+        if actions.shape[1:] != buffer.action_space.shape or not (np.abs(actions) <= 1 + 1e-6).all():
             raise ValueError(
                 f"actions of an episode, of shape {actions.shape[1:]}, are not within {buffer.action_space}: "
                 "record them as the environment takes them."
             )
+        if not all(np.isfinite(each).all() for each in (*by_key(observations).values(), episode.rewards)):
+            raise ValueError("an episode has observations or rewards that are not finite: leave it out.")
         for t, reward in enumerate(episode.rewards):
             terminated = bool(episode.terminations[t])
             done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)

@@ -66,8 +66,8 @@ class ModelArchive:
             self.is_pickled = "format" not in self.content  # but attributes of the model, as SB3 writes them
             if not self.is_pickled:
                 check_version(self.content["format"], name)
-            self._tensors = {} if self.is_pickled else load_tensors(archive.read(_TENSORS))
-            self.system_info = "" if self.is_pickled else archive.read(_SYSTEM_INFO).decode(errors="replace")
+                self._tensors = load_tensors(archive.read(_TENSORS))
+                self.system_info = archive.read(_SYSTEM_INFO).decode(errors="replace")
 
     def read(self, part: str) -> dict[str, Any]:
         """Read states.
@@ -244,6 +244,8 @@ class SavesModels(OffPolicyAlgorithm):
         model._setup_model()
         given = {key for key in _TEMPERATURES if key in kwargs and kwargs[key] != settings.get(key)}
         model._load_tensors(archive, given)
+        if model.use_sde:
+            model.policy.reset_noise()  # type: ignore[operator]  # of the loaded deviation, as SB3's load does
         return model
 
     def _load_tensors(self, archive: ModelArchive, given: set[str]) -> None:
@@ -280,7 +282,8 @@ class SavesModels(OffPolicyAlgorithm):
         if not isinstance(load_path_or_dict, dict):
             with reading(load_path_or_dict, "zip") as (file, name):
                 archive = ModelArchive(file, name)
-            load_path_or_dict = load_path_or_dict if archive.is_pickled else archive.read("parameters")
+            if not archive.is_pickled:
+                load_path_or_dict = archive.read("parameters")
         try:
             super().set_parameters(load_path_or_dict, exact_match, device)
         finally:

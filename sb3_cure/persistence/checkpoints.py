@@ -57,7 +57,7 @@ class CheckpointWriter:
         state = training_state(model, run)
         buffer: Any = model.replay_buffer
         segments: dict[str, list[_Segment]] = {}
-        # Of two trainings in this folder, which is refused, neither removes what the other is about to write.
+        # Locked, so that a second training in this folder, which is refused, removes no file that this one writes.
         with locked(self.generations.path, LOCK_SECONDS), self.generations.writing(keep) as draft:
             model.save(draft.folder / MODEL)
             for place, (key, ring) in enumerate(buffer.rings.items()):

@@ -168,8 +168,6 @@ def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[
         return {key: inside(item, f"{path}.{key}") for key, item in value.items()}
     if isinstance(value, np.str_):
         return str(value)
-    if isinstance(value, NUMBERS):
-        return {"!number": [name_of(kind), inside(value.item(), path)]}
     if isinstance(value, np.ndarray) and (dtype := value.dtype.newbyteorder("=")).type in NUMBERS:
         array = np.ascontiguousarray(value, dtype).reshape(value.shape)
         # What torch does not take: single elements may keep a negative stride.
@@ -211,8 +209,6 @@ def decode(node: Any, tensors: Callable[[str], th.Tensor], named: Mapping[str, A
     ((tag, content),) = node.items()
     if tag == "!float":
         return float(content)
-    if tag == "!number":
-        return {name_of(kind): kind for kind in NUMBERS}[content[0]](decode(content[1], tensors, named))
     if tag == "!array":
         return tensors(content).numpy()
     if tag == "!tensor":
@@ -241,6 +237,10 @@ def _generator(state: dict[str, Any]) -> np.random.Generator:
     return generator
 
 
+def _number(parts: list[Any]) -> np.generic:
+    return {name_of(kind): kind for kind in NUMBERS}[parts[0]](parts[1])
+
+
 def _random_state(state: dict[str, Any]) -> np.random.RandomState:
     random = np.random.RandomState()
     random.set_state(state)
@@ -254,6 +254,7 @@ _BY_ATTRIBUTES = (
 )
 #: By tag: class, function from an object to its parts, and back
 _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "number": (np.generic, lambda value: [name_of(type(value)), value.item()], _number),
     "tuple": (tuple, list, tuple),
     "dict": (dict, lambda value: [list(item) for item in value.items()], dict),
     "OrderedDict": (OrderedDict, lambda value: [list(item) for item in value.items()], OrderedDict),
@@ -278,10 +279,14 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "RandomState": (np.random.RandomState, lambda random: random.get_state(legacy=False), _random_state),
     **{name_of(kind): (kind, lambda value: dict(vars(value)), partial(_revived, kind)) for kind in _BY_ATTRIBUTES},
 }
-_TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()}
+_TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()} | dict.fromkeys(NUMBERS, "number")
 
 
 # -------------------------------------------------------------------- files
+
+
+#: Bytes of a header that the library reads
+LARGEST_HEADER = 100_000_000
 
 
 def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -292,6 +297,7 @@ def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[
     :param file: Where to write
     :param tensors: Contiguous tensors on the CPU, by name
     :param metadata: Texts for the header
+    :raises OSError: for a header that could not be read
     """
     header: dict[str, Any] = {} if metadata is None else {"__metadata__": metadata}
     by_alignment = sorted(tensors.items(), key=lambda item: -item[1].itemsize)
@@ -301,6 +307,8 @@ def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[
         header[name] = {"dtype": _DTYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
+    if len(text) > LARGEST_HEADER:
+        raise OSError(f"{len(text):,} bytes that are no arrays are more than can be read back")
     file.write(struct.pack("<Q", len(text)) + text)
     for _, tensor in by_alignment:
         # Not `view(-1)`: that keeps odd strides of single elements, which cannot be viewed as bytes.

@@ -85,7 +85,8 @@ class ResumableEnv(TransparentWrapper):
 
         :return: Values to be sent to another process
         """
-        return {"layers": _layer_states(_layers(self.env)), "random": random_streams()}
+        layers = _layers(self.env)
+        return {"built": _describe(layers), "layers": _layer_states(layers), "random": random_streams()}
 
     def load_exact_state(self, state: dict[str, Any]) -> str | None:
         """Restore the state.
@@ -111,11 +112,10 @@ def vec_env_state(venv: VecEnv) -> dict[str, Any]:
     :return: Values that ``encode`` knows
     """
     layers = _layers(venv)
-    state: dict[str, Any] = {"built": [_describe(layers)], "envs": [], "error": None}
+    state: dict[str, Any] = {"built": _describe(layers), "envs": [], "error": None}
     try:
         # The environments first: this may find a dead worker, which is then replaced.
         state["envs"] = _call_each(venv, "exact_state")
-        state["built"] += _call_each(venv, "describe")
     except (NotKept, OSError, EOFError, RuntimeError) as failure:
         state["error"] = str(failure) or type(failure).__name__
     return {**state, "layers": _layer_states(layers)}
@@ -145,8 +145,8 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> str | None:
     try:
         built += _call_each(venv, "describe") if state["envs"] else []
     except NotKept as failure:
-        error, state = str(failure), {**state, "envs": [], "built": state["built"][:1]}
-    for saved, own in zip(state["built"], built, strict=True):
+        error, state = str(failure), {**state, "envs": []}
+    for saved, own in zip([state["built"], *(each["built"] for each in state["envs"])], built, strict=True):
         if saved != own:
             raise ValueError(
                 f"the saved state is of {saved}, and here is {own}: build the environments as they were when it was "

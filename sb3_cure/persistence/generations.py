@@ -126,7 +126,7 @@ class Generations:
             self._newest = draft.number
             flush_to_disk(self.path)
         finally:
-            # Where this one failed, no other goes for it: the newest of them may be damaged.
+            # If writing failed, no generation is removed: the newest one may be damaged.
             self._remove_all_but(keep if self._newest == draft.number else len(self.numbers()))
 
     def _remove_all_but(self, keep: int) -> None:

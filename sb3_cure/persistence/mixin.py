@@ -101,7 +101,8 @@ class Persistence(SavesModels, SavesReplayBuffers):
         resumed = run.resumed
         continues = resumed is not None and reset_num_timesteps
         if resumed is not None and continues:
-            total_timesteps, reset_num_timesteps = resumed.left_of(total_timesteps), False
+            total_timesteps += resumed.num_timesteps_at_start - resumed.num_timesteps  # what is left, maybe nothing
+            reset_num_timesteps = False
         total, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )

@@ -89,7 +89,7 @@ class Resumption:
         assert model.env is not None
         self.state, self.num_timesteps = state, model.num_timesteps
         # What SB3's set-up of `learn` changes
-        self._num_timesteps_at_start = model._num_timesteps_at_start
+        self.num_timesteps_at_start = model._num_timesteps_at_start
         self._action_noise = copy.deepcopy(model.action_noise)
         #: Whether a ``learn`` came that had nothing left to do
         self.is_over = False
@@ -100,14 +100,6 @@ class Resumption:
             # Other first states than those that this training has begun with
             model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)
 
-    def left_of(self, total_timesteps: int) -> int:
-        """Get what is left of the interrupted call.
-
-        :param total_timesteps: Agent steps of that call
-        :return: Agent steps, 0 or less if there are none
-        """
-        return self._num_timesteps_at_start + total_timesteps - self.num_timesteps
-
     def set_up(self, model: OffPolicyAlgorithm, callbacks: list[BaseCallback], continues: bool) -> None:
         """Restore callbacks, and what SB3's set-up has begun anew.
 
@@ -117,7 +109,7 @@ class Resumption:
         """
         model.action_noise = copy.deepcopy(self._action_noise)
         if continues:
-            model._num_timesteps_at_start = self._num_timesteps_at_start
+            model._num_timesteps_at_start = self.num_timesteps_at_start
         for name, values in self.state["recorded"].items():
             getattr(model.logger, name).update(values)
         saved = list(self.state["callbacks"])

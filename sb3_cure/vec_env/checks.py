@@ -1,8 +1,6 @@
 """Put environments into the checks that every training needs."""
 
-from typing import Any
-
-from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
 
 from sb3_cure.envs.copy_observations import CopyObservations
@@ -30,14 +28,9 @@ def check_environments(venv: VecEnv) -> FiniteCheck:
 
 def _check_normalizer(venv: VecEnv) -> None:
     normalizer = unwrap_vec_wrapper(venv, VecNormalize)
-    if normalizer is not None and _shapes(venv.observation_space) != _shapes(normalizer.observation_space):
+    if normalizer is not None and get_obs_shape(venv.observation_space) != get_obs_shape(normalizer.observation_space):
         raise ValueError(
             "VecNormalize is inside of a wrapper that changes the shape of observations, but the replay buffer stores "
             "what VecNormalize gets: put it outside, such as VecNormalize(VecTransposeImage(venv)) for images with the "
             "channels last."
         )
-
-
-def _shapes(space: spaces.Space) -> dict[str, Any]:
-    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    return {key: part.shape for key, part in parts.items()}

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_cure.data.observations import image_spaces, images_of
 from sb3_cure.envs.copy_observations import CopyObservations
-from sb3_cure.envs.wrappers import positive_attribute
+from sb3_cure.envs.wrappers import action_repeat_of, channel_axis, positive_attribute
 
 #: Least change of a coordinate in one agent step that counts as motion, metres or radians
 FROZEN_MOTION = 0.01
@@ -55,7 +55,7 @@ class FrameWatch(CopyObservations):
             state = _joint_positions
         self._state = None if frozen_steps is None or not image_spaces(env.observation_space) else state
         # In agent steps
-        self._patience = (frozen_steps or 0) / positive_attribute(env, "action_repeat")
+        self._patience = (frozen_steps or 0) / action_repeat_of(env)
         # Latest frame of each image, and during how many moving steps it has stayed the same
         self._frames: dict[str, np.ndarray] = {}
         self._n_frozen: dict[str, int] = {}
@@ -95,10 +95,10 @@ class FrameWatch(CopyObservations):
                 )
 
     def _newest(self, image: np.ndarray) -> np.ndarray:
-        """Get the newest frame of a stack; as in SB3, the smallest dimension is that of the channels."""
-        axis = 2 if image.shape[2] < min(image.shape[:2]) else 0
-        oldest, left_over = divmod(image.shape[axis] * (self._frame_stack - 1), self._frame_stack)
-        return image if left_over else image[(slice(None),) * axis + (slice(oldest, None),)]
+        """Get the newest frame of a stack, channels first."""
+        channels = np.moveaxis(image, channel_axis(image.shape), 0)
+        n_channels, left_over = divmod(len(channels), self._frame_stack)
+        return image if left_over else channels[-n_channels:]
 
 
 def _joint_positions(env: gym.Env) -> np.ndarray:

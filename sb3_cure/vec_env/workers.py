@@ -339,6 +339,9 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         self._seeds, self._options = state["seeds"], state["options"]
         for worker, own in zip(self.remotes, state["workers"], strict=True):
             vars(worker).update(own)
+            for attribute in own["attributes"].items():
+                worker.send(("set_attr", attribute))
+                worker.recv()
 
     def close(self) -> None:
         """End all workers, within ten seconds or ``timeout``, whichever is less."""

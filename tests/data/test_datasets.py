@@ -98,6 +98,17 @@ def test_lengths_of_an_episode_must_agree() -> None:
     assert model.replay_buffer.size() == 0
 
 
+@pytest.mark.parametrize("part", ["observations", "actions", "rewards"])
+def test_numbers_that_are_not_finite_are_refused(part: str) -> None:
+    ends = np.zeros(8, bool)
+    episode = RecordedEpisode(np.zeros((9, 2), np.float32), np.zeros((8, 2)), np.zeros(8), ends, ends)
+    getattr(episode, part)[3] = np.nan
+    model = tiny_model("MlpPolicy", VectorBox())
+    with pytest.raises(ValueError, match=r"not finite|not within"):
+        model.load_transitions([episode])
+    assert model.replay_buffer.size() == 0
+
+
 def test_rows_of_several_environments_are_counted() -> None:
     """One long episode beside a short one fills the buffer's rows, and the rest of them is empty."""
     envs = make_vec_env(VectorBox, 2)

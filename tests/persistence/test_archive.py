@@ -18,7 +18,7 @@ import torch as th
 from dictionaries_for_tests import Goal
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
-from stable_baselines3 import TD3, HerReplayBuffer
+from stable_baselines3 import SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
@@ -185,6 +185,19 @@ def test_other_algorithms_are_saved_alike(tmp_path: Path) -> None:
     loaded.load_replay_buffer(tmp_path / "buffer")
     assert differences(state_of(model), state_of(loaded)) == []
     assert loaded.learn(5, reset_num_timesteps=False).num_timesteps == 25
+
+
+def test_noise_of_generalised_exploration_has_the_loaded_size(tmp_path: Path) -> None:
+    class SafeSAC(Persistence, SAC):
+        """SAC without pickle."""
+
+    model: Any = SafeSAC("MlpPolicy", VectorBox(), use_sde=True, policy_kwargs=dict(net_arch=[4]))
+    model.policy.actor.log_std.data.fill_(-20.0)  # as training would
+    model.policy.reset_noise()
+    model.save(tmp_path / "model")
+    seen = np.ones((1, 2), np.float32)
+    expected, found = (each.predict(seen)[0] for each in (model, SafeSAC.load(tmp_path / "model")))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 # ----------------------------------------------------------- SB3's conventions

@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from safetensors.torch import load_file
 
 from benchmarks.fuzz import parts_of, safetensors_of, watching
-from sb3_cure.persistence import ArchiveError, read_state, write_state
+from sb3_cure.persistence import ArchiveError, encoding, read_state, write_state
 
 TENSOR_DTYPES = [th.uint8, th.int16, th.int64, th.bool, th.bfloat16, th.float16, th.float32, th.float64]
 
@@ -107,6 +107,15 @@ def test_special_floats_come_back() -> None:
     state = read_state(file)
     assert state["floats"][:2] == [math.inf, -math.inf] and math.isnan(state["floats"][2])
     assert same(state["number"], np.float32(-math.inf))
+
+
+def test_what_could_not_be_read_back_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """safetensors reads headers up to a size."""
+    monkeypatch.setattr(encoding, "LARGEST_HEADER", 1000)
+    write_state(io.BytesIO(), {"log": [0.5] * 100})
+    with pytest.raises(OSError, match="no arrays"):
+        write_state(file := io.BytesIO(), {"log": [0.5] * 1000})
+    assert file.getvalue() == b""
 
 
 def test_shared_tensors_are_written_twice(tmp_path: Path) -> None:

@@ -378,6 +378,7 @@ def test_resumed_environments_continue_bit_for_bit() -> None:
     state = vec_env_state(whole)
     load_vec_env_state(resumed, state)
     assert differences(vec_env_state(resumed), state) == []
+    assert resumed.get_attr("difficulty") == [0, 3]
     runs = []
     for env in (whole, resumed):
         kill(env)
