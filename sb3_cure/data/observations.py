@@ -53,17 +53,6 @@ def by_key(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {"": value}
 
 
-def copied(observation: Any) -> Any:
-    """Copy an observation, which the environment may write the next one into.
-
-    :param observation: An observation
-    :return: A copy
-    """
-    if isinstance(observation, dict):
-        return {key: np.array(value) for key, value in observation.items()}
-    return np.array(observation)
-
-
 def stacked(observations: Sequence[Any]) -> Any:
     """Stack observations along a new first axis.
 
@@ -86,15 +75,6 @@ def rows_of(observations: Any, rows: Any) -> Any:
     if isinstance(observations, Mapping):
         return {key: rows_of(part, rows) for key, part in observations.items()}
     return observations[rows]
-
-
-def len_of(observations: Any) -> int:
-    """Count observations.
-
-    :param observations: [n, *shape], or a dictionary of such
-    :return: n
-    """
-    return len_of(next(iter(observations.values()))) if isinstance(observations, Mapping) else len(observations)
 
 
 def sensed_space(space: spaces.Space) -> spaces.Space:

@@ -18,6 +18,8 @@ Seed = int | Sequence[int] | None
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp")
 #: Kinds of geoms that floors and walls are of: planes and height fields (MuJoCo's mjtGeom)
 _GROUND = (0, 1)
+#: MuJoCo's number of the kind "geom" (mjtObj)
+_GEOM = 5
 
 
 class Background:
@@ -74,7 +76,7 @@ class Background:
         """
         seen = camera.render(segmentation=True)
         numbers, kinds = seen[..., 0], seen[..., 1]
-        return (kinds == -1) | (kinds == _geom()) & np.isin(numbers, self._ground)
+        return (kinds == -1) | (kinds == _GEOM) & np.isin(numbers, self._ground)
 
     def behind(self, frame: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Put this background behind the robot.
@@ -100,9 +102,3 @@ class Background:
         """
         self.rng.bit_generator.state = state["rng"]
         self._show(state["drawn"])
-
-
-def _geom() -> int:
-    import mujoco
-
-    return int(mujoco.mjtObj.mjOBJ_GEOM)

@@ -18,7 +18,7 @@ from sb3_cure.envs.wrappers import ActionRepeat, NormalizeActions, StackFrames, 
 ACTION_REPEATS = {"cartpole": 8, "finger": 2, "walker": 2}
 # Camera 0 of the quadruped does not follow it; 0 for all other domains.
 CAMERAS = {"quadruped": 2}
-# All other tasks end by themselves after 1000 steps of physics.
+# All other tasks end by themselves after 1000 environment steps.
 STEP_LIMITS = {"lqr": 1000}
 RENDER_FLAGS: dict[str, dict[str, bool]] = {"dmc": {}, "fast": {"shadow": False, "reflection": False}}
 VIDEO_SIZE = 256
@@ -245,7 +245,7 @@ def _make_shimmy_env(domain: str, task: str, seed: int | None, **kwargs: Any) ->
     )
     base: Any = env.unwrapped
     base.np_random = np.random.RandomState(seed)
-    # What nobody sees would be computed in every step of physics: a tenth of cartpole's time in 36 px.
+    # What nobody sees would be computed in every environment step: a tenth of cartpole's time in 36 px.
     base.task.get_observation = _no_observation
     base.observation_space = spaces.Dict()
     # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.

@@ -246,13 +246,17 @@ class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs)
         return {**observation, **{key: self._resize(observation[key]) for key in self._keys}}
 
     def _resize(self, image: np.ndarray) -> np.ndarray:
-        if _channel_axis(image.shape) == 0:
+        if channel_axis(image.shape) == 0:
             return resize_image(image, self._height, self._width)
         return np.moveaxis(resize_image(np.moveaxis(image, 2, 0), self._height, self._width), 0, 2)
 
 
-def _channel_axis(shape: tuple[int, ...]) -> int:
-    """Find the axis of the channels; as in SB3, they are the smallest dimension."""
+def channel_axis(shape: tuple[int, ...]) -> int:
+    """Find the axis of the channels; as in SB3, they are the smallest dimension.
+
+    :param shape: Shape of an observation
+    :return: 0 or, of images with the channels last, 2
+    """
     return 2 if len(shape) == 3 and shape[2] < min(shape[:2]) else 0
 
 
@@ -288,7 +292,7 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             raise ValueError(
                 f"Observations of {space} cannot be stacked: expected a Box; wrap in PixelObservation first."
             )
-        self._axes = {key: _channel_axis(box.shape) for key, box in boxes.items()}
+        self._axes = {key: channel_axis(box.shape) for key, box in boxes.items()}
         stacked = {**parts, **{key: self._stacked_space(box, self._axes[key]) for key, box in boxes.items()}}
         self.observation_space = spaces.Dict(list(stacked.items())) if is_dict else stacked[""]
         self._frames: dict[str, deque[np.ndarray]] = {key: deque(maxlen=self.frame_stack) for key in boxes}
