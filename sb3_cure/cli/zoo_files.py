@@ -161,13 +161,16 @@ def named_classes(arguments: Mapping[str, Any]) -> dict[str, Any]:
 def named_wrappers(named: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Import the wrappers that settings name.
 
-    :param named: As of rl-zoo3's ``env_wrapper``: None, a name, a name with its arguments, or a list of such
+    :param named: As of rl-zoo3's ``env_wrapper``: None, a name or class, alone or with its arguments, or a list of such
     :return: Wrappers and their arguments, innermost first
-    :raises UsageError: as ``find_class``
+    :raises UsageError: as ``find_class``, or for several in one mapping
     """
     for each in named if isinstance(named, list) else [named] if named else []:
-        [(name, kwargs)] = each.items() if isinstance(each, dict) else [(each, {})]
-        yield find_class(name), kwargs
+        parts = list(each.items()) if isinstance(each, dict) else [(each, {})]
+        if len(parts) != 1:
+            raise UsageError(f"{each} must be one wrapper with its arguments: give several as a list.")
+        ((name, kwargs),) = parts
+        yield (name if isinstance(name, type) else find_class(name)), kwargs
 
 
 def find_class(name: str) -> Any:

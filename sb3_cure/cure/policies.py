@@ -157,9 +157,9 @@ class CuRePolicy(BasePolicy):
 
     @classmethod
     def _choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-        """Of dictionaries without images the one for vectors."""
-        joined = isinstance(observation_space, spaces.Dict) and not image_spaces(observation_space)
-        return VectorEncoder if joined else cls.default_encoder
+        """The default, but for dictionaries without images, which act as one vector."""
+        is_vector = cls.default_encoder is DictEncoder and not image_spaces(observation_space)
+        return VectorEncoder if is_vector else cls.default_encoder
 
     def _encoder_kwargs(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> dict[str, Any]:
         """Head defaults, overridden by the user's kwargs."""

@@ -188,13 +188,21 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
                 f"actions of an episode, of shape {actions.shape[1:]}, are not within {buffer.action_space}: "
                 "record them as the environment takes them."
             )
-        if not all(np.isfinite(each).all() for each in (*by_key(observations).values(), episode.rewards)):
-            raise ValueError("an episode has observations or rewards that are not finite: leave it out.")
+        if not all(map(_is_finite, (*by_key(observations).values(), episode.rewards))):
+            raise ValueError("an episode has observations or rewards that are not finite in float32: leave it out.")
         for t, reward in enumerate(episode.rewards):
             terminated = bool(episode.terminations[t])
             done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)
             info = {"TimeLimit.truncated": done and not terminated}
             yield rows_of(observations, t), rows_of(observations, t + 1), actions[t], float(reward), done, info
+
+
+def _is_finite(numbers: Any) -> bool:
+    """Whether all are in float32, as they are stored; images always are."""
+    if getattr(numbers, "dtype", None) == np.uint8:
+        return True
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(np.asarray(numbers).astype(np.float32)).all())
 
 
 def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:

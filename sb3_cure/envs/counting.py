@@ -1,6 +1,5 @@
 """Visits of cells of the true state, in the info and as a reward; and the task's reward below other ones."""
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -78,7 +77,7 @@ class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
         super().__init__(env)
         self._indices, self._widths = _grid(env, widths)
         #: Visits of each cell
-        self.visits = Counter[tuple[int, ...]]()
+        self.visits: dict[tuple[int, ...], int] = {}
 
     def reward(self, reward: Any) -> float:
         """Count a visit.
@@ -87,8 +86,22 @@ class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
         :return: The reward of the cell that the step has led to
         """
         cell = _cell(self.env, self._indices, self._widths)
-        self.visits[cell] += 1
+        self.visits[cell] = self.visits.get(cell, 0) + 1
         return self.visits[cell] ** -0.5
+
+    def state_dict(self) -> dict[str, Any]:
+        """Get the counts, for exact resume.
+
+        :return: Plain data
+        """
+        return {"cells": np.array(list(self.visits), dtype=np.int64), "visits": list(self.visits.values())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the counts.
+
+        :param state: Result of ``state_dict``
+        """
+        self.visits = dict(zip(map(tuple, state["cells"].tolist()), state["visits"], strict=True))
 
 
 def _grid(env: gym.Env, widths: Mapping[str, float]) -> tuple[list[int], np.ndarray]:

@@ -35,7 +35,7 @@ class Episode:
     :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty without a head
     :param observations: Observations before each step, [T, *shape], or such by key; images channels first, as the
         model gets them
-    :param frames: ``env.render()`` before each step, if requested
+    :param frames: ``env.render()`` before each step and after the last one, [T + 1], if requested; else empty
     :param states: True state of the environment before each step, [T, d], if requested; else empty
     """
 
@@ -148,7 +148,7 @@ def run_episodes(
     :param deterministic: Whether policies act by their mean
     :param seed: Seed of the first reset and of random actions. The environment's random numbers decide where later
         episodes start: equal for all policies if ``step`` draws none, as in DeepMind Control
-    :param render: Whether to keep ``env.render()`` before each step
+    :param render: Whether to keep ``env.render()`` before each step and after the last one
     :param states: Whether to keep the true state before each step: ``True`` for that of a dm_control environment
         (``sb3_cure.envs.physics_state``), or a function of the environment that returns an array [d]
     :return: The episodes
@@ -185,6 +185,8 @@ def run_episodes(
             observations.append(_own_keys(observation, model.observation_space))
             rewards.append(float(reward))
             dones.append(terminated)
+        if render:
+            frames.append(env.render())
         seen: Any = _channels_first(stacked(observations), model.observation_space)
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):

@@ -57,7 +57,7 @@ def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3, size: i
     :param size: Height of the GIF in pixels
     """
     pictures = []
-    for frame, observation in zip(episode.frames, episode.observations, strict=True):
+    for frame, observation in zip(episode.frames[:-1], episode.observations, strict=True):
         seen = observation[-channels:].transpose(1, 2, 0).repeat(3 // channels, axis=2)
         rendered = Image.fromarray(frame).resize((size, size), Image.Resampling.LANCZOS)
         picture = Image.new("RGB", (2 * size + 4, size), "white")
@@ -79,7 +79,7 @@ def annotated_frames(episode: Episode, action_repeat: int, title: str, top: floa
     :param top: Error at the upper end of the curve
     :return: RGB pictures, uint8 [height, width, 3] of even sizes; small frames are magnified
     """
-    returns = episode.rewards.cumsum() - episode.rewards  # so far
+    returns = np.concatenate([[0], episode.rewards.cumsum()])
     for step, frame in enumerate(episode.frames):
         caption = f"environment step {step * action_repeat}, return {returns[step]:.0f}"
         errors = episode.srl_errors[: step + 1]

@@ -285,8 +285,8 @@ _TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()} | dict.fromkeys(NUMBER
 # -------------------------------------------------------------------- files
 
 
-#: Bytes of a header that the library reads
-LARGEST_HEADER = 100_000_000
+#: Bytes of values that are no arrays: the library reads headers of 100 MB
+LARGEST_HEADER = 95_000_000
 
 
 def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[str, str] | None = None) -> None:
@@ -297,7 +297,6 @@ def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[
     :param file: Where to write
     :param tensors: Contiguous tensors on the CPU, by name
     :param metadata: Texts for the header
-    :raises OSError: for a header that could not be read
     """
     header: dict[str, Any] = {} if metadata is None else {"__metadata__": metadata}
     by_alignment = sorted(tensors.items(), key=lambda item: -item[1].itemsize)
@@ -307,8 +306,6 @@ def write_tensors(file: BinaryIO, tensors: dict[str, th.Tensor], metadata: dict[
         header[name] = {"dtype": _DTYPES[tensor.dtype], "shape": list(tensor.shape), "data_offsets": [start, end]}
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
-    if len(text) > LARGEST_HEADER:
-        raise OSError(f"{len(text):,} bytes that are no arrays are more than can be read back")
     file.write(struct.pack("<Q", len(text)) + text)
     for _, tensor in by_alignment:
         # Not `view(-1)`: that keeps odd strides of single elements, which cannot be viewed as bytes.
@@ -321,9 +318,12 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
     :param file: Path to write to (not atomically: see ``replacing``), or a binary file
     :param state: What ``encode`` knows
     :raises TypeError: for anything else; the file is not touched then
+    :raises OSError: for more than could be read back, without arrays; the file is not touched then
     """
     tensors: dict[str, th.Tensor] = {}
     metadata = {"format": str(VERSION), "state": json.dumps(encode(state, "state", tensors))}
+    if len(metadata["state"]) > LARGEST_HEADER:
+        raise OSError(f"{len(metadata['state']):,} bytes that are no arrays are more than can be read back")
     with open(file, "wb") if isinstance(file, str | Path) else contextlib.nullcontext(file) as stream:
         write_tensors(stream, tensors, metadata)
 

@@ -112,10 +112,11 @@ def vec_env_state(venv: VecEnv) -> dict[str, Any]:
     :return: Values that ``encode`` knows
     """
     layers = _layers(venv)
-    state: dict[str, Any] = {"built": _describe(layers), "envs": [], "error": None}
+    state: dict[str, Any] = {"built": [_describe(layers)], "envs": [], "error": None}
     try:
         # The environments first: this may find a dead worker, which is then replaced.
         state["envs"] = _call_each(venv, "exact_state")
+        state["built"] += [each.pop("built") for each in state["envs"]]
     except (NotKept, OSError, EOFError, RuntimeError) as failure:
         state["error"] = str(failure) or type(failure).__name__
     return {**state, "layers": _layer_states(layers)}
@@ -145,8 +146,8 @@ def load_vec_env_state(venv: VecEnv, state: dict[str, Any]) -> str | None:
     try:
         built += _call_each(venv, "describe") if state["envs"] else []
     except NotKept as failure:
-        error, state = str(failure), {**state, "envs": []}
-    for saved, own in zip([state["built"], *(each["built"] for each in state["envs"])], built, strict=True):
+        error, state = str(failure), {**state, "envs": [], "built": state["built"][:1]}
+    for saved, own in zip(state["built"], built, strict=True):
         if saved != own:
             raise ValueError(
                 f"the saved state is of {saved}, and here is {own}: build the environments as they were when it was "

@@ -118,6 +118,8 @@ class _Originals:
         self._venv, self._finite_check = venv, check
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # asked while it is copied, before it has anything
+            raise AttributeError(name)
         return getattr(self._venv, name)
 
     def reset(self) -> VecEnvObs:

@@ -44,6 +44,7 @@ TYPOS = {
     "train --conf-file fast/best": "--env must name an environment",
     "train --env CartPole-v1 --conf-file fast/best": "actions are Discrete(2)",
     "doctor --env CartPole-v1": "actions are Discrete(2)",
+    f"{TRAIN} env_wrapper:\"{{'my_module.Mine': {{}}, 'my_module.Other': {{}}}}\"": "one wrapper with its arguments",
     f"{TRAIN} --env-kwargs image_sise:36": "did you mean image_size?",
     f"{TRAIN} --algo cure_tcq": "'cure_tqc'",
     f"{TRAIN} --sede 1": "unrecognized arguments: --sede",

@@ -99,10 +99,11 @@ def test_lengths_of_an_episode_must_agree() -> None:
 
 
 @pytest.mark.parametrize("part", ["observations", "actions", "rewards"])
-def test_numbers_that_are_not_finite_are_refused(part: str) -> None:
+@pytest.mark.parametrize("number", [np.nan, 1e39])
+def test_numbers_that_are_not_finite_are_refused(part: str, number: float) -> None:
     ends = np.zeros(8, bool)
-    episode = RecordedEpisode(np.zeros((9, 2), np.float32), np.zeros((8, 2)), np.zeros(8), ends, ends)
-    getattr(episode, part)[3] = np.nan
+    episode = RecordedEpisode(np.zeros((9, 2)), np.zeros((8, 2)), np.zeros(8), ends, ends)
+    getattr(episode, part)[3] = number
     model = tiny_model("MlpPolicy", VectorBox())
     with pytest.raises(ValueError, match=r"not finite|not within"):
         model.load_transitions([episode])

@@ -135,14 +135,14 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
 def test_any_algorithm_can_be_filmed(
     make: Callable[[Any], BaseAlgorithm], env: type[VectorBox], tmp_path: Path
 ) -> None:
-    """An episode of 20 steps in 20 frames that change, with a caption and, without an SRL head, no error."""
+    """An episode of 20 steps in 21 frames that change, with a caption and, without an SRL head, no error."""
     callback = PolicyVideoCallback(Filmed(env()), tmp_path / "videos", every=20, seed=1)
     make(env()).learn(30, callback=callback)
     assert names(tmp_path / "videos") == ["task_policy_20_steps.mp4"]
     with imageio.get_reader(tmp_path / "videos" / "task_policy_20_steps.mp4") as video:
         assert video.get_meta_data()["fps"] == 12
         frames = np.stack([np.asarray(frame) for frame in video])
-    assert frames.shape[0] == 20 and frames.shape[2] == 256
+    assert frames.shape[0] == 21 and frames.shape[2] == 256
     camera, caption = frames[:, :192].astype(int), frames[:, 192:].astype(int)
     assert np.abs(camera[0] - camera[-1]).max() > 100
     assert (caption < 80).any() and not is_red(caption).any()
@@ -162,7 +162,7 @@ def test_video_shows_both_policies_with_their_errors(tmp_path: Path) -> None:
     # The update after the last step came after the film.
     for actor in ("task", "curious"):
         frames = np.stack(imageio.mimread(tmp_path / f"{actor}_policy_20_steps.mp4", memtest=False))
-        assert len(frames) == 20
+        assert len(frames) == 21
         (episode,) = run_episodes(model, env, 1, actor, seed=4, render=True)
         first = episode.frames[0].repeat(4, axis=0).repeat(4, axis=1).astype(int)
         assert np.abs(frames[0, :192] - first).mean() < 5
@@ -176,7 +176,8 @@ def test_frames_show_what_the_agent_saw() -> None:
     env = PixelBox()
     env.render = lambda: env.frames[-1]  # type: ignore[method-assign]
     (episode,) = run_episodes(tiny_model("CnnPolicy", PixelBox()), env, 1, seed=4, render=True)
-    np.testing.assert_array_equal(np.stack(episode.frames), episode.observations[:, -3:])
+    np.testing.assert_array_equal(np.stack(episode.frames[:-1]), episode.observations[:, -3:])
+    assert len(episode.frames) == len(episode.rewards) + 1 and (episode.frames[-1] != episode.frames[-2]).any()
 
 
 def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Path) -> None:

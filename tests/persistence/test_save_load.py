@@ -131,8 +131,8 @@ def test_load_without_environment(tmp_path: Path) -> None:
 
 
 def test_load_keeps_the_frame_stack_beside_other_arguments_of_the_buffer(tmp_path: Path) -> None:
-    make = functools.partial(PixelBox, frame_stack=2)
-    tiny_model("CnnPolicy", make()).save(tmp_path / "model.zip")
+    make = functools.partial(PixelBox, frame_stack=2, tells_frame_stack=False)
+    tiny_model("CnnPolicy", make(), replay_buffer_kwargs=dict(frame_stack=2)).save(tmp_path / "model.zip")
     loaded = CuReSAC.load(tmp_path / "model.zip", make(), replay_buffer_kwargs=dict(frames_dir=tmp_path / "frames"))
     assert loaded.replay_buffer.frame_stack == loaded.policy._arguments["reward_settings"]["frame_stack"] == 2
 
