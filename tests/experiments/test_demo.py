@@ -50,7 +50,7 @@ def test_demo_draws_pictures_and_a_video(written: Path) -> None:
         picture = np.asarray(Image.open(written / f"{name}.png").convert("L"))
         assert picture.std() > 5, f"{name}.png is blank"
     frames = imageio.mimread(written / "policies.mp4", memtest=False)
-    assert len(frames) == 125
+    assert len(frames) == 126
     # Two policies side by side; below each the curve of its error grows from the first to the last frame.
     width = frames[0].shape[1] // 2
     for left in (0, width):
