@@ -21,7 +21,7 @@ from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import maybe_transpose
 
-from sb3_cure.data.observations import by_key, rows_of, stacked
+from sb3_cure.data.observations import by_key, first_not_finite, rows_of, stacked
 
 #: One array, or one for each key of a dictionary
 Arrays = Any
@@ -188,21 +188,13 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
                 f"actions of an episode, of shape {actions.shape[1:]}, are not within {buffer.action_space}: "
                 "record them as the environment takes them."
             )
-        if not all(map(_is_finite, (*by_key(observations).values(), episode.rewards))):
+        if first_not_finite(observations) or first_not_finite(np.asarray(episode.rewards, np.float64)):
             raise ValueError("an episode has observations or rewards that are not finite in float32: leave it out.")
         for t, reward in enumerate(episode.rewards):
             terminated = bool(episode.terminations[t])
             done = terminated or bool(episode.truncations[t]) or t + 1 == len(actions)
             info = {"TimeLimit.truncated": done and not terminated}
             yield rows_of(observations, t), rows_of(observations, t + 1), actions[t], float(reward), done, info
-
-
-def _is_finite(numbers: Any) -> bool:
-    """Whether all are in float32, as they are stored; images always are."""
-    if getattr(numbers, "dtype", None) == np.uint8:
-        return True
-    with np.errstate(over="ignore"):
-        return bool(np.isfinite(np.asarray(numbers).astype(np.float32)).all())
 
 
 def _as_stored(observations: Arrays, space: spaces.Space) -> Arrays:

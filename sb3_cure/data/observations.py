@@ -77,6 +77,22 @@ def rows_of(observations: Any, rows: Any) -> Any:
     return observations[rows]
 
 
+def first_not_finite(observations: Any) -> tuple[int, str, float] | None:
+    """Find the first number that is not finite in float32, in which numbers are stored and networks compute.
+
+    :param observations: [n, *shape], or a dictionary of such
+    :return: Its place along the first axis, its key or ``""``, and the number; None if all are finite
+    """
+    for key, part in by_key(observations).items():
+        if np.issubdtype(part.dtype, np.floating):
+            with np.errstate(over="ignore"):
+                finite = np.isfinite(part.astype(np.float32, copy=False))
+            if not finite.all():
+                where = tuple(np.argwhere(~finite)[0])
+                return int(where[0]), key, float(part[where])
+    return None
+
+
 def sensed_space(space: spaces.Space) -> spaces.Space:
     """Space of observations as encoder, head and rewards get them: a dictionary without images is one vector.
 

@@ -240,9 +240,9 @@ class SavesModels(OffPolicyAlgorithm):
         vars(model).update(settings)
         if unknown := kwargs.keys() - vars(model).keys() - archive.content["settings"].keys():
             raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
-        if kwargs.get("replay_buffer_kwargs") is not None:  # what the environment may not tell
-            stack = {k: v for k, v in settings.get("replay_buffer_kwargs", {}).items() if k == "frame_stack"}
-            kwargs["replay_buffer_kwargs"] = stack | kwargs["replay_buffer_kwargs"]
+        changed, saved = kwargs.get("replay_buffer_kwargs"), settings.get("replay_buffer_kwargs", {})
+        if changed is not None and "frame_stack" in saved:  # which the environment may not tell
+            kwargs["replay_buffer_kwargs"] = {"frame_stack": saved["frame_stack"], **changed}
         vars(model).update(kwargs)
         model._setup_model()
         given = {key for key in _TEMPERATURES if key in kwargs and kwargs[key] != settings.get(key)}

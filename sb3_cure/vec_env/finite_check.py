@@ -9,6 +9,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_cure.data.observations import first_not_finite
+
 
 class BadTransitionError(ValueError):
     """A reward, an observation or an action is not finite; it was neither returned nor executed."""
@@ -45,7 +47,7 @@ class FiniteCheck(VecEnvWrapper):
         :param actions: Actions, [n_envs, ...]
         :raises BadTransitionError: If one is not finite; none is executed then
         """
-        if (found := _find_bad(actions)) is not None:
+        if (found := first_not_finite(actions)) is not None:
             raise BadTransitionError(
                 f"the agent chose the action {actions[found[0]]} for environment {found[0]} at agent step "
                 f"{self.n_steps}, but actions must be finite: check action_noise and the policy's parameters."
@@ -100,7 +102,7 @@ class FiniteCheck(VecEnvWrapper):
         return np.zeros(0) if observation is None else np.asarray(observation)[None]
 
     def _check(self, kind: str, values: Any, is_normalized: bool, index: int | None = None) -> None:
-        if (found := _find_bad(values)) is None:
+        if (found := first_not_finite(values)) is None:
             return
         row, key, number = found
         source = "VecNormalize made" if is_normalized else f"environment {row if index is None else index} returned"
@@ -127,15 +129,3 @@ class _Originals:
 
     def step_wait(self) -> VecEnvStepReturn:
         return self._finite_check._step_wait(self._venv, False)
-
-
-def _find_bad(values: Any) -> tuple[int, str, float] | None:
-    """Find the first number that is not finite in float32: its environment, its key or "", and the number."""
-    for key, part in values.items() if isinstance(values, dict) else [("", values)]:
-        if np.issubdtype(part.dtype, np.floating):
-            with np.errstate(over="ignore"):
-                finite = np.isfinite(part.astype(np.float32, copy=False))
-            if not finite.all():
-                where = tuple(np.argwhere(~finite)[0])
-                return int(where[0]), key, float(part[where])
-    return None
