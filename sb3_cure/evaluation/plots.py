@@ -4,7 +4,7 @@ import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch as th
@@ -39,11 +39,45 @@ _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
 #: By colour, so that policies differ in print, too
 _LOOKS = {COLORS["random"]: {"marker": "s", "linestyle": "--"}, COLORS["curious"]: {"marker": "^"}}
 
-#: Arm, actor, ends of the error bar or None, values whose mean is shown (one per seed), and text above
-Bar: TypeAlias = tuple[str, str, tuple[float, float] | None, np.ndarray, str]
 #: By title of a panel: values to compare with, one or several, by name
 Lines: TypeAlias = Mapping[str, Mapping[str, np.ndarray | float]]
 PathOrFile: TypeAlias = Path | IO[bytes]
+
+
+class Bar(NamedTuple):
+    """A policy in ``actor_bars``.
+
+    :param arm: Its arm
+    :param actor: Who acts
+    :param values: One number per seed; the bar is their mean
+    :param text: Above the bar
+    :param ends: Lowest and highest of all steps; None: not measured
+    """
+
+    arm: str
+    actor: str
+    values: np.ndarray
+    text: str = ""
+    ends: tuple[float, float] | None = None
+
+
+class Difference(NamedTuple):
+    """A line in ``paired_differences``.
+
+    :param arm: Its arm
+    :param label: Name of the line
+    :param pairs: Difference of each pair of seeds
+    :param mean: Their mean
+    :param low: Lower end of its interval; None: there is none
+    :param high: Upper end
+    """
+
+    arm: str
+    label: str
+    pairs: np.ndarray
+    mean: float
+    low: float | None
+    high: float | None
 
 
 #: Decorator of functions that draw
@@ -153,29 +187,29 @@ def learning_curves(
 @in_style
 def paired_differences(
     path: PathOrFile,
-    rows: Sequence[tuple[str, str, np.ndarray, tuple[float, float | None, float | None]]],
+    rows: Sequence[Difference],
     colors: Mapping[str, str],
     xlabel: str,
 ) -> None:
     """Differences from the baseline, one line each, with every pair of seeds as a dot.
 
     :param path: File to write
-    :param rows: Arm, label of the line, differences by pair, and their mean with its interval
+    :param rows: The lines
     :param colors: By arm
     :param xlabel: What the differences are of
     """
     figure = Figure(figsize=(8.5, 1.5 + 0.34 * len(rows)))
     axes = figure.subplots()
     axes.axvline(0, color="#333333", linewidth=1)
-    for place, (arm, _, pairs, (mean, low, high)) in enumerate(rows):
+    for place, (arm, _, pairs, mean, low, high) in enumerate(rows):
         axes.plot(pairs, np.full(len(pairs), place + 0.24), "o", color=colors[arm], alpha=0.5)
         if low is not None and high is not None:
             axes.plot([low, high], [place, place], color=colors[arm], linewidth=2.5, solid_capstyle="butt")
         axes.plot([mean], [place], "D", color=colors[arm], markersize=6.5, zorder=4, markeredgecolor="white")
-    axes.set_yticks(range(len(rows)), [_plain(label) for _, label, *_ in rows])
+    axes.set_yticks(range(len(rows)), [_plain(row.label) for row in rows])
     axes.set(xlabel=_plain(xlabel), ylim=(len(rows) - 0.5, -0.5))
     # Intervals of two seeds can be a hundred times as wide as the differences: they may leave the picture.
-    reach = 4 * max((float(np.abs(pairs).max(initial=0)) for *_, pairs, _ in rows), default=0) or 1
+    reach = 4 * max((float(np.abs(row.pairs).max(initial=0)) for row in rows), default=0) or 1
     axes.set_xlim(*np.clip(axes.get_xlim(), -reach, reach))
     marks = {
         "a pair of seeds": Line2D([], [], color="#555555", marker="o", linestyle=""),
@@ -219,8 +253,8 @@ def actor_bars(
     figure, places = _panels(len(panels), height=3.3, ylabel=ylabel)
     for axes, (title, rows) in zip(places, panels.items(), strict=True):
         ticks, position = {}, 0.0
-        for arm in dict.fromkeys(arm for arm, *_ in rows):
-            group = [row for row in rows if row[0] == arm]
+        for arm in dict.fromkeys(row.arm for row in rows):
+            group = [row for row in rows if row.arm == arm]
             ticks[_plain(arm)] = position + (len(group) - 1) / 2
             for bar in group:
                 _draw_bar(axes, position, bar, logarithmic)
@@ -233,7 +267,7 @@ def actor_bars(
             name = f"{label} policy" if label in COLORS else _plain(label)
             axes.axhline(known.mean(), color=color, linewidth=1.2, linestyle=_DASHES.get(label, "-."), label=name)
             axes.axhspan(known.min(), known.max(), color=color, alpha=0.15, linewidth=0)
-        means = [float(values.mean()) for *_, values, _ in rows]
+        means = [float(row.values.mean()) for row in rows]
         if logarithmic and max(means) > 0:
             _use_logarithms(axes)
             # The lowest contrastive error is often zero: keep the means in sight.
@@ -241,7 +275,7 @@ def actor_bars(
             axes.set_ylim(bottom=np.clip(axes.get_ylim()[0], least / 30, least / 3))
         (bottom, top), is_log = axes.get_ylim(), axes.get_yscale() == "log"
         axes.set_ylim(top=top * (top / bottom) ** 0.15 if is_log else bottom + 1.15 * (top - bottom))  # for the texts
-    if lines or any(arm != actor for rows in panels.values() for arm, actor, *_ in rows):
+    if lines or any(row.arm != row.actor for rows in panels.values() for row in rows):
         marks = "thick marks: their means (thin lines: least to greatest step)" if logarithmic else "bars: their means"
         legends = [axes.get_legend_handles_labels() for axes in places]
         handles = {label: handle for legend in legends for handle, label in zip(*legend, strict=True)}
@@ -250,7 +284,7 @@ def actor_bars(
 
 
 def _draw_bar(axes: Axes, position: float, bar: Bar, logarithmic: bool) -> None:
-    _, actor, ends, values, text = bar
+    _, actor, values, text, ends = bar
     color, label, mean = COLORS.get(actor, _ARM_COLORS[0]), _plain(f"{actor} policy"), float(values.mean())
     low, high = ends or (mean, float(values.max()))
     if logarithmic:

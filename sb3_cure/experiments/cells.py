@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import filelock
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,7 +26,7 @@ from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write
 from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
 from sb3_cure.experiments import rewards_met
 from sb3_cure.experiments.coverage import CoverageRecorder
-from sb3_cure.experiments.grid import DONE, SETTINGS, Cell, read_json
+from sb3_cure.experiments.grid import DONE, ERROR, SETTINGS, Cell, first_difference, read_json
 from sb3_cure.experiments.media import draw_cell, reconstruction_callbacks
 from sb3_cure.experiments.visitation import measure_visits
 from sb3_cure.persistence import ExactCheckpoint
@@ -33,8 +34,6 @@ from sb3_cure.persistence.files import locked
 
 #: Seed of evaluations, which start from the same states in all cells, see ``run_episodes``
 EVAL_SEED = 10_000
-#: File with the traceback of a failed cell, until it is started again
-ERROR = "error.txt"
 _EVAL_COLUMNS = (
     "environment_steps", "agent_steps", "updates", "seconds", "cpu_seconds", "return_mean", "return_std",
     "task_srl_error", "curious_return_mean", "curious_srl_error", *rewards_met.COLUMNS,
@@ -63,7 +62,7 @@ def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, 
     with alone_in(folder):
         if not (folder / DONE).exists():
             (folder / ERROR).unlink(missing_ok=True)
-            _CellRun(cell, folder, checkpoint_minutes, pictures).finish()
+            _run(cell, folder, checkpoint_minutes, pictures)
         shutil.rmtree(folder / "checkpoint", ignore_errors=True)
     return folder
 
@@ -75,8 +74,7 @@ def check_cell(folder: Path, cell: Cell) -> None:
     :param cell: The cell
     :raises UsageError: if they differ
     """
-    keys = ("task", "kind", "budget", "eval_every", "eval_episodes", "coverage", "stop_at_return", *SETTINGS)
-    check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in keys})
+    check_settings(folder / "config.json", {key: value for key, value in asdict(cell).items() if key in SETTINGS})
 
 
 def check_settings(path: Path, settings: dict[str, Any]) -> None:
@@ -87,77 +85,60 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
     :raises UsageError: if they differ
     """
     before = read_json(path) if path.exists() else {}
-    for key, now in json.loads(json.dumps(settings, default=str)).items():
-        if before.get(key, now) != now:
-            raise UsageError(
-                f"{path.parent} was run with other settings: {key} was {before[key]!r} and is {now!r} now. Choose "
-                "another --out, or remove that folder."
-            )
+    now = json.loads(json.dumps(settings, default=str))
+    if key := first_difference(before, now, now):
+        raise UsageError(
+            f"{path.parent} was run with other settings: {key} was {before[key]!r} and is {now[key]!r} now. Choose "
+            "another --out, or remove that folder."
+        )
 
 
-class _CellRun:
-    """An attempt at a cell: its model and its callbacks."""
-
-    def __init__(self, cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool):
-        self.cell, self.folder, self.pictures = cell, folder, pictures
-        self.checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
-        self.record = _Record(cell, folder)
-        write_json(folder / "config.json", {**asdict(cell), "action_repeat": self.record.action_repeat})
-        resumed = self._resume()
-        self.pretrains = cell.pretrain is not None and (resumed is None or resumed.is_pretraining)
-        self.model = resumed or cell.make_model(self._make_env())
-
-    def finish(self) -> None:
-        try:
-            self._train()
-            self._write_results()
-        finally:
-            self.record.eval_env.close()
-            if self.model.env is not None:
-                self.model.env.close()
-
-    def _train(self) -> None:
-        """Make the same calls in every attempt: a resumed model does what is left of them."""
-        cell, record = self.cell, self.record
-        if cell.pretrain is not None and self.pretrains:
-            steps = record.agent_steps(cell.pretrain.budget)
+def _run(cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool) -> None:
+    """Make an attempt at a cell."""
+    # By a function: SB3 passes render_mode="rgb_array" to an id, which not every environment accepts.
+    with (
+        contextlib.closing(cell.make_eval_env()) as eval_env,
+        contextlib.closing(make_vec_env(cell.make_env, n_envs=cell.n_envs)) as env,
+    ):
+        record = _Record(cell, folder, eval_env)
+        write_json(folder / "config.json", {**asdict(cell), "action_repeat": record.action_repeat})
+        checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
+        if ExactCheckpoint.exists(checkpoints.path):  # the newest complete one
+            objects = cell.custom_objects()
+            model = ALGORITHMS[cell.algo].resume(checkpoints.path, env, custom_objects=objects)
+            pretrain = cell.pretrain if model.is_pretraining else None
+        else:
+            model, pretrain = cell.make_model(env), cell.pretrain
+        # The same calls in every attempt: a resumed model does what is left of them.
+        if pretrain is not None:
             clock = TimeLeft(f"{cell.folder} (pretraining)")
-            self.model.pretrain(steps, cell.pretrain.collector, callback=[record, self.checkpoints, clock])
-        clock = TimeLeft(str(cell.folder), best_return=record.best_return)
-        callbacks: list[BaseCallback] = [record.rewards, record, self.checkpoints, clock]
+            steps = record.agent_steps(pretrain.budget)
+            model.pretrain(steps, pretrain.collector, callback=[record, checkpoints, clock])
         record.evaluates = True
         if cell.budget > 0:
+            clock = TimeLeft(str(cell.folder), best_return=record.best_return)
+            callbacks: list[BaseCallback] = [record.rewards, record, checkpoints, clock]
             if cell.coverage is not None:
-                path = self.folder / "coverage.csv"
+                path = folder / "coverage.csv"
                 callbacks.append(CoverageRecorder(cell.coverage.at, record.action_repeat, path))
-            if self.pictures:
-                callbacks += reconstruction_callbacks(cell, record.action_repeat, self.folder)
-            self.model.learn(record.agent_steps(cell.budget), callback=callbacks)
+            if pictures:
+                callbacks += reconstruction_callbacks(cell, record.action_repeat, folder)
+            model.learn(record.agent_steps(cell.budget), callback=callbacks)
+        _write_results(cell, folder, model, record, pictures)
 
-    def _write_results(self) -> None:
-        cell, record = self.cell, self.record
-        self.model.save(self.folder / "model.zip")
-        if cell.kind == "visitation":
-            measure_visits(self.model, cell, self.folder)
-        if self.pictures:
-            try:
-                draw_cell(self.model, cell, self.folder)
-            except Exception as error:  # the results are complete without them
-                print(f"{cell.folder} lacks some of its pictures: {type(error).__name__}: {error}")
-        record.write_tables()
-        write_json(self.folder / "run.json", record.conditions(self.model))
-        write_text(self.folder / DONE, "")
 
-    def _make_env(self) -> Any:
-        # By a function: SB3 passes render_mode="rgb_array" to an id, which not every environment accepts.
-        return make_vec_env(self.cell.make_env, n_envs=self.cell.n_envs)
-
-    def _resume(self) -> CuReSAC | None:
-        """The model of the newest complete checkpoint, or None."""
-        cell, path = self.cell, self.checkpoints.path
-        if not ExactCheckpoint.exists(path):
-            return None
-        return ALGORITHMS[cell.algo].resume(path, self._make_env(), custom_objects=cell.custom_objects())
+def _write_results(cell: Cell, folder: Path, model: CuReSAC, record: "_Record", pictures: bool) -> None:
+    model.save(folder / "model.zip")
+    if cell.kind == "visitation":
+        measure_visits(model, cell, folder)
+    if pictures:
+        try:
+            draw_cell(model, cell, folder)
+        except Exception as error:  # the results are complete without them
+            print(f"{cell.folder} lacks some of its pictures: {type(error).__name__}: {error}")
+    record.write_tables()
+    write_json(folder / "run.json", record.conditions(model))
+    write_text(folder / DONE, "")
 
 
 class _TimedCheckpoint(ExactCheckpoint):
@@ -190,13 +171,13 @@ class _Record(BaseCallback):
 
     :param cell: The cell
     :param folder: Its folder
+    :param eval_env: The environment to evaluate in
     """
 
-    def __init__(self, cell: Cell, folder: Path):
+    def __init__(self, cell: Cell, folder: Path, eval_env: gym.Env):
         super().__init__()
-        self.cell, self.folder = cell, folder
-        self.eval_env = cell.make_eval_env()
-        self.action_repeat = action_repeat_of(self.eval_env)
+        self.cell, self.folder, self.eval_env = cell, folder, eval_env
+        self.action_repeat = action_repeat_of(eval_env)
         #: Whether the task's reward is being learned from
         self.evaluates = False
         self.evaluations: list[Row] = []

@@ -206,7 +206,7 @@ def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float
         means = np.array([episode.srl_errors.mean() for episode in episodes])
         states = np.concatenate([episode.states for episode in episodes])
         visits[actor] = states, np.concatenate([episode.srl_errors for episode in episodes])
-        bars.append((actor, actor, None, means, f"{means.mean():.4f}"))
+        bars.append(plots.Bar(actor, actor, means, f"{means.mean():.4f}"))
         for number, episode in enumerate(episodes):
             row = {"policy": actor, "episode": number, "return": episode.total_reward}
             kept.append({**row, "mean_error": means[number], "max_error": episode.srl_errors.max()})

@@ -4,8 +4,8 @@ import contextlib
 import copy
 import json
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,8 +34,8 @@ from sb3_cure.evaluation.callbacks import untouched_randomness
 
 #: Empty file of a finished cell
 DONE = "DONE"
-#: Keys of ``config.json`` that decide what is trained, and are compared before results are mixed
-SETTINGS = ("n_envs", "env_kwargs", "arguments", "pretrain", "algo")
+#: File with the traceback of a failed cell, until it is started again
+ERROR = "error.txt"
 
 
 def short_name(task: str) -> str:
@@ -145,7 +145,7 @@ class GridFile(_Part):
     """
 
     experiment: _Name
-    kind: Literal["curves", "visitation", "pretraining"]
+    kind: Literal["curves", "visitation"]
     budget: Annotated[int, Field(ge=0)]
     tasks: Annotated[list[Annotated[str, AfterValidator(_check_registered)]], Field(min_length=1)]
     methods: Annotated[dict[_Name, Method], Field(min_length=1)]
@@ -270,6 +270,23 @@ class Cell:
         :return: Whether it is marked as ``DONE``
         """
         return (results / self.folder / DONE).exists()
+
+
+#: Fields of a cell that must be equal before results are mixed
+SETTINGS = tuple(
+    each.name for each in fields(Cell) if each.name not in ("experiment", "method", "seed", "eval_curious")
+)
+
+
+def first_difference(before: Mapping[str, Any], now: Mapping[str, Any], keys: Iterable[str]) -> str | None:
+    """Find a setting that differs; those that an earlier version did not write are not compared.
+
+    :param before: Settings, as in a JSON file
+    :param now: Others
+    :param keys: Names of the settings to compare
+    :return: Name of the first that both have and that differs, or None
+    """
+    return next((key for key in keys if key in before and key in now and before[key] != now[key]), None)
 
 
 @dataclass(frozen=True)

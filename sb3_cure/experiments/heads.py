@@ -4,6 +4,7 @@ The common head of a seed is an autoencoder that is fitted to an even mix of the
 curious policies of the task's *other* seeds. The heads of a task are a unit of work like a cell, with their own folder.
 """
 
+import contextlib
 from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +18,8 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write_csv, write_json
 from sb3_cure.evaluation.rollouts import Episode, srl_errors
-from sb3_cure.experiments.cells import ERROR, alone_in
-from sb3_cure.experiments.grid import Cell, Grid, read_json, short_name
+from sb3_cure.experiments.cells import alone_in
+from sb3_cure.experiments.grid import ERROR, Cell, Grid, read_json, short_name
 from sb3_cure.experiments.visitation import COLUMNS, roll_out, visit_row, visiting_actors
 
 #: Updates of a common head
@@ -135,11 +136,10 @@ def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator
     """The episodes of ``measure_visits`` again by policy, without the known policies."""
     path = results / cell.folder / "model.zip"
     model = ALGORITHMS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
-    env = cell.make_eval_env()
-    for actor in visiting_actors(model, cell):
-        if actor not in known:
-            yield actor, roll_out(model, cell, env, actor)
-    env.close()
+    with contextlib.closing(cell.make_eval_env()) as env:
+        for actor in visiting_actors(model, cell):
+            if actor not in known:
+                yield actor, roll_out(model, cell, env, actor)
 
 
 def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
@@ -159,19 +159,17 @@ def _judge(cell: Cell) -> CuReSAC:
     """An untrained autoencoder with the networks of a seed's first cell."""
     arguments = cell.build_arguments()
     has_rae = arguments.get("srl", "rae") == "rae"
-    env = cell.make_eval_env()
-    model: CuReSAC = ALGORITHMS[cell.algo](
-        arguments["policy"],
-        env,
-        srl="rae",
-        srl_kwargs=arguments.get("srl_kwargs", {}) if has_rae else {},
-        curiosity=None,
-        policy_kwargs=arguments.get("policy_kwargs", {}),
-        buffer_size=1,
-        seed=1000 + cell.seed,
-    )
-    env.close()
-    return model
+    with contextlib.closing(cell.make_eval_env()) as env:
+        return ALGORITHMS[cell.algo](
+            arguments["policy"],
+            env,
+            srl="rae",
+            srl_kwargs=arguments.get("srl_kwargs", {}) if has_rae else {},
+            curiosity=None,
+            policy_kwargs=arguments.get("policy_kwargs", {}),
+            buffer_size=1,
+            seed=1000 + cell.seed,
+        )
 
 
 def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:

@@ -24,15 +24,16 @@ from sb3_cure.cli.usage import UsageError, missing_file
 from sb3_cure.evaluation import plots
 from sb3_cure.experiments import statistics, tables
 from sb3_cure.experiments.results import CellResult, Experiment, read_results
+from sb3_cure.experiments.statistics import Curves
 from sb3_cure.experiments.tables import (
     NONE,
     Table,
     interval_text,
     number_text,
     plural,
-    ratio_text,
     render_text,
     tasks_text,
+    value_and_interval,
 )
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
 
@@ -49,9 +50,6 @@ _CURVES = (
 )
 #: Evaluations with something to see, below which a table says it better than lines
 LEAST_POINTS = 4
-
-#: By task and arm: environment steps [n] and values [seeds, n]
-Curves: TypeAlias = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -132,17 +130,13 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     if len(updates) and not updates.any():
         headlines.insert(0, render_text("untrained"))
     parts += curve_parts(experiment, colors)
-    if explored := _stacked(experiment, "cells"):
-        parts.append(tables.cells_reached_table(experiment, explored))
-        headlines += _exploration_headlines(experiment, list(explored))
+    headlines += _exploration_headlines(experiment)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
         compared, more = _comparison(experiment, colors, thresholds)
         headlines += compared
         if not headlines:  # no cells that could be compared either
             several = len(experiment.methods) > 1
             headlines = [render_text("nothing_shared", experiment.baseline) if several else render_text("one_arm")]
-        if experiment.kind == "pretraining":
-            parts.insert(0, tables.pretraining_table(experiment))
         parts += more
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
@@ -157,7 +151,7 @@ def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[P
     """
     few = {}
     for column, name, measure, label in _CURVES:
-        curves, is_error = _stacked(experiment, column), "srl" in column
+        curves, is_error = statistics.stack_curves(experiment, column), "srl" in column
         if is_error:
             curves = _one_unit_each(experiment, curves)
         means = [values.mean(axis=0) for arms in curves.values() for _, values in arms.values()]
@@ -166,20 +160,12 @@ def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[P
         if max(visible, default=0) >= LEAST_POINTS:
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, is_error)
-        elif curves and column != "cells":  # which have a table anyway
+        elif curves and column != "cells":
             few[measure] = curves
+        if curves and column == "cells":  # which have a table in any case
+            yield tables.measured_table("Cells of the true state", {measure: curves}, render_text("cells_counted"))
     if few:
-        yield tables.evaluations_table(few)
-
-
-def _stacked(experiment: Experiment, column: str) -> Curves:
-    """Curves by task and arm, of those with a value in the column."""
-    curves: Curves = {}
-    for task, method in experiment.arms:
-        steps, values = statistics.stack_curves(list(experiment.done(task, method).values()), column)
-        if len(steps):
-            curves.setdefault(task, {})[method] = steps, values
-    return curves
+        yield tables.measured_table("Evaluations", few, render_text("evaluations"))
 
 
 def _one_unit_each(experiment: Experiment, curves: Curves) -> Curves:
@@ -259,7 +245,7 @@ def _bars(
         text = f"{number_text(row.ratio.value, 2)}\N{MULTIPLICATION SIGN}" if math.isfinite(row.ratio.value) else ""
         text += "" if row.ratio.low is None else f"\n{interval_text(row.ratio, 1)}"
         ends = (row.error_min, row.error_max) if isinstance(row, ErrorSummary) else None
-        bars.setdefault(row.task, []).append((row.method, row.actor, ends, row.values, text))
+        bars.setdefault(row.task, []).append(plots.Bar(row.method, row.actor, row.values, text, ends))
     return bars, lines
 
 
@@ -268,18 +254,18 @@ def _visitation_headlines(experiment: Experiment, measures: Sequence[tuple[Measu
     for (task, method), other in itertools.product(experiment.arms, ("ratio", "task_ratio")):
         rows = [(row, what) for row, what in measures if (row.task, row.method, row.actor) == (task, method, "curious")]
         ratios = [(getattr(row, other), what) for row, what in rows]
-        found = [(ratio_text(ratio), what, ratio.n) for ratio, what in ratios if math.isfinite(ratio.value)]
+        found = [(value_and_interval(ratio), what, ratio.n) for ratio, what in ratios if math.isfinite(ratio.value)]
         if found:
             policy = "random policy" if other == "ratio" else f"task policy of {experiment.baseline_of(method)}"
             yield render_text("visits", method, task, policy, found)
 
 
-def _exploration_headlines(experiment: Experiment, tasks: Sequence[str]) -> Iterator[str]:
+def _exploration_headlines(experiment: Experiment) -> Iterator[str]:
     """A sentence on each arm: its cells over those of its baseline."""
-    for task, method in itertools.product(tasks, experiment.methods):
+    for task, method in experiment.arms:
         baseline, ratio = experiment.baseline_of(method), statistics.cells_ratio(experiment, task, method)
         if method != baseline and ratio.n:
-            yield render_text("explores", method, task, baseline, ratio_text(ratio), ratio.n)
+            yield render_text("explores", method, task, baseline, value_and_interval(ratio), ratio.n)
 
 
 def _comparison(
@@ -305,11 +291,11 @@ def _difference_parts(
     experiment: Experiment, differences: Sequence[statistics.PairedDifference], colors: Mapping[str, str]
 ) -> Iterator[Part]:
     lines = [
-        (
+        plots.Difference(
             row.method,
             f"{tables.difference_label(row, experiment.baseline)}, {tasks_text(row)}",
             np.concatenate(list(row.differences.values())),
-            (row.t.value, row.t.low, row.t.high),
+            *(row.t.value, row.t.low, row.t.high),
         )
         for row in differences
     ]
@@ -319,7 +305,7 @@ def _difference_parts(
         label = f"mean return over training, minus that of {compared}\n(right of the line: better)"
         yield _figure("paired_difference", caption, plots.paired_differences, lines, colors, label)
     yield tables.difference_table(experiment, differences)
-    finals = statistics.paired_differences(experiment, "finals")
+    finals = statistics.paired_differences(experiment, "final")
     yield tables.difference_table(experiment, finals, "final return", "As above.")
 
 

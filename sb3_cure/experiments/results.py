@@ -1,5 +1,7 @@
 """Read the folders that experiments wrote, and refuse what would give wrong numbers."""
 
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,9 +10,11 @@ import numpy as np
 import pandas as pd
 
 from sb3_cure.cli.usage import UsageError
-from sb3_cure.experiments.grid import SETTINGS, read_json, seed_of, short_name
+from sb3_cure.experiments.grid import DONE, ERROR, SETTINGS, first_difference, read_json, seed_of, short_name
 
-DONE, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+FINISHED, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
+#: Settings that all cells of a task share
+_SHARED = ("eval_every", "eval_episodes", "coverage", "stop_at_return")
 _FIX = "remove the cell's folder and run the grid again"
 
 
@@ -44,12 +48,12 @@ class CellResult:
 
     @property
     def done(self) -> bool:
-        return self.status == DONE
+        return self.status == FINISHED
 
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values, where there are any.
 
-        A cell that stopped early, at ``stop_at_return``, holds its last return until the budget.
+        A cell that stopped early, at ``stop_at_return``, holds its last returns and SRL errors until the budget.
 
         :param column: A column of ``eval.csv``, or ``"cells"`` of ``coverage.csv``
         :return: Steps and values, [n] each
@@ -60,7 +64,7 @@ class CellResult:
         known = table.dropna(subset=[column])
         steps, values = known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
         stopped = self.config.get("stop_at_return") is not None and len(steps) and steps[-1] < self.config["budget"]
-        if column == "return_mean" and stopped:
+        if stopped and column.endswith(("return_mean", "srl_error")):
             steps, values = np.append(steps, self.config["budget"]), np.append(values, values[-1])
         return steps, values
 
@@ -95,7 +99,7 @@ class Experiment:
 
     @property
     def kind(self) -> str:
-        """``"curves"``, ``"visitation"`` or ``"pretraining"``."""
+        """``"curves"`` or ``"visitation"``."""
         return self.grid["kind"]
 
     @property
@@ -168,7 +172,7 @@ def read_results(folder: str | Path) -> list[Experiment]:
     if (folder / "grid.json").exists():
         return [_read_experiment(folder / "grid.json")]
     grids = sorted(folder.rglob("grid.json"))
-    lost = {path.parents[3] for path in folder.rglob("*/*/seed*/DONE")} - {path.parent for path in grids}
+    lost = {path.parents[3] for path in folder.rglob(f"*/*/seed*/{DONE}")} - {path.parent for path in grids}
     if lost:
         raise UsageError(f"{min(lost)} holds finished cells, but no grid.json: run the grid again, which writes it.")
     if not grids:
@@ -187,42 +191,43 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     keys = sorted(dict.fromkeys(keys), key=lambda key: order.index(key[0]))
     cells = {key: _read_cell(root, *key) for key in keys}
     experiment = Experiment(name or grid["experiment"], root, grid, cells)
-    for task, method in experiment.arms:
-        done = list(experiment.done(task, method).values())
-        for cell in done[1:]:
-            _check_settings(done[0], cell, (*SETTINGS, "task", "budget"))
-    for task in experiment.tasks:
-        done = [cell for cell in experiment.finished if cell.task == task]
-        for cell in done[1:]:
-            _check_settings(done[0], cell, ("eval_every", "eval_episodes", "coverage", "stop_at_return"))
+    for first, other in itertools.combinations(experiment.finished, 2):
+        if first.task == other.task:
+            _check_settings(first, other, SETTINGS if first.method == other.method else _SHARED)
     for cell in experiment.finished:
         if cell.config["budget"] > 0 and (experiment.kind != "visitation" or len(cell.evaluations)):
             _check_curve(cell)
     return experiment
 
 
-def _check_settings(first: CellResult, other: CellResult, keys: tuple[str, ...]) -> None:
+def _check_settings(first: CellResult, other: CellResult, keys: Iterable[str]) -> None:
     """Refuse to average over cells that were run with different settings."""
-    for key in keys:
-        if first.config.get(key) != other.config.get(key):
-            raise UsageError(
-                f"{other.folder} was run with {key} {other.config.get(key)!r}, but {first.folder} with "
-                f"{first.config.get(key)!r}: put one of them into another folder."
-            )
+    if key := first_difference(first.config, other.config, keys):
+        raise UsageError(
+            f"{other.folder} was run with {key} {other.config[key]!r}, but {first.folder} with {first.config[key]!r}: "
+            "put one of them into another folder."
+        )
 
 
 def _read_cell(root: Path, task: str, method: str, seed: int) -> CellResult:
     folder = root / task / method / f"seed{seed}"
     if not folder.is_dir():
         return CellResult(task, method, seed, folder, NOT_RUN)
-    if not (folder / "DONE").exists():
-        return CellResult(task, method, seed, folder, FAILED if (folder / "error.txt").exists() else UNFINISHED)
+    if not (folder / DONE).exists():
+        return CellResult(task, method, seed, folder, FAILED if (folder / ERROR).exists() else UNFINISHED)
     config, run = read_json(folder / "config.json"), read_json(folder / "run.json")
     if (short_name(config["task"]), config["method"], config["seed"]) != (task, method, seed):
         raise UsageError(f"{folder / 'config.json'} is of another cell than its folder: put it back.")
     names = ("eval.csv", "visitation.csv", "coverage.csv")
-    tables = (pd.read_csv(folder / name) if (folder / name).exists() else pd.DataFrame() for name in names)
-    return CellResult(task, method, seed, folder, DONE, config, run, *tables)
+    tables = (_read_csv(folder / name) for name in names)
+    return CellResult(task, method, seed, folder, FINISHED, config, run, *tables)
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path) if path.exists() else pd.DataFrame()
+    except ValueError as error:
+        raise UsageError(f"{path} cannot be read ({error}): {_FIX}.") from None
 
 
 def _check_curve(cell: CellResult) -> None:

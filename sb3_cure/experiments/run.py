@@ -15,15 +15,15 @@ from typing import Any, TypeAlias
 from sb3_cure.cli.progress import time_text
 from sb3_cure.cli.usage import UsageError, install_command
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
-from sb3_cure.experiments.cells import ERROR, CellIsRunning, check_cell, check_settings, is_held, run_cell
-from sb3_cure.experiments.grid import Grid, check_arms, load_grid, read_json
+from sb3_cure.experiments.cells import CellIsRunning, check_cell, check_settings, is_held, run_cell
+from sb3_cure.experiments.grid import ERROR, Grid, check_arms, load_grid, read_json
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 
 ENGINES = ("local", "ray")
-#: Folder of results, minutes between checkpoints, whether to draw
-Settings: TypeAlias = tuple[Path, float, bool]
-#: Runs units, and returns those that failed
-RunAll: TypeAlias = Callable[[Sequence[Unit], Settings], list[Unit]]
+#: Runs a unit in a folder of results, and tells whether it is done
+RunUnit: TypeAlias = Callable[[Unit, Path], bool]
+#: Runs units in a folder of results, and returns those that failed
+RunAll: TypeAlias = Callable[[Sequence[Unit], Path], list[Unit]]
 
 
 def run_grid(
@@ -59,16 +59,18 @@ def run_grid(
         raise UsageError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
-    settings = (results, checkpoint_minutes, pictures)
+    run_unit = partial(_run_unit, checkpoint_minutes=checkpoint_minutes, pictures=pictures)
     resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-    with _ray(address, resources) if engine == "ray" else nullcontext(_run_here) as run_all:
+    with (
+        _ray(address, resources, run_unit) if engine == "ray" else nullcontext(partial(_run_here, run_unit)) as run_all
+    ):
         _write_grid(grid, results / grid.experiment)
         for cell in grid.cells:
             if cell.is_done(results):  # and was killed before it removed this
                 shutil.rmtree(results / cell.folder / "checkpoint", ignore_errors=True)
-        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], settings)
+        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], results)
         heads = common_heads(grid, results)
-        failed += run_all([each for each in heads if not each.is_done(results)], settings)
+        failed += run_all([each for each in heads if not each.is_done(results)], results)
     lacking = {cell.task for cell in grid.cells if grid.kind == "visitation"} - {each.task for each in heads}
     for task in sorted(lacking):
         print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
@@ -107,10 +109,10 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 # ---------------------------------------------------------------- engines
 
 
-def _run_here(units: Sequence[Unit], settings: Settings) -> list[Unit]:
+def _run_here(run_unit: RunUnit, units: Sequence[Unit], results: Path) -> list[Unit]:
     failed, start = [], time.monotonic()
     for number, unit in enumerate(units, 1):
-        if not _run_unit(unit, *settings):
+        if not run_unit(unit, results):
             failed.append(unit)
         left = (time.monotonic() - start) * (len(units) / number - 1)
         print(f"{number} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""), flush=True)
@@ -137,11 +139,11 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
     return True
 
 
-def _run_on_worker(unit: Unit, settings: Settings, has_gpu: bool) -> bool:
+def _run_on_worker(run_unit: RunUnit, has_gpu: bool, unit: Unit, results: Path) -> bool:
     """Run a unit in a process of Ray, which does not hide the GPUs from a task that needs none."""
     if not has_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
-    return _run_unit(unit, *settings)
+    return run_unit(unit, results)
 
 
 def _write_error(unit: Unit, results: Path, text: str) -> None:
@@ -152,7 +154,7 @@ def _write_error(unit: Unit, results: Path, text: str) -> None:
 
 
 @contextmanager
-def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
+def _ray(address: str | None, resources: dict[str, Any], run_unit: RunUnit) -> Iterator[RunAll]:
     """Connect to a cluster with the resources that a cell needs."""
     try:
         import ray
@@ -164,16 +166,15 @@ def _ray(address: str | None, resources: dict[str, Any]) -> Iterator[RunAll]:
     try:
         # One process per unit, so that nothing of a unit burdens the next.
         remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
-        yield partial(_run_remotely, remote, bool(resources["num_gpus"]))
+        yield partial(_run_remotely, partial(remote.remote, run_unit, bool(resources["num_gpus"])))
     finally:
         ray.shutdown()
 
 
-def _run_remotely(remote: Any, has_gpu: bool, units: Sequence[Unit], settings: Settings) -> list[Unit]:
+def _run_remotely(start: Callable[[Unit, Path], Any], units: Sequence[Unit], results: Path) -> list[Unit]:
     import ray
 
-    results, failed = settings[0], []
-    pending = {remote.remote(unit, settings, has_gpu): unit for unit in units}
+    failed, pending = [], {start(unit, results): unit for unit in units}
     while pending:
         for reference in ray.wait(list(pending), timeout=5)[0]:
             unit = pending.pop(reference)
@@ -195,7 +196,7 @@ def _run_remotely(remote: Any, has_gpu: bool, units: Sequence[Unit], settings: S
 
 
 def status_lines(units: Sequence[Unit], results: Path) -> list[str]:
-    """State of each unit, and of cells that have begun their last evaluation.
+    """State of each unit, with the last evaluation of cells that have begun.
 
     Locks of other machines may be invisible: their cells read "interrupted" then.
 

@@ -7,14 +7,20 @@ task. With one task it is the paired t interval, exactly. It is wide with two or
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import pandas as pd
 from scipy import integrate, stats
 
-from sb3_cure.experiments.results import CellResult, Experiment
+from sb3_cure.experiments.results import Experiment
 
 #: Draws of a mean over several tasks
 DRAWS = 100_000
+#: By task and arm: environment steps [n] and values [seeds, n]
+Curves: TypeAlias = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
+#: Columns of ``summarise_arm`` that are equal where the arms of a seed begin with equal weights
+_STARTS = ["start_return", "start_error"]
 
 
 # Learning curves
@@ -32,88 +38,54 @@ def area_under_curve(steps: np.ndarray, values: np.ndarray) -> float:
     return float(integrate.trapezoid(values, steps) / (steps[-1] - steps[0]))
 
 
-def steps_to_threshold(steps: np.ndarray, values: np.ndarray, threshold: float) -> float:
-    """Environment steps of the first evaluation at or above a return.
-
-    :param steps: Environment steps, [n]
-    :param values: Returns, [n]
-    :param threshold: A return
-    :return: The steps; infinity if there is no such evaluation
-    """
-    reached = np.flatnonzero(values >= threshold)
-    return float(steps[reached[0]]) if len(reached) else float("inf")
-
-
-def restricted_mean(times: np.ndarray, limit: float) -> float:
-    """Restricted mean time: what did not happen until the limit counts as the limit.
-
-    Unlike a median, it uses all times, and unlike a mean of the finite ones, it does not favour an arm whose slow seeds
-    never get there.
-
-    :param times: Time of each seed, infinite if it did not happen, [seeds]
-    :param limit: Time at which all were last observed
-    :return: Mean of min(time, limit); nan without a time
-    """
-    return float(np.minimum(times, limit).mean()) if len(times) else float("nan")
-
-
-def stack_curves(cells: Sequence[CellResult], column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate the curves of several seeds to common steps.
-
-    :param cells: Finished cells
-    :param column: As of ``CellResult.curve``
-    :return: Environment steps [n], within what all of them span, and values [seeds, n]
-    """
-    curves = [cell.curve(column) for cell in cells]
-    curves = [(steps, values) for steps, values in curves if len(steps)]
-    if not curves:
-        return np.zeros(0), np.zeros((0, 0))
-    first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
-    grid = np.unique(np.concatenate([steps for steps, _ in curves]))
-    grid = grid[(grid >= first) & (grid <= last)]
-    return grid, np.stack([np.interp(grid, steps, values) for steps, values in curves])
-
-
-@dataclass(frozen=True)
-class ArmSummary:
-    """One arm on one task.
-
-    :param seeds: Seeds that are done and have a curve
-    :param areas: Area under the curve by seed
-    :param starts: Return and SRL error of the first evaluation by seed, before training; nan: not measured [seeds, 2]
-    :param finals: Return of the last evaluation by seed
-    :param lasts: Mean return of the last three evaluations by seed
-    :param reached: For each threshold the steps of each seed
-    """
-
-    seeds: tuple[int, ...]
-    areas: np.ndarray
-    starts: np.ndarray
-    finals: np.ndarray
-    lasts: np.ndarray
-    reached: dict[float, np.ndarray]
-
-
-def summarise_arm(experiment: Experiment, task: str, method: str, thresholds: Sequence[float] = ()) -> ArmSummary:
-    """Summarise an arm on a task.
+def steps_to_return(experiment: Experiment, task: str, method: str, limit: float) -> np.ndarray:
+    """Environment steps of the first evaluation at or above a return, after training has begun.
 
     :param experiment: An experiment
     :param task: Short name of the task
     :param method: Name of the arm
-    :param thresholds: Returns
-    :return: Its numbers; empty arrays if no cell with a curve is done
+    :param limit: The return
+    :return: The steps of each seed with a curve, infinite without such an evaluation, [seeds]
     """
-    cells = {seed: cell for seed, cell in experiment.done(task, method).items() if len(cell.curve()[0]) > 1}
-    curves = [cell.curve() for cell in cells.values()]
-    starts = [cell.evaluations.reindex(columns=["return_mean", "task_srl_error"]).iloc[0] for cell in cells.values()]
-    return ArmSummary(
-        tuple(cells),
-        np.array([area_under_curve(*curve) for curve in curves]),
-        np.array(starts, dtype=float).reshape(-1, 2),
-        np.array([values[-1] for _, values in curves]),
-        np.array([values[-3:].mean() for _, values in curves]),
-        {limit: np.array([steps_to_threshold(*curve, limit) for curve in curves]) for limit in thresholds},
-    )
+    curves = [cell.curve() for cell in experiment.done(task, method).values()]
+    return np.array([next(iter(steps[1:][values[1:] >= limit]), np.inf) for steps, values in curves if len(steps) > 1])
+
+
+def stack_curves(experiment: Experiment, column: str = "return_mean") -> Curves:
+    """Interpolate the curves of the seeds of each arm to common steps, within what all of them span.
+
+    :param experiment: An experiment
+    :param column: As of ``CellResult.curve``
+    :return: By task and arm, of those with a value in the column: environment steps [n], and values [seeds, n]
+    """
+    found: Curves = {}
+    for task, method in experiment.arms:
+        curves = [cell.curve(column) for cell in experiment.done(task, method).values()]
+        seeds = [pd.Series(values, steps) for steps, values in curves if len(steps)]
+        if seeds:
+            table = pd.concat(seeds, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
+            found.setdefault(task, {})[method] = table.index.to_numpy(), table.to_numpy().T
+    return found
+
+
+def summarise_arm(experiment: Experiment, task: str, method: str) -> pd.DataFrame:
+    """Summarise the finished cells of an arm that have a curve.
+
+    :param experiment: An experiment
+    :param task: Short name of the task
+    :param method: Name of the arm
+    :return: By seed: ``area`` under the curve, return of the ``final`` evaluation, mean return of the ``last`` three
+        (not of the first one, before training), and of the first one ``start_return`` and ``start_error``, the SRL
+        error (nan: not measured)
+    """
+    rows = {}
+    for seed, cell in experiment.done(task, method).items():
+        steps, values = cell.curve()
+        if len(steps) > 1:
+            starts = cell.evaluations.reindex(columns=["return_mean", "task_srl_error"]).iloc[0]
+            rows[seed] = [area_under_curve(steps, values), values[-1], values[1:][-3:].mean(), *starts]
+    columns = ["area", "final", "last", *_STARTS]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns, dtype=float)
 
 
 # Estimates with intervals
@@ -173,10 +145,12 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
 
     :param ours: A positive number by seed
     :param theirs: Another
-    :return: The estimate; nan without a common seed
+    :return: The estimate; nan without a common seed, or if one of the numbers is not positive
     """
-    ratios = [ours[seed] / theirs[seed] for seed in ours if ours[seed] > 0 and theirs.get(seed, 0) > 0]
-    found = t_interval([np.log(ratios)])
+    pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
+    if any(min(pair) <= 0 for pair in pairs):
+        return Estimate(float("nan"))
+    found = t_interval([np.log([mine / other for mine, other in pairs])])
     low, high = (None if end is None else float(np.exp(end)) for end in (found.low, found.high))
     return Estimate(float(np.exp(found.value)), low, high, found.n)
 
@@ -295,11 +269,11 @@ class PairedDifference:
         return sum(len(values) for values in self.differences.values())
 
 
-def paired_differences(experiment: Experiment, measure: str = "areas") -> list[PairedDifference]:
+def paired_differences(experiment: Experiment, measure: str = "area") -> list[PairedDifference]:
     """Every arm minus its baseline: per task, and over all tasks where there are several.
 
     :param experiment: An experiment
-    :param measure: ``"areas"`` or ``"finals"``
+    :param measure: ``"area"`` or ``"final"``
     :return: Arm by arm, all tasks together first; arms without a single pair are left out
     """
     arms = {arm: summarise_arm(experiment, *arm) for arm in experiment.arms}
@@ -310,13 +284,11 @@ def paired_differences(experiment: Experiment, measure: str = "areas") -> list[P
             continue
         by_task, same = {}, {}
         for task in experiment.tasks:
-            ours, theirs = arms[task, method], arms[task, other]
-            _, mine, its = np.intersect1d(ours.seeds, theirs.seeds, assume_unique=True, return_indices=True)
-            if len(mine):
-                by_task[task] = getattr(ours, measure)[mine] - getattr(theirs, measure)[its]
+            change = (arms[task, method] - arms[task, other]).dropna(subset=[measure])  # of the seeds that both have
+            if len(change):
+                by_task[task] = change[measure].to_numpy()
                 # Returns of sparse tasks are all zero at first: there the SRL error tells equal weights
-                first, second = ours.starts[mine], theirs.starts[its]
-                same[task] = int(((first == second) | np.isnan(first) | np.isnan(second)).all(axis=1).sum())
+                same[task] = int(change[_STARTS].fillna(0).eq(0).all(axis=1).sum())
         # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
         rows: dict[str | None, dict[str, np.ndarray]] = {task: {task: values} for task, values in by_task.items()}

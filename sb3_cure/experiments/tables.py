@@ -16,8 +16,8 @@ import pandas as pd
 from sb3_cure.cli.progress import time_text
 from sb3_cure.experiments import statistics
 from sb3_cure.experiments.results import NOT_RUN, CellResult, Experiment
-from sb3_cure.experiments.statistics import Estimate, PairedDifference
-from sb3_cure.experiments.visit_statistics import GRID_INTERVALS, Coverage, ErrorSummary
+from sb3_cure.experiments.statistics import Curves, Estimate, PairedDifference
+from sb3_cure.experiments.visit_statistics import GRID_INTERVALS, ErrorSummary, Occupancy
 
 NONE = "\N{EN DASH}"
 _RATIOS = (">/ random's [95 %]", ">/ baseline's task policy's [95 %]")
@@ -155,10 +155,10 @@ def interval_text(estimate: Estimate, digits: int = 0) -> str:
     return f"[{number_text(estimate.low, digits)}, {number_text(estimate.high, digits)}]"
 
 
-def ratio_text(estimate: Estimate) -> str:
-    """Format a ratio and its interval.
+def value_and_interval(estimate: Estimate) -> str:
+    """Format a number and its interval.
 
-    :param estimate: A ratio
+    :param estimate: A ratio, or a difference of logarithms
     :return: The text
     """
     shown = "(one seed)" if estimate.low is None else interval_text(estimate, 2)
@@ -202,15 +202,17 @@ def curves_table(experiment: Experiment) -> Table:
     for task, method in experiment.arms:
         digits, arm = return_digits(experiment, task), statistics.summarise_arm(experiment, task, method)
         missing = NONE if experiment.done(task, method) else _state(experiment, task, method)
-        row = [_mean_std(values, digits) or missing for values in (arm.areas, arm.finals)]
-        rows.append([task, method, str(len(arm.seeds)), *row])
+        row = [_mean_std(arm[measure].to_numpy(), digits) or missing for measure in ("area", "final")]
+        rows.append([task, method, str(len(arm)), *row])
     return _table("Learning curves", "task; arm; >seeds; >area under curve; >final return", rows, render_text("curves"))
 
 
-def evaluations_table(measured: Mapping[str, Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]]) -> Table:
-    """What a few evaluations have measured.
+def measured_table(title: str, measured: Mapping[str, Curves], note: str) -> Table:
+    """What was measured at a few steps.
 
-    :param measured: By measure, task and arm: environment steps [n] and values [seeds, n]
+    :param title: Its heading
+    :param measured: By measure
+    :param note: What to know when reading it
     :return: The table
     """
     rows = {}
@@ -222,7 +224,7 @@ def evaluations_table(measured: Mapping[str, Mapping[str, Mapping[str, tuple[np.
     numbers = pd.DataFrame(list(rows.values())).sort_index(axis=1).fillna(NONE)
     numbers.columns = [f">at {number_text(step)}" for step in numbers]
     names = pd.DataFrame(list(rows), columns=["measure", "task", "arm", ">seeds"])
-    return Table("Evaluations", names.join(numbers), render_text("evaluations"))
+    return Table(title, names.join(numbers), note)
 
 
 def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
@@ -234,17 +236,18 @@ def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     """
     rows, end = [], experiment.grid.get("stop_at_return") or math.inf
     for task, limit in itertools.product(experiment.tasks, [each for each in thresholds if each <= end]):
-        arms = {arm: statistics.summarise_arm(experiment, task, arm, [limit]) for arm in experiment.methods}
-        if not any(np.isfinite(arm.reached[limit]).any() for arm in arms.values()):
+        arms = {arm: statistics.steps_to_return(experiment, task, arm, limit) for arm in experiment.methods}
+        if not any(np.isfinite(steps).any() for steps in arms.values()):
             continue
-        for method, arm in arms.items():
-            if n := len(arm.seeds):
-                steps, shown = arm.reached[limit], f"{limit:,.15g}".replace("-", "\N{MINUS SIGN}")
-                counts = [f"{int(found.sum())} of {n}" for found in (np.isfinite(steps), arm.lasts >= limit)]
-                median = float(np.median(steps))
+        for method, steps in arms.items():
+            if n := len(steps):
+                solved = statistics.summarise_arm(experiment, task, method)["last"] >= limit
+                counts = [f"{int(found.sum())} of {n}" for found in (np.isfinite(steps), solved)]
+                median, shown = float(np.median(steps)), f"{limit:,.15g}".replace("-", "\N{MINUS SIGN}")
                 until = number_text(median) if np.isfinite(median) else f"> {number_text(experiment.budget)}"
-                mean = number_text(statistics.restricted_mean(steps, experiment.budget))
-                rows.append([task, shown, method, *counts, until, mean])
+                # Unlike a median it uses all seeds, and unlike a mean of those that got there it favours no arm
+                restricted = number_text(float(np.minimum(steps, experiment.budget).mean()))
+                rows.append([task, shown, method, *counts, until, restricted])
     columns = "task; >return; arm; >reached; >solved; >steps, median; >steps, restricted mean"
     return _table("Returns reached", columns, rows, render_text("reached"))
 
@@ -331,7 +334,7 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
     for row in summaries:
         policy = [row.task, row.method, row.head.replace("_", " "), row.actor, str(len(row.values))]
         errors = [f"{value:.2e}" for value in (row.error_min, row.mean, row.error_max)]
-        rows.append([*policy, *errors, ratio_text(row.ratio), ratio_text(row.task_ratio)])
+        rows.append([*policy, *errors, value_and_interval(row.ratio), value_and_interval(row.task_ratio)])
     columns = "; ".join(["task; arm; head; actor; >seeds; >min; >mean; >max", *_RATIOS])
     return _table("SRL error per step", columns, rows, render_text("errors", _baselines(experiment)))
 
@@ -341,7 +344,7 @@ def _baselines(experiment: Experiment) -> str:
     return _list([experiment.baseline, *(f"of {name} {experiment.baseline_of(name)}" for name in own)])
 
 
-def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
+def coverage_table(experiment: Experiment, rows: Sequence[Occupancy]) -> Table:
     """Occupied cells.
 
     :param experiment: An experiment
@@ -350,34 +353,12 @@ def coverage_table(experiment: Experiment, rows: Sequence[Coverage]) -> Table:
     """
     shown = []
     for row in rows:
-        numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), ratio_text(row.ratio)]
-        shown.append([row.task, row.method, row.actor, *numbers, ratio_text(row.task_ratio)])
+        numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), value_and_interval(row.ratio)]
+        shown.append([row.task, row.method, row.actor, *numbers, value_and_interval(row.task_ratio)])
     columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS])
     dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
     note = render_text("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
     return _table("Coverage of the true state space", columns, shown, note)
-
-
-def cells_reached_table(
-    experiment: Experiment, curves: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
-) -> Table:
-    """Cells reached by then, and the final ratio to the baseline's.
-
-    :param experiment: An experiment
-    :param curves: By task and arm: environment steps [n], and cells reached until then [seeds, n]
-    :return: The table
-    """
-    steps = max((own for arms in curves.values() for own, _ in arms.values()), key=len)
-    shown = []
-    for task, arms in curves.items():
-        for method, (_, cells) in arms.items():
-            ratio = NONE
-            if method != experiment.baseline_of(method):
-                ratio = ratio_text(statistics.cells_ratio(experiment, task, method))
-            numbers = [*map(_mean_std, cells.T), *[NONE] * (len(steps) - cells.shape[1])]  # of an arm that ended early
-            shown.append([task, method, str(len(cells)), *numbers, ratio])
-    columns = "; ".join(["task; arm; >seeds", *(f">at {number_text(step)}" for step in steps), ">/ baseline"])
-    return _table("Cells of the true state", columns, shown, render_text("cells_note", _baselines(experiment)))
 
 
 def rewards_met_table(experiment: Experiment) -> Table:
@@ -399,21 +380,11 @@ def rewards_met_table(experiment: Experiment) -> Table:
         numbers = [_mean_std(met), *(_mean_std(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
         difference = NONE
         if method != experiment.baseline_of(method):
-            difference = ratio_text(statistics.rewards_met_difference(experiment, task, method))
+            difference = value_and_interval(statistics.rewards_met_difference(experiment, task, method))
         shown.append([task, method, str(len(met)), *numbers, difference])
     columns = "task; arm; >seeds; >rewards met, c; >by task policy; >by second actor; >late; >log(1 + c)"
     columns += "; >minus baseline's"
     return _table("Rewards met in training", columns, shown, render_text("rewards_met", _baselines(experiment)))
-
-
-def pretraining_table(experiment: Experiment) -> Table:
-    """Final returns.
-
-    :param experiment: An experiment of kind ``"pretraining"``
-    :return: The table
-    """
-    rows = curves_table(experiment).rows.drop(columns=">area under curve")
-    return Table("Final return after pretraining", rows)
 
 
 def conditions_table(experiment: Experiment) -> Table:

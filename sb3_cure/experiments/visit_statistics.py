@@ -63,7 +63,7 @@ class ErrorSummary(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coverage(Measured):
+class Occupancy(Measured):
     """Occupied cells of a grid over two coordinates of the true state, averaged over all pairs of them.
 
     :param steps: States counted, of each seed and actor alike
@@ -119,7 +119,7 @@ def summarise_errors(experiment: Experiment) -> list[ErrorSummary]:
     return rows
 
 
-def state_coverage(experiment: Experiment) -> list[Coverage]:
+def state_coverage(experiment: Experiment) -> list[Occupancy]:
     """Coverage of the true states by every actor.
 
     States are counted on grids over two coordinates at a time: a grid over all of them has either a few cells per
@@ -138,13 +138,12 @@ def state_coverage(experiment: Experiment) -> list[Coverage]:
             continue
         steps = min(len(states) for states in visits.values())
         low, width = _grid_of_random(visits, units)
-        rng = np.random.default_rng(0)
-        occupied = {
-            key: float(np.mean(occupied_cells(rng.choice(states, steps, replace=False), low, width)))
-            for key, states in visits.items()
-        }
+        occupied = {}
+        for key, states in visits.items():  # the same draw of all, as arms of a seed share the random policy's states
+            drawn = np.random.default_rng(0).choice(states, steps, replace=False)
+            occupied[key] = float(np.mean(occupied_cells(drawn, low, width)))
         for row in _compare(experiment, task, occupied):
-            rows.append(Coverage(**row, steps=steps, dimensions=len(low)))
+            rows.append(Occupancy(**row, steps=steps, dimensions=len(low)))
     return rows
 
 

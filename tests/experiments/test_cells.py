@@ -256,14 +256,13 @@ def pretrained_grid(folder: Path, task: str, warm_up: int, budget: int, **change
 def warm_ups(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Filled by each cell: what its replay buffer holds of the first steps."""
     found: list[Any] = []
-    finish = cells._CellRun._write_results
+    finish = cells._write_results
 
-    def keep(run_of_cell: Any) -> None:
-        buffer = run_of_cell.model.replay_buffer
-        found.append((buffer.actions[:20].copy(), buffer.rewards[:20].copy()))
-        finish(run_of_cell)
+    def keep(cell: Any, folder: Path, model: Any, *others: Any) -> None:
+        found.append((model.replay_buffer.actions[:20].copy(), model.replay_buffer.rewards[:20].copy()))
+        finish(cell, folder, model, *others)
 
-    monkeypatch.setattr(cells._CellRun, "_write_results", keep)
+    monkeypatch.setattr(cells, "_write_results", keep)
     return found
 
 

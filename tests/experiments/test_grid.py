@@ -94,7 +94,7 @@ def test_numbers_with_exponents_alone_are_numbers(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "an unknown kind": (dict(kind="curve"), "kind: Input should be 'curves', 'visitation' or 'pretraining'"),
+    "an unknown kind": (dict(kind="curve"), "kind: Input should be 'curves' or 'visitation'"),
     "an unknown key": (dict(budgets=3), "budgets is no key of a grid; did you mean budget"),
     "no seeds": (dict(seeds=0), "seeds: .*at least 1 item"),
     "an unknown task": (

@@ -39,9 +39,10 @@ def test_experiments_are_found_at_any_depth(tmp_path: Path) -> None:
     assert [experiment.name for experiment in read_results(tmp_path / "500k" / "curves")] == ["curves"]
 
 
-@pytest.mark.parametrize("name", ["grid.json", f"{TASK}/sac_ae/seed0/run.json", f"{TASK}/sac_ae/seed0/config.json"])
-def test_damaged_files_are_named(results: Path, name: str) -> None:
-    (results / name).write_text("{")
+@pytest.mark.parametrize("name", ["grid.json", *(f"{TASK}/sac_ae/seed0/{file}" for file in ("run.json", "eval.csv"))])
+@pytest.mark.parametrize("content", ["", "{"])
+def test_damaged_files_are_named(results: Path, name: str, content: str) -> None:
+    (results / name).write_text(content)
     with pytest.raises(UsageError, match=name):
         read_results(results)
 
@@ -83,6 +84,15 @@ def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: i
         path.write_text(json.dumps({**json.loads(path.read_text()), "eval_episodes": 10}))
     write_cell(results, TASK, method, seed, curve(0, 1), **{"eval_episodes": 10, **settings})
     with pytest.raises(UsageError, match=f"was run with {next(iter(settings))}"):
+        read_results(results)
+
+
+def test_cells_of_earlier_versions_enter_with_those_of_today(results: Path) -> None:
+    """Keys that an earlier version did not write are no other setting; those that two later ones have are."""
+    write_cell(results, TASK, "sac_ae", 2, curve(0, 1), algo="cure_sac", pretrain=None)
+    assert list(read_results(results)[0].done(TASK, "sac_ae")) == [0, 1, 2]
+    write_cell(results, TASK, "sac_ae", 3, curve(0, 1), algo="cure_tqc", pretrain=None)
+    with pytest.raises(UsageError, match=r"seed3 was run with algo 'cure_tqc', but .*seed2 with 'cure_sac'"):
         read_results(results)
 
 

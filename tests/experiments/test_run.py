@@ -1,7 +1,6 @@
 """Runs of grids: failures stop nothing else, settings are not mixed, and kills lose nothing."""
 
 import json
-import math
 import os
 import signal
 import subprocess
@@ -269,8 +268,12 @@ def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.M
     """Ray keeps no account of what nobody asks for: a cell per core would compute on the first card."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
     seen: list[str] = []
-    monkeypatch.setattr(run, "_run_unit", lambda *_: seen.append(os.environ["CUDA_VISIBLE_DEVICES"]))
     (cell,) = load_grid(write_grid(tmp_path)).cells
+
+    def run_unit(*_: Any) -> bool:
+        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
+        return True
+
     for has_gpu in (True, False):
-        run._run_on_worker(cell, (tmp_path, math.inf, False), has_gpu)
+        run._run_on_worker(run_unit, has_gpu, cell, tmp_path)
     assert seen == ["0", ""]

@@ -24,13 +24,22 @@ def results(tmp_path: Path) -> Path:
 
 def test_areas_finals_and_thresholds(results: Path) -> None:
     (experiment,) = read_results(results)
-    arm = statistics.summarise_arm(experiment, TASK, "sac_ae", thresholds=(100, 150, 500))
-    assert arm.seeds == (0, 1)
-    np.testing.assert_allclose(arm.areas, [50, 100])
-    np.testing.assert_allclose(arm.finals, [100, 200])
-    np.testing.assert_array_equal(arm.reached[100], [100_000, 50_000])
-    np.testing.assert_array_equal(arm.reached[150], [np.inf, 100_000])
-    np.testing.assert_array_equal(arm.reached[500], [np.inf, np.inf])
+    arm = statistics.summarise_arm(experiment, TASK, "sac_ae")
+    assert list(arm.index) == [0, 1]
+    np.testing.assert_allclose(arm.area, [50, 100])
+    np.testing.assert_allclose(arm.final, [100, 200])
+    for limit, steps in ((100, [100_000, 50_000]), (150, [np.inf, 100_000]), (500, [np.inf, np.inf])):
+        np.testing.assert_array_equal(statistics.steps_to_return(experiment, TASK, "sac_ae", limit), steps)
+
+
+def test_return_before_training_is_none_of_the_agents(tmp_path: Path) -> None:
+    """An untrained policy may earn much, which reaches and solves nothing."""
+    write_grid(tmp_path, seeds=1)
+    write_cell(tmp_path, TASK, "sac_ae", 0, {0: 660, 50_000: 465, 100_000: 0})
+    (experiment,) = read_results(tmp_path)
+    np.testing.assert_allclose(statistics.summarise_arm(experiment, TASK, "sac_ae")["last"], [465 / 2])
+    for limit, steps in ((250, 50_000), (500, np.inf)):
+        np.testing.assert_array_equal(statistics.steps_to_return(experiment, TASK, "sac_ae", limit), [steps])
 
 
 def test_cell_that_stopped_holds_its_last_return(tmp_path: Path) -> None:
@@ -40,10 +49,22 @@ def test_cell_that_stopped_holds_its_last_return(tmp_path: Path) -> None:
     for method in ("sac_ae", "cure_sac_ae"):
         write_cell(folder, TASK, method, 0, {0: 0, 25_000: 200, 50_000: 400}, stop_at_return=300)
     (experiment,) = read_results(folder)
-    arm = statistics.summarise_arm(experiment, TASK, "sac_ae", [300])
-    np.testing.assert_allclose(arm.areas, [(200 + 400) / 2])
-    np.testing.assert_array_equal(arm.reached[300], [50_000])
-    np.testing.assert_allclose(arm.lasts, [(200 + 400 + 400) / 3])
+    arm = statistics.summarise_arm(experiment, TASK, "sac_ae")
+    np.testing.assert_allclose(arm.area, [(200 + 400) / 2])
+    np.testing.assert_array_equal(statistics.steps_to_return(experiment, TASK, "sac_ae", 300), [50_000])
+    np.testing.assert_allclose(arm["last"], [(200 + 400 + 400) / 3])
+
+
+def test_measures_of_seeds_that_stop_at_different_times_have_common_steps(tmp_path: Path) -> None:
+    """Curious policies are evaluated at the end alone: at 20 000 and at 30 000 steps."""
+    write_grid(tmp_path, seeds=2, stop_at_return=1)
+    for seed, end in enumerate((20_000, 30_000)):
+        path = write_cell(tmp_path, TASK, "sac_ae", seed, {0: 0, end: 1}, curious=True, stop_at_return=1) / "eval.csv"
+        first, _, *rows = path.read_text().splitlines()
+        path.write_text("\n".join([first, "0,0,0,0,0,0,,,,", *rows]))
+    curves = statistics.stack_curves(read_results(tmp_path)[0], "curious_srl_error")
+    np.testing.assert_array_equal(curves[TASK]["sac_ae"][0], [30_000, 100_000])
+    np.testing.assert_allclose(curves[TASK]["sac_ae"][1], 0.002)
 
 
 def test_equal_starts_are_told_by_the_error(tmp_path: Path) -> None:
@@ -74,7 +95,7 @@ def test_differences_pair_the_seeds(results: Path) -> None:
     assert difference.t.high == pytest.approx(75 + 12.7062 * 25, rel=1e-5)
     assert difference.t.verdict == "inconclusive"
     assert difference.same_starts == 2
-    (final,) = statistics.paired_differences(experiment, "finals")
+    (final,) = statistics.paired_differences(experiment, "final")
     assert final.t.value == pytest.approx(150)
 
 
@@ -136,9 +157,11 @@ def test_holm_steps_down() -> None:
     np.testing.assert_allclose(statistics.holm([0.9, 0.6]), [1, 1])
 
 
-def test_restricted_mean_counts_the_limit() -> None:
-    """A seed that is late, or never there, counts as the limit."""
-    assert statistics.restricted_mean(np.array([10.0, 150.0, np.inf]), 100) == pytest.approx(70)
+def test_ratio_needs_positive_numbers() -> None:
+    """An error of zero has no logarithm, and the interval of the other pairs would not be that of all."""
+    ours, theirs = {0: 0.2, 1: 0.4, 2: 0.3}, {0: 0.1, 1: 0.1, 3: 0.1}
+    assert statistics.paired_ratio(ours, theirs).value == pytest.approx(8**0.5)
+    assert np.isnan(statistics.paired_ratio({**ours, 1: 0}, theirs).value)
 
 
 @settings(deadline=None, max_examples=20)

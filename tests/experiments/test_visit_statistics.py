@@ -100,6 +100,17 @@ def test_coverage_counts_equally_many_states(tmp_path: Path) -> None:
     assert curious.ratio == statistics.Estimate(2, None, None, 1) and np.isnan(random.ratio.value)
 
 
+def test_random_policy_covers_as_much_in_each_arm(tmp_path: Path) -> None:
+    """All arms of a seed have its episodes; of longer ones as many states are drawn as of the shortest."""
+    rng, arms = np.random.default_rng(0), ("calm", "wild")
+    write_grid(tmp_path, kind="visitation", seeds=1, methods={name: {} for name in arms}, baseline="calm")
+    states = {"random": rng.normal(0, 1, (2000, 2)), "task": rng.normal(0, 1, (300, 2))}
+    for method in arms:
+        write_cell(tmp_path, TASK, method, 0, {}, states=states)
+    rows = {(row.method, row.actor): row.values[0] for row in state_coverage(read_results(tmp_path)[0])}
+    assert rows["calm", "random"] == rows["wild", "random"] and rows["calm", "task"] == rows["wild", "task"]
+
+
 @given(st.integers(1, 4), st.integers(1, 60), st.integers(0, 1000))
 def test_cells_are_counted_by_pair(dimensions: int, n: int, seed: int) -> None:
     """As when cells are told apart one by one; every state is in one cell of each pair."""
