@@ -36,6 +36,7 @@ from sb3_cure.evaluation.rollouts import (
     balanced_negatives,
     run_episodes,
     state_probe,
+    states_and_errors,
     trained_actors,
 )
 
@@ -420,9 +421,7 @@ class CuriosityMapCallback(RolloutCallback):
         self.visits = {}
         with balanced_negatives(self.model, self.eval_env, self.seed):
             for actor in self.actors:
-                pairs = [(episode.states, episode.srl_errors) for episode in self.run(actor, states=self.state)]
-                states, errors = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
-                self.visits[actor] = states, errors
+                self.visits[actor] = states_and_errors(self.run(actor, states=self.state))
         plots.curiosity_map(
             self._path(self.folder, f"curiosity_map_{self.num_timesteps}_steps.png"),
             self.visits,

@@ -121,8 +121,8 @@ def constant_image(model: Any) -> Finding | None:
             if bool((images == images[:1]).all()):
                 constant.append(f"{env} ({key})" if key else f"{env}")
     problem = (
-        f"the last {count} observations of environment {', '.join(constant)} are the same image: check what "
-        "env.render() shows, and camera_id."
+        f"{len(chosen)} of the last {count} observations of environment {', '.join(constant)} are the same image: "
+        "check what env.render() shows, and camera_id."
     )
     return Finding("constant_image", len(constant), problem if constant else None)
 

@@ -51,6 +51,16 @@ class Episode:
         return float(self.rewards.sum())
 
 
+def states_and_errors(episodes: Iterable[Episode]) -> tuple[np.ndarray, np.ndarray]:
+    """Join the steps of episodes.
+
+    :param episodes: Episodes with true states
+    :return: States, [n, d], and SRL errors, [n]
+    """
+    states, errors = zip(*((episode.states, episode.srl_errors) for episode in episodes), strict=True)
+    return np.concatenate(states), np.concatenate(errors)
+
+
 def chunks(n: int) -> list[slice]:
     """Split observations into parts of ``CHUNK``, of which one at a time is encoded.
 

@@ -96,7 +96,7 @@ def _with_panel(frame: np.ndarray, title: str, caption: str, errors: np.ndarray,
     # Only the title may be wrapped, as it is constant: all pictures must have the same number of lines
     lines = [*textwrap.wrap(title, LINE, break_on_hyphens=False), caption]
     if len(errors):
-        lines.append(f"SRL error {errors[-1]:.5f} (highest {top:.5f})")
+        lines.append(f"SRL error {errors[-1]:.5f} (highest so far {errors.max():.5f})")
     size = (width + width % 2, height + line_height * len(lines) + curve_height + 2 * unit)
     picture = Image.new("RGB", (size[0], size[1] + size[1] % 2), "white")
     picture.paste(Image.fromarray(frame))

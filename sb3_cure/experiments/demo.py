@@ -24,7 +24,7 @@ from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
 from sb3_cure.evaluation.result_files import describe_run, write_csv, write_json
-from sb3_cure.evaluation.rollouts import Episode, run_episodes
+from sb3_cure.evaluation.rollouts import Episode, run_episodes, states_and_errors
 from sb3_cure.evaluation.video import frame_rate, write_gif, write_video
 
 
@@ -204,8 +204,7 @@ def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float
         options: Any = dict(deterministic=False, seed=30_000, states=True)
         episodes = list(run_episodes(model, eval_env, EPISODES, actor, **options))
         means = np.array([episode.srl_errors.mean() for episode in episodes])
-        states = np.concatenate([episode.states for episode in episodes])
-        visits[actor] = states, np.concatenate([episode.srl_errors for episode in episodes])
+        visits[actor] = states_and_errors(episodes)
         bars.append(plots.Bar(actor, actor, means, f"{means.mean():.4f}"))
         for number, episode in enumerate(episodes):
             row = {"policy": actor, "episode": number, "return": episode.total_reward}

@@ -4,7 +4,6 @@ import contextlib
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
@@ -14,7 +13,13 @@ from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
 from sb3_cure.evaluation.callbacks import ReconstructionCallback
-from sb3_cure.evaluation.rollouts import balanced_negatives, highest_errors, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import (
+    balanced_negatives,
+    highest_errors,
+    run_episodes,
+    states_and_errors,
+    trained_actors,
+)
 from sb3_cure.evaluation.video import frame_rate, write_video
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.experiments.visitation import VISIT_SEED, roll_out, visiting_actors
@@ -68,9 +73,7 @@ def _draw_map(model: CuReSAC, cell: Cell, env: gym.Env, folder: Path) -> None:
     visits = {}
     with balanced_negatives(model, env, VISIT_SEED - 1):
         for actor in visiting_actors(model, cell):
-            episodes = roll_out(model, cell, env, actor, states=True)
-            states, errors = zip(*[(each.states, each.srl_errors) for each in episodes], strict=True)
-            visits[actor] = np.concatenate(states), np.concatenate(errors)
+            visits[actor] = states_and_errors(roll_out(model, cell, env, actor, states=True))
     title = f"Where policies go with sampled actions: {_title(cell)}"
     names, units = physics_state_names(env), physics_state_units(env)
     plots.curiosity_map(folder / "curiosity_map.png", visits, names, title, units=units)

@@ -88,11 +88,15 @@ class Section:
 
     @property
     def facts(self) -> str:
-        return render_text("facts", self.experiment)
+        environments: dict[str, dict[str, None]] = {}
+        for cell in self.experiment.finished:
+            kwargs = ", ".join(f"{name} {value}" for name, value in sorted(cell.config["env_kwargs"].items()))
+            environments.setdefault(kwargs or "as registered", {})[cell.task] = None
+        return render_text("facts", self.experiment, self.progress, environments)
 
     @property
     def progress(self) -> str:
-        return render_text("progress", self.experiment)
+        return f"{len(self.experiment.finished)} of {len(self.experiment.cells)}"
 
     @property
     def summary(self) -> str:
