@@ -68,12 +68,15 @@ def check_arguments(model: Any) -> None:
     :raises ValueError: for the first that cannot work, in one sentence
     """
     try:
-        CuReArguments.model_validate(model)
+        checked = CuReArguments.model_validate(model)
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
         or_none = " or None" if type(None) in get_args(CuReArguments.model_fields[name].annotation) else ""
         raise ValueError(f"{name}={first['input']!r} is not valid: {first['msg'].lower()}{or_none}.") from None
+    for name, value in checked:
+        if isinstance(value, int | float):  # converted, where a file has 1e3 or "0.1"
+            setattr(model, name, value)
     for is_wrong, sentence in _conflicts(model):
         if is_wrong:
             raise ValueError(sentence)

@@ -66,7 +66,9 @@ class CuRe(CuReBase):
         if self.curiosity == "random" and not self.task:  # uniform actions all the time
             learning_starts = self.num_timesteps + 1
         _, actions = super()._sample_action(learning_starts, None, n_envs)
-        if self.task and self.curiosity in ("separate", "random") and self.num_timesteps >= learning_starts:
+        if self.num_timesteps < learning_starts:
+            self._mixer.forget()  # who acted in a `learn` before this one
+        elif self.task and self.curiosity in ("separate", "random"):
             starts: Any = self._last_episode_starts
             second = self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
             if second.any():

@@ -58,6 +58,10 @@ class CuriousMixer:
         self.n_bouts += int((self.curious & ~before).sum())
         return self.curious
 
+    def forget(self) -> None:
+        """Forget who acts, which is redrawn in the next step."""
+        self.curious = np.zeros(0, dtype=bool)
+
     def hold(self, sample: Callable[[], npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Get the actions of a random second actor: drawn where a bout begins, and held until it ends.
 

@@ -126,7 +126,9 @@ class Pretraining(CuRe):
                     f"{path} has {name} of shape {theirs}, and this model of shape {ours}: transfer needs equal "
                     "images, encoders and heads, and for a curious agent equal actions and rewards."
                 )
-        ignored = ({"srl"} if self.srl is None else set()) | (set() if transfers_curious else {"intrinsic"})
+        ignored = ({"srl"} if self.srl is None else set()) | (
+            set() if transfers_curious else {"intrinsic", "activation"}
+        )
         for name, ours in self.policy.architecture.items():
             theirs = their_architecture.get(name)
             if name not in ignored and ours != theirs:

@@ -143,6 +143,14 @@ def test_numbers_of_numpy_and_schedules_are_accepted() -> None:
     tiny_model("MlpPolicy", VectorBox(), **arguments).learn(20)
 
 
+def test_numbers_as_files_have_them_are_converted() -> None:
+    """YAML reads 1e1 as a float and 1e-1 as a string: the model would stop after its warm-up, maybe hours later."""
+    arguments: dict[str, Any] = dict(warmup_updates=1e1, srl_interval="2", encoder_tau="5e-2", curiosity_beta="0.5")
+    model = tiny_model("MlpPolicy", VectorBox(), **arguments)
+    assert [getattr(model, name) for name in arguments] == [10, 2, 0.05, 0.5]
+    assert isinstance(model.warmup_updates, int)
+
+
 @pytest.mark.parametrize("name", ["learning_rat", "srl_kwarg"])
 def test_unknown_argument_is_an_error(name: str) -> None:
     for arguments in ({name: 1}, {"policy_kwargs": {name: 1}}, {"srl_kwargs": {name: 1}}):

@@ -167,6 +167,17 @@ def test_curious_actions_are_executed_with_their_probability(
     assert model._mixer.pop_metrics()["rollout/curious_share"] == pytest.approx(curious.mean())
 
 
+def test_another_call_of_learn_continues_no_bout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each call begins with a reset, in its warm-up, when nobody asks who acts: after it the curious actor would act
+    on, as it did at the end of the call before."""
+    model = tiny_model("MlpPolicy", VectorBox(), learning_starts=3, curiosity_bout="episode", curiosity_prob=1.0)
+    model.learn(6)
+    assert model._mixer.curious.all()
+    model.curiosity_prob = 0.0
+    model.learn(6)
+    assert not model._mixer.curious.any()
+
+
 @pytest.mark.parametrize("bout", [6, "episode"])
 def test_logged_bout_is_the_mean_as_it_happened(bout: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over the stretches of each environment, which resets cut: after 10 steps, then every 20."""

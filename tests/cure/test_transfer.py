@@ -186,6 +186,7 @@ MEANINGS: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
     "tanh": (untrained, dict(srl="curl", **CROP_33), dict(srl=None, curiosity=None, **CROP_33)),
     "srl": (untrained, dict(), dict(srl=Doubtful)),
     "intrinsic": (untrained, dict(), dict(intrinsic=Constant)),
+    "activation": (untrained, dict(), dict(policy_kwargs=dict(activation_fn=th.nn.Tanh))),
 }
 
 
