@@ -157,16 +157,16 @@ def test_modes_change_as_torch_changes_them() -> None:
 @pytest.mark.parametrize("factor", [0.1, 2.0])
 def test_learning_rate_reaches_every_optimizer(factor: float) -> None:
     """A schedule's value in everything but the temperatures, which follow it at their ratio."""
-    model = model_of(learning_rate=lambda left: 1e-3 * left, ent_coef_lr_factor=factor)
+    model = model_of(learning_rate=lambda left: 1e-3 * left, ent_coef_lr_factor=factor, intrinsic="rnd")
     policy = model.policy
     for agent in policy.agents.values():  # before the first update, too
         assert agent.ent_coef_optimizer.param_groups[0]["lr"] == pytest.approx(factor * 1e-3)
     model.learn(20)
     model._current_progress_remaining = 0.4
     model.train(1, 4)
-    owners: list[Any] = [policy.srl, *(p for agent in policy.agents.values() for p in (agent.actor, agent.critic))]
-    rates = [owner.optimizer.param_groups[0]["lr"] for owner in owners]
-    assert [*rates, policy.encoder_update.learning_rate] == pytest.approx([4e-4] * 6)
+    owners: list[Any] = [part for agent in policy.agents.values() for part in (agent.actor, agent.critic)]
+    rates = [owner.optimizer.param_groups[0]["lr"] for owner in (policy.srl, policy.intrinsic, *owners)]
+    assert [*rates, policy.encoder_update.learning_rate] == pytest.approx([4e-4] * 7)
     temperatures = [agent.ent_coef_optimizer.param_groups[0]["lr"] for agent in policy.agents.values()]
     assert temperatures == pytest.approx([factor * 4e-4] * 2)
 

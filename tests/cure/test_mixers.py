@@ -138,18 +138,20 @@ def rollout(steps: int, monkeypatch: pytest.MonkeyPatch, **kwargs: Any) -> tuple
     model = tiny_model("MlpPolicy", env, learning_starts=warmup, buffer_size=size, gradient_steps=0, **kwargs)
     asked: list[int] = []
 
-    def curious_actions(observations: np.ndarray, *args: Any, **kwargs: Any) -> tuple[np.ndarray, None]:
+    def curious_actions(observations: np.ndarray, deterministic: bool = False) -> tuple[np.ndarray, None]:
+        assert not deterministic, "it explores with noise"
         asked.append(len(observations))
-        return np.full((len(observations), 2), 2.5, np.float32), None
+        return 1 + observations, None
 
     monkeypatch.setattr(model, "predict_curious", curious_actions)
     executed: list[np.ndarray] = []
     step = env.step_async
     monkeypatch.setattr(env, "step_async", lambda actions: (executed.append(actions.copy()), step(actions))[1])
     model.learn(n_envs * (warmup // n_envs + steps), log_interval=10**9)
-    # 2.5 in [-2, 4] is 0.5 in [-1, 1], which is what the buffer stores.
-    stored = np.isclose(model.replay_buffer.actions[: len(executed)], 0.5).all(axis=2)
-    done = np.isclose(np.array(executed), 2.5).all(axis=2)
+    # 1 + o in [-2, 4] is o / 3 in [-1, 1], which is what the buffer stores: o is of the same environment.
+    seen = model.replay_buffer.observations[: len(executed)]
+    stored = np.isclose(model.replay_buffer.actions[: len(executed)], seen / 3, atol=1e-6).all(axis=2)
+    done = np.isclose(np.array(executed), 1 + seen, atol=1e-5).all(axis=2)
     assert np.array_equal(stored, done)
     assert not done[: warmup // n_envs].any()
     return model, done[warmup // n_envs :], asked
@@ -167,7 +169,7 @@ def test_curious_actions_are_executed_with_their_probability(
     assert model._mixer.pop_metrics()["rollout/curious_share"] == pytest.approx(curious.mean())
 
 
-def test_another_call_of_learn_continues_no_bout(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_call_of_learn_continues_no_bout() -> None:
     """Each call begins with a reset, in its warm-up, when nobody asks who acts: after it the curious actor would act
     on, as it did at the end of the call before."""
     model = tiny_model("MlpPolicy", VectorBox(), learning_starts=3, curiosity_bout="episode", curiosity_prob=1.0)

@@ -127,6 +127,7 @@ def test_task_bootstraps_after_n_steps_and_curiosity_after_one(
     model.policy.encoder_target.register_forward_hook(lambda *args: passes.append(1))
     batch, targets = recorded_targets(model, monkeypatch)
     assert batch.n_step is not None
+    assert_equal(batch.n_step, model.replay_buffer.n_step(3, 0.5))  # type: ignore[union-attr]
     assert not th.equal(batch.n_step.next_observations, batch.next_observations)
     assert len(targets) == len(passes) == (1 if curiosity is None else 2)
 
@@ -144,6 +145,17 @@ def test_task_bootstraps_after_n_steps_and_curiosity_after_one(
         # Standardised rewards: of mean zero
         assert float((targets[1] - after).mean()) == pytest.approx(0, abs=1e-3)
         assert not th.allclose(targets[1], after)
+
+
+def test_the_task_learns_from_normalised_sums(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of rewards and observations, as everything else that is sampled."""
+    venv = VecNormalize(make_vec_env(lambda: VectorBox(), 2))
+    model = tiny_model("MlpPolicy", venv, curiosity=None, n_steps=3, gamma=0.5).learn(40)
+    batch, _ = recorded_targets(model, monkeypatch)
+    buffer: Any = model.replay_buffer
+    assert batch.n_step is not None
+    assert_equal(batch.n_step, buffer.n_step(3, 0.5, venv))
+    assert not th.equal(batch.n_step.rewards, buffer.n_step(3, 0.5).rewards)
 
 
 @both_algorithms

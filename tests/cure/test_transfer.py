@@ -84,8 +84,8 @@ FROZEN: dict[str, Any] = {
     "rae, joint": dict(),
     "rae, sequential": dict(update="sequential"),
     "tqc": dict(algorithm="tqc"),
-    "curl": dict(srl="curl"),
-    "moving average": dict(srl="spr"),
+    "curl": dict(srl="curl", intrinsic="srl_error"),  # whose head measures
+    "moving average": dict(srl="spr", intrinsic="srl_error"),
     "batch norm": dict(srl=Norms),
     "vectors": dict(policy="MlpPolicy"),
 }

@@ -5,6 +5,7 @@ import errno
 import itertools
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -399,7 +400,9 @@ def test_warns_of_too_little_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     monkeypatch.setattr(buffers.psutil, "virtual_memory", lambda: SimpleNamespace(available=40_000))
     with pytest.warns(UserWarning, match="0.00 GB are available"):
         FrameStackReplayBuffer(*arguments, frame_stack=3)
-    FrameStackReplayBuffer(*arguments, frame_stack=3, frames_dir=tmp_path)  # a warning would fail
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        FrameStackReplayBuffer(*arguments, frame_stack=3, frames_dir=tmp_path)
 
 
 def test_pickled_buffer_is_as_large_as_its_contents(tmp_path: Path) -> None:

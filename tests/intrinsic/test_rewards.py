@@ -154,6 +154,15 @@ def test_optimiser_has_what_is_trained_and_the_encoder_what_is_declared(arm: str
     assert changed == {name for name, p in reward.named_parameters() if p.requires_grad}
 
 
+def test_each_image_of_a_dictionary_has_a_reward_that_learns() -> None:
+    model = sensor_model(intrinsic="rnd").learn(20)
+    before = {name: p.clone() for name, p in reward_of(model).named_parameters() if p.requires_grad}
+    assert {name.split(".")[1] for name in before} == {"0", "1"}
+    model.train(1, 8)
+    after = dict(reward_of(model).named_parameters())
+    assert not any(th.equal(after[name], p) for name, p in before.items())
+
+
 # ---------------------------------------------------------------- rnd
 
 
@@ -450,6 +459,7 @@ def test_error_per_pixel_is_in_units_of_the_pixels_deviation(target: str) -> Non
     train_once(model)  # of the same batch, so are the variances
     with th.no_grad():
         assert not th.allclose(found[1], expected, rtol=1e-4)  # the head has learned
+    assert float(reward.weight) == pytest.approx(1 - 0.99**2)  # of a running mean of two updates
     before = reward.variance.clone()
     measured = samples_of(model, 8)
     th.testing.assert_close(

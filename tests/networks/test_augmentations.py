@@ -214,11 +214,12 @@ def test_arguments_reach_the_augmentation() -> None:
     assert isinstance(make_augmentation("crop", image_space(3, 9, 9), size=4), RandomCrop)
 
 
-@pytest.mark.parametrize("augmentation, size", [("shift", 36), ("crop", 30)])
-def test_training_sees_views_acting_the_centre(augmentation: str, size: int) -> None:
-    """Observations and next observations are viewed anew in each update; `predict` never draws a view."""
+@pytest.mark.parametrize("augmentation, size, n_steps", [("shift", 36, 1), ("crop", 30, 1), ("shift", 36, 3)])
+def test_training_sees_views_acting_the_centre(augmentation: str, size: int, n_steps: int) -> None:
+    """Observations and those after n steps are viewed anew in each update; `predict` never draws a view."""
     kwargs: dict[str, Any] = {"augmentation_kwargs": {"size": 30}} if augmentation == "crop" else {}
-    model = filled_model(pixels=True, augmentation=augmentation, learning_rate=0.0, curiosity=None, **kwargs)
+    kwargs |= dict(curiosity=None, n_steps=n_steps)
+    model = filled_model(pixels=True, augmentation=augmentation, learning_rate=0.0, **kwargs)
     policy = model.policy
     seen: list[th.Tensor] = []
     policy.encoder.trunk.register_forward_hook(lambda module, args, out: seen.append(args[0].detach()))
@@ -235,6 +236,7 @@ def test_training_sees_views_acting_the_centre(augmentation: str, size: int) -> 
     original.__class__ = Spy
     train_once(model)
     assert len(drawn) == 2 and not th.equal(drawn[0][0], drawn[1][0])
+    assert th.equal(drawn[1][0], model.replay_buffer.n_step(n_steps, model.gamma).next_observations)
     assert drawn[0][1].shape[2:] == (size, size)
     for (_, views), inputs in zip(drawn, seen, strict=True):
         assert th.equal(inputs, views)

@@ -467,6 +467,21 @@ def test_rows_around_a_fault_are_transitions(wrap: Any) -> None:
     np.testing.assert_allclose(buffer.next_observations[rows], after, atol=1e-6)
 
 
+class Still(VectorBox):
+    """Observations tell no step from another, nor an end from a beginning."""
+
+    def observe(self, first: bool = False) -> np.ndarray:
+        return np.zeros(2, np.float32)
+
+
+def test_stored_stream_breaks_at_a_fault_that_observations_do_not_show() -> None:
+    """Else returns of several steps would add up rewards across it."""
+    env = make([Still] * 2)
+    buffer: Any = tiny_model("MlpPolicy", env).learn(20, callback=KillNow(3)).replay_buffer
+    env.close()
+    assert np.flatnonzero(buffer.starts[: buffer.pos].any(axis=1)).tolist() == [0, 3]
+
+
 def test_monitor_keeps_episodes_before_a_fault(tmp_path: Path) -> None:
     env = make_vec_env(
         partial(PixelBox, episode_length=5, size=12),
