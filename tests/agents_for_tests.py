@@ -56,19 +56,6 @@ def q_values(model: CuReSAC, name: str, latents: th.Tensor, actions: th.Tensor) 
     return actor_critic(model, name).critic(latents, actions).squeeze(2)
 
 
-def one_update(model: CuReSAC, batch_size: int = 8, seed: int = 1) -> dict[str, float]:
-    """Call ``train`` for one update, on a batch and with noise that depend on the seed alone.
-
-    :return: What it logged, without the prefix ``train/``
-    """
-    np.random.seed(seed)
-    th.manual_seed(seed)
-    model.logger.name_to_value.clear()
-    model.logger.name_to_count.clear()  # of which `record_mean` makes its means
-    model.train(1, batch_size=batch_size)
-    return {key.removeprefix("train/"): float(value) for key, value in model.logger.name_to_value.items()}
-
-
 def steps_of(optimizer: Any) -> int:
     """Count the steps of an optimiser.
 
