@@ -108,19 +108,6 @@ def test_any_features_extractor_is_the_encoder(extras: dict[str, Any]) -> None:
         np.testing.assert_array_equal(first, second)
 
 
-@both_modes
-@pytest.mark.parametrize("ent_coef, initial", [("auto", 1.0), ("auto_0.25", 0.25), (0.3, 0.3)])
-def test_temperature(extras: dict[str, Any], ent_coef: str | float, initial: float) -> None:
-    """Learned temperatures start where they are told and move; a fixed one stays."""
-    model = vector_model(ent_coef=ent_coef, **extras)
-    agents = model.policy.agents.values()
-    assert [agent.temperature().item() for agent in agents] == pytest.approx([initial] * len(agents))
-    model.learn(14)
-    assert [agent.temperature().item() != pytest.approx(initial, rel=1e-6) for agent in agents] == [
-        isinstance(ent_coef, str)
-    ] * len(agents)
-
-
 @pytest.mark.parametrize("ent_coef", [0.3, "auto_0.3"])
 def test_callbacks_set_the_temperature(ent_coef: str | float) -> None:
     """By the attributes that SB3's own ``train`` reads; ``save`` writes the same ones."""
