@@ -1,9 +1,7 @@
 """Environments that are, or hold, the same one are found."""
 
 import gymnasium as gym
-import pytest
-from envs_for_tests import VectorBox, tiny_model
-from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
+from envs_for_tests import VectorBox
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -30,10 +28,3 @@ def test_shared_simulator_is_found() -> None:
     robot = VectorBox()
     assert share_environment(Adapter(robot), Monitor(Adapter(robot)))
     assert not share_environment(Adapter(robot), Adapter(VectorBox()))
-
-
-def test_training_environment_is_refused_by_evaluations() -> None:
-    """Also by SB3's, inside of another callback."""
-    env = VectorBox()
-    with pytest.raises(ValueError, match="give it an eval_env of its own"):
-        tiny_model("MlpPolicy", env).learn(5, callback=[EveryNTimesteps(2, EvalCallback(Monitor(env)))])

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import PixelBox, tiny_model
 from gymnasium import spaces
 from srl_for_tests import batch_of, encode, image_space, make, noise_images, randomise, seeded
 
@@ -189,10 +189,3 @@ def test_augmentation_of_curl_can_be_chosen(size: int, kwargs: dict[str, Any], s
     policy = tiny_model("CnnPolicy", PixelBox(size=size), srl="curl", buffer_size=40, **kwargs).policy
     assert policy.encoder.view_space.shape == (6, seen, seen)
     assert policy.encoder.projection.tanh is tanh
-
-
-def test_curl_needs_two_views_of_an_image() -> None:
-    with pytest.raises(ValueError, match="srl='curl' compares two views of one image"):
-        tiny_model("MlpPolicy", VectorBox(), srl="curl")
-    with pytest.raises(ValueError, match="srl='curl' compares two random views, but augmentation is None"):
-        tiny_model("CnnPolicy", PixelBox(), srl="curl", augmentation=None)
