@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch as th
-from agents_for_tests import actor_critic, q_values
+from agents_for_tests import q_values
 from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox, VectorBox, gradients_of_an_update, samples_of, tiny_model
 from gymnasium import spaces
@@ -153,7 +153,7 @@ def test_vectors_enter_in_fp32(all_wide: None, vector_model: CuReSAC) -> None:
     near = th.tensor([[1.0, 0.5]]), th.tensor([[1.003, 0.5]])
     assert relative_error(policy, policy.encoder, *near) < 1e-3
     for name in ("task", "curious"):
-        actor: Any = actor_critic(vector_model, name).actor
+        actor: Any = vector_model.policy.agents[name].actor
         layer = first_output(actor.latent_pi[0], lambda x, actor=actor: actor.action_log_prob(policy.encoder.trunk(x)))
         assert relative_error(policy, layer, *near) < 1e-3
 
@@ -161,7 +161,7 @@ def test_vectors_enter_in_fp32(all_wide: None, vector_model: CuReSAC) -> None:
 @pytest.mark.parametrize("name", ["task", "curious"])
 def test_actions_enter_the_critics_in_fp32(all_wide: None, vector_model: CuReSAC, name: str) -> None:
     """.500 and .501, equal in bf16, differ in the first layer as in fp32."""
-    critic: Any = actor_critic(vector_model, name).critic
+    critic: Any = vector_model.policy.agents[name].critic
     latents = th.full((1, vector_model.policy.encoder.features_dim), 0.7)
     layer = first_output(critic.ensemble[0], lambda actions: q_values(vector_model, name, latents, actions))
     near = th.tensor([[0.5, 0.5]]), th.tensor([[0.501, 0.5]])
