@@ -3,7 +3,6 @@
 import copy
 import io
 import json
-import os
 import pickle
 import struct
 import zipfile
@@ -18,6 +17,7 @@ import torch as th
 from dictionaries_for_tests import Goal
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium import spaces
+from payloads_for_tests import EXECUTED, Payload
 from stable_baselines3 import SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
@@ -384,15 +384,6 @@ def test_pickled_buffers_need_trust(buffer_class: Any, tmp_path: Path) -> None:
 
 # ---------------------------------------------------------------- the corpus
 
-HERE = Path(__file__)
-
-
-class Payload:
-    """Unpickled, it would write a file."""
-
-    def __reduce__(self) -> tuple:
-        return os.system, (f"touch {HERE.parent}/executed",)
-
 
 def changed_model(**members: bytes | None) -> bytes:
     """The example with other members; None: without it."""
@@ -541,7 +532,7 @@ def test_hostile_files_are_refused(kind: str, build: Callable[[], bytes]) -> Non
     """By an error; no code is run and no file is written."""
     data = build()
     assert outcome(lambda: load(kind, data)) == "refused"
-    assert not (HERE.parent / "executed").exists()
+    assert not EXECUTED.exists()
 
 
 def test_payload_of_the_corpus_works() -> None:
@@ -549,7 +540,7 @@ def test_payload_of_the_corpus_works() -> None:
     with watching() as events:
         with pytest.raises(Exception):  # noqa: B017
             CuReSAC.load(io.BytesIO(sb3_with("spam")), trusted=True)
-    (HERE.parent / "executed").unlink()
+    EXECUTED.unlink()
     assert any(event.startswith("os.system") for event in events)
 
 
