@@ -161,13 +161,13 @@ def test_numbers_of_numpy_are_settings(kwargs: dict[str, Any]) -> None:
     assert loaded.learn(10, reset_num_timesteps=False).num_timesteps == 24
 
 
-@pytest.mark.parametrize("name", sorted(example_model()._excluded_save_params()))
-def test_no_archive_sets_parts_of_the_model(name: str) -> None:
+def test_no_archive_sets_parts_of_the_model() -> None:
     """Nor does `save` write one."""
-    with pytest.raises(ArchiveError, match=rf"has {name}, which is no setting"):
-        CuReSAC.load(io.BytesIO(setting(name, None)()))
-    with pytest.raises(ValueError, match=rf"include=\['{name}'\], which an archive does not hold"):
-        example_model().save(io.BytesIO(), include=[name])
+    for name in example_model()._excluded_save_params():
+        with pytest.raises(ArchiveError, match=rf"has {name}, which is no setting"):
+            CuReSAC.load(io.BytesIO(setting(name, None)()))
+        with pytest.raises(ValueError, match=rf"include=\['{name}'\], which an archive does not hold"):
+            example_model().save(io.BytesIO(), include=[name])
 
 
 def test_other_algorithms_are_saved_alike(tmp_path: Path) -> None:
