@@ -1,5 +1,6 @@
 """The allocator keeps large blocks once there is a model."""
 
+import os
 import subprocess
 import sys
 
@@ -13,20 +14,25 @@ from sb3_cure import CuReSAC
 small = dict(net_arch=[8], features_extractor_kwargs=dict(n_filters=2))
 env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
 CuReSAC("CnnPolicy", env, buffer_size=10, policy_kwargs=small)
-def round():
-    [th.ones(4_000_000) for _ in range(12)]
-for _ in range(10):
-    round()
+def round(size):
+    [th.ones(size) for _ in range(6)]
+round(7_000_000)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(10):
-    round()
+for size in (7_100_000, 7_200_000, 7_300_000):
+    round(size)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only glibc is tuned")
 def test_large_blocks_are_kept() -> None:
-    """A dozen blocks of 16 MB, made and freed again and again: their pages come from the system once, not each time."""
-    result = subprocess.run([sys.executable, "-c", COUNT_FAULTS], capture_output=True, text=True, check=True)
-    # 468 750 pages are written to. Untuned, most are new each time (unless a small block happens to lie above them).
-    assert int(result.stdout) < 4000
+    """Six blocks of 28 MB, made and freed again and again: their pages come from the system once, not each time.
+
+    Each time they are a little larger: untuned, those are mapped anew, whatever lies above the freed ones.
+    """
+    # Whoever sets these variables has chosen otherwise.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    command = [sys.executable, "-c", COUNT_FAULTS]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    # 126 563 pages are written to. Kept, 1758 of them are new, or a block's more where a small one lies in between.
+    assert int(result.stdout) < 40_000
