@@ -96,7 +96,7 @@ def test_gradients_point_where_those_of_fp32_do(srl: str) -> None:
     """
     network = dict(net_arch=[64], features_extractor_kwargs=dict(n_filters=16, n_layers=3))
     arguments: dict[str, Any] = dict(srl=srl, update="joint", batch_size=128, policy_kwargs=network)
-    trained = tiny_model("CnnPolicy", PixelBox(), **arguments).learn(60)
+    trained = tiny_model("CnnPolicy", PixelBox(), learning_starts=50, **arguments).learn(60)
     state = copy.deepcopy(trained.get_parameters())
     found = {}
     for name in ("fp32", "bf16"):
