@@ -2,30 +2,17 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from envs_for_tests import PixelBox, tiny_model
-from stable_baselines3.common.logger import KVWriter, Logger
+from logs_for_tests import KeptRows
+from stable_baselines3.common.logger import Logger
 
 from sb3_cure.evaluation import diagnostics
 from sb3_cure.evaluation.callbacks import DiagnosticsCallback, EvalBothCallback
 
 GLOSSARY = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text(encoding="utf-8")
 NAMES = set(re.findall(r"`((?:train|rollout|time|eval|diagnostics)/[\w<>]+)`", GLOSSARY))
-
-
-class Keeper(KVWriter):
-    """Remembers the names that a logger was given."""
-
-    def __init__(self) -> None:
-        self.names: set[str] = set()
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        self.names |= key_values.keys()
-
-    def close(self) -> None:
-        pass
 
 
 def as_in_glossary(name: str) -> str:
@@ -35,13 +22,13 @@ def as_in_glossary(name: str) -> str:
 
 @pytest.fixture(scope="module")
 def logged() -> set[str]:
-    model, keeper = tiny_model("CnnPolicy", PixelBox(), intrinsic="icm"), Keeper()
-    model.set_logger(Logger(None, [keeper]))
+    model, kept = tiny_model("CnnPolicy", PixelBox(), intrinsic="icm"), KeptRows()
+    model.set_logger(Logger(None, [kept]))
     watching = [EvalBothCallback(PixelBox(), 40, 1), DiagnosticsCallback(every=40)]
     with pytest.MonkeyPatch.context() as early:
         early.setattr(diagnostics, "MIN_UPDATES", 1)
         model.learn(80, callback=watching, log_interval=1)
-    return {as_in_glossary(name) for name in keeper.names}
+    return {as_in_glossary(name) for row in kept.rows for name in row.keys() - {"step"}}
 
 
 def test_all_that_is_logged_is_explained(logged: set[str]) -> None:
