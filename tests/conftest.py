@@ -37,3 +37,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def logs_of_models(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Put the folders that SB3 makes for logs of every model where pytest tidies up."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture
+def quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no checkpoint wait for the disk: a kill of the process, unlike a loss of power, does not need it."""
+    monkeypatch.setattr(os, "fsync", lambda descriptor: None)

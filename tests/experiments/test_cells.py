@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import random
 from functools import partial
 from pathlib import Path
@@ -25,11 +24,7 @@ from sb3_cure.experiments import cells, media, run, visitation
 from sb3_cure.experiments.cells import run_cell
 from sb3_cure.experiments.grid import Cell, Grid, load_grid
 
-
-@pytest.fixture(autouse=True)
-def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoints do not wait for the disk."""
-    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+pytestmark = pytest.mark.usefixtures("quick_disk")
 
 
 @pytest.fixture

@@ -21,11 +21,7 @@ from sb3_cure.experiments.grid import load_grid
 
 QUICK: dict[str, Any] = dict(budget=40, evaluation=dict(every=40, episodes=1))
 
-
-@pytest.fixture(autouse=True)
-def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checkpoints do not wait for the disk."""
-    monkeypatch.setattr(os, "fsync", lambda descriptor: None)
+pytestmark = pytest.mark.usefixtures("quick_disk")
 
 
 # -------------------------------------------------------------------- failures
