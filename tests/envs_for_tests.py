@@ -257,3 +257,28 @@ class KillNow(BaseCallback):
         if self.n_calls in self.at:
             os.kill(self.training_env.unwrapped.processes[1].pid, signal.SIGKILL)
         return True
+
+
+class Killed(Exception):
+    """Stands in for a kill where the process is to live on: nothing is written after it."""
+
+
+class KillAt(BaseCallback):
+    """Raises at its n-th call."""
+
+    def __init__(self, calls: int):
+        super().__init__()
+        self.left = calls
+
+    def _on_step(self) -> bool:
+        self.left -= 1
+        if self.left == 0:
+            raise Killed
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing."""
