@@ -400,15 +400,14 @@ def test_pictures_show_every_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 # -------------------------------------------------------------------- visits
 
 
-def test_of_crops_all_is_measured_and_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_crops_all_is_measured_and_drawn(tmp_path: Path) -> None:
     """What the head draws, which is the centre, and not the whole image."""
     crops: dict[str, Any] = dict(augmentation="crop", augmentation_kwargs=dict(size=30))
     model = tiny_model("CnnPolicy", PixelBox(), srl="rae", **crops).learn(20)
     seen = model.replay_buffer.observations_at(np.arange(5), np.zeros(5, int))[0]
     drawn = visitation.mean_target(model, [SimpleNamespace(observations=seen)])  # type: ignore[list-item]
     assert drawn.shape == (6, 30, 30)
-    monkeypatch.setattr(media, "_title", lambda cell: "crops")
-    media._draw_replay_buffer(model, None, tmp_path)  # type: ignore[arg-type]
+    media.draw_cell(model, only_cell(tmp_path), tmp_path)
     assert (tmp_path / "uncomfortable.png").exists()
 
 
