@@ -118,17 +118,22 @@ def test_error_is_about_the_true_transition(srl: str) -> None:
     assert logged["curious_reward_raw_mean"] == logged["srl_error"]
 
 
+def let_predict(head: Any, latents: th.Tensor) -> None:
+    """Let these be the latents of next observations that the head predicts."""
+    head.project = lambda latents: latents
+    head.target_encoder.forward = lambda views: latents
+
+
 @pytest.mark.parametrize("size", [1e-2, 1.0])
 @pytest.mark.parametrize("srl", ["spr", "forward"])
 def test_small_latents_are_no_easier_to_predict(srl: str, size: float) -> None:
     """The target is standardised; else a collapsed encoder would be the best one. By the batch, or as was seen."""
     model = filled_model(srl=srl, curiosity=None)
     head: Any = model.policy.srl
-    head.project = lambda latents: latents
     seen: list[th.Tensor] = []
     head.distance = lambda inputs, target: (seen.append(target), target.square().mean(dim=1))[1]
     latents = 0.3 + size * th.randn(64, 8, generator=th.Generator().manual_seed(0))
-    head.target_encoder.forward = lambda views: latents
+    let_predict(head, latents)
     batch = samples_of(model, 64)
     for _ in range(200):
         head.loss(batch, latents)
@@ -140,12 +145,15 @@ def test_small_latents_are_no_easier_to_predict(srl: str, size: float) -> None:
 
 def test_running_statistics_of_targets_follow_slowly() -> None:
     """A batch moves them towards its own; it neither replaces them nor throws them beyond."""
-    head: Any = filled_model(srl="spr", curiosity=None).policy.srl
-    low, high = 1 + th.randn(64, 8), 50 + 9 * th.randn(64, 8)
+    model = filled_model(srl="spr", curiosity=None)
+    head: Any = model.policy.srl
+    batch, low, high = samples_of(model, 64), 1 + th.randn(64, 8), 50 + 9 * th.randn(64, 8)
+    let_predict(head, low)
     for _ in range(50):
-        head._standardise(low, learns=True)
+        head.loss(batch, low)
     before = head.mean.clone(), head.variance.clone()
-    head._standardise(high, learns=True)
+    let_predict(head, high)
+    head.loss(batch, low)
     for old, new, goal in zip(before, (head.mean, head.variance), (high.mean(dim=0), high.var(dim=0)), strict=True):
         assert ((old < new) & (new < goal)).all()
 
@@ -191,11 +199,10 @@ def test_latents_tell_the_state(srl: str, real_frames: tuple[gym.Env, Any, list[
     """
     env, buffer, episodes = real_frames
     updates, batch_size, learning_rate = LEARNS[srl]
-    model = model_of_cups(env, srl, learning_rate=learning_rate).learn(1)
+    model = model_of_cups(env, srl, learning_rate=learning_rate, batch_size=batch_size).learn(1)
     model.replay_buffer = buffer
-    model._plan = lambda: (True, False, 1)  # type: ignore[method-assign]
     untrained = r2_of_positions(model, env, episodes)
-    model.train(updates, batch_size)
+    model.fit_representation(updates)
     trained = r2_of_positions(model, env, episodes)
     assert untrained < 0.15 and trained > 0.4, (untrained, trained)
 
