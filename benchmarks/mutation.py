@@ -39,7 +39,7 @@ from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write
 ROOT = Path(__file__).resolve().parent.parent
 #: Tests of each file or group of files, the likeliest and fastest first (paths below tests/, or options of pytest)
 GROUPS = {
-    "cure/cure.py": """cure/test_gradients.py cure/test_schedules.py cure/test_actor_critic.py test_polyak_rates.py
+    "cure/cure.py": """cure/test_gradients.py cure/test_schedules.py cure/test_actor_critic.py
         cure/test_update_equals_sb3.py cure/test_training.py intrinsic/test_contract.py
         srl/test_contract.py
         -k 'not (one_update_per or vectors or can_be_changed or frame_stack or board)'""",

@@ -264,15 +264,15 @@ class Killed(Exception):
 
 
 class KillAt(BaseCallback):
-    """Raises at its n-th call."""
+    """Raises after a number of agent steps."""
 
-    def __init__(self, calls: int):
+    def __init__(self, steps: int):
         super().__init__()
-        self.left = calls
+        self.left = steps
 
     def _on_step(self) -> bool:
-        self.left -= 1
-        if self.left == 0:
+        self.left -= self.training_env.num_envs
+        if self.left <= 0:
             raise Killed
         return True
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch as th
 from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from logs_for_tests import KeptRows
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.torch_layers import NatureCNN
@@ -52,24 +53,11 @@ class NoParameters(SRLHead):
         return SRLOutput(latents.square().mean(), latents.detach().square().mean(dim=1))
 
 
-class Dumps(KVWriter):
-    """Keeps what the logger writes."""
-
-    def __init__(self) -> None:
-        self.dumps: list[dict[str, Any]] = []
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        self.dumps.append(dict(key_values))
-
-    def close(self) -> None:
-        pass
-
-
 def log_to(model: CuReSAC) -> list[dict[str, Any]]:
     """Everything that the model's logger writes from now on, one dictionary per dump."""
-    dumps = Dumps()
-    model.set_logger(Logger(None, [dumps]))
-    return dumps.dumps
+    kept = KeptRows()
+    model.set_logger(Logger(None, [kept]))
+    return kept.rows
 
 
 def make_vec_env(n_envs: int, make: Callable[[], gym.Env] = PixelBox, kind: type[VecEnv] = DummyVecEnv) -> VecEnv:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
-from envs_for_tests import PixelBox, VectorBox, differences, samples_of, state_of, tiny_model
+from envs_for_tests import KillAt, Killed, PixelBox, VectorBox, differences, samples_of, state_of, tiny_model
 from srl_for_tests import noise_images, randomise
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
@@ -80,29 +79,7 @@ def layer_by_layer(network: nn.Sequential, inputs: th.Tensor) -> th.Tensor:
 # ---------------------------------------------------------------- in every mode
 
 
-class Killed(Exception):
-    """Stands in for a kill."""
-
-
-class KillAt(BaseCallback):
-    def __init__(self, step: int):
-        super().__init__()
-        self._left = step  # not public: it is not kept
-
-    def _on_step(self) -> bool:
-        self._left -= 1
-        if self._left == 0:
-            raise Killed
-        return True
-
-
-@pytest.fixture
-def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("files", "generations", "checkpoints"):
-        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
-
-
-@pytest.mark.usefixtures("_no_waiting_for_the_disk")
+@pytest.mark.usefixtures("quick_disk")
 @pytest.mark.parametrize("arm, curiosity", [*((arm, "separate") for arm in ARMS), ("rnd", "bonus")])
 def test_resumed_training_is_the_uninterrupted_one(arm: str, curiosity: str, tmp_path: Path) -> None:
     """Bit for bit, with a replay buffer and memories that have gone round, from a model that was loaded."""

@@ -4,7 +4,6 @@ checkpoint."""
 import collections
 import hashlib
 import itertools
-import os
 import pickle
 import random
 import subprocess
@@ -24,10 +23,11 @@ import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import Goal, SensorBox, sensor_model
-from envs_for_tests import PixelBox, VectorBox, differences, state_of, tiny_model
+from envs_for_tests import KillAt, Killed, PixelBox, VectorBox, differences, state_of, tiny_model
 from gymnasium.wrappers import NormalizeReward
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from payloads_for_tests import EXECUTED, Payload
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
@@ -46,12 +46,7 @@ from sb3_cure.persistence.generations import Generations
 from sb3_cure.persistence.resume import random_state
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
-
-@pytest.fixture(autouse=True)
-def _no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kill of the process, unlike a loss of power, does not need it."""
-    for module in ("files", "generations", "checkpoints"):
-        monkeypatch.setattr(f"sb3_cure.persistence.{module}.flush_to_disk", lambda path: None)
+pytestmark = pytest.mark.usefixtures("quick_disk")
 
 
 @dataclass
@@ -145,31 +140,6 @@ def outcome(model: CuReSAC) -> dict[str, Any]:
         "to be logged": {k: v for k, v in model.logger.name_to_value.items() if not k.startswith("train/encoder_")},
         "next draws": (np.random.random(3), th.rand(3), random.random(), model.action_space.sample()),
     }
-
-
-class Killed(Exception):
-    """Stands in for a kill where the process is to live on: nothing is written after it."""
-
-
-class KillAt(BaseCallback):
-    """Raises after a number of agent steps."""
-
-    def __init__(self, steps: int):
-        super().__init__()
-        self.left = steps
-
-    def _on_step(self) -> bool:
-        self.left -= self.training_env.num_envs
-        if self.left <= 0:
-            raise Killed
-        return True
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing."""
 
 
 _REFERENCE: dict[str, dict[str, Any]] = {}
@@ -632,13 +602,6 @@ def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
         assert th.equal(kept, read), name
 
 
-class Payload:
-    """Unpickled, it would write a file."""
-
-    def __reduce__(self) -> tuple:
-        return os.system, (f"touch {Path(__file__).parent}/executed",)
-
-
 @pytest.mark.parametrize("name", ["model.zip", "state.safetensors"])
 def test_hostile_checkpoint_runs_no_code(name: str, tmp_path: Path) -> None:
     """Its checksums are those of the author's files."""
@@ -651,7 +614,7 @@ def test_hostile_checkpoint_runs_no_code(name: str, tmp_path: Path) -> None:
     (folder / "SHA256SUMS").write_text("\n".join([*lines, f"{digest}  {name}"]) + "\n")
     with watching() as events, pytest.raises(ArchiveError):
         CuReSAC.resume(tmp_path, vectors(), device="cpu")
-    assert events == [] and not (Path(__file__).parent / "executed").exists()
+    assert events == [] and not EXECUTED.exists()
 
 
 # ------------------------------------------------------------------------------------------------ refusals
