@@ -13,7 +13,7 @@ import psutil
 from benchmarks.harness import fill, make_model, stream
 from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-from sb3_cure.persistence.checkpoints import CheckpointWriter
+from sb3_cure.persistence.checkpoints import CheckpointFolder
 
 BUFFER_SIZE, NEW_STEPS, KEEP = 80_000, 10_000, 3
 #: The paper's networks, and some that are next to nothing: what is left then is the replay buffer's share
@@ -65,7 +65,7 @@ def measure(repeats: int = 5, directory: str | None = None) -> dict[str, Any]:
         model.train(2, 8)  # so that the optimisers have a state
         _collect(model, BUFFER_SIZE)
         with tempfile.TemporaryDirectory(dir=directory) as folder:
-            writer = CheckpointWriter(folder)
+            writer = CheckpointFolder(folder)
             writer.write(model, model._run, KEEP)
             times: dict[str, list[float]] = {name: [] for name in ("at once", "in pieces", "checkpoint")}
             extra = []

@@ -34,7 +34,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.data.buffers import transitions
 from sb3_cure.evaluation.result_files import describe_run, write_json
 from sb3_cure.persistence import CheckpointError, write_state
-from sb3_cure.persistence.checkpoints import CheckpointWriter
+from sb3_cure.persistence.checkpoints import CheckpointFolder
 from sb3_cure.persistence.resume import load_random_state, random_state
 
 #: Generations to keep, in the folder that the faults hit
@@ -166,7 +166,7 @@ class Site:
         self.before, self.work, self.after = folder / "before", folder / "work", folder / "after"
         model = _make_model()
         self.before.mkdir(parents=True)
-        writer = CheckpointWriter(self.before)
+        writer = CheckpointFolder(self.before)
         for _ in range(3):
             model.learn(21, reset_num_timesteps=False)
             writer.write(model, model._run, KEEP)

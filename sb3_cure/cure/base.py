@@ -25,7 +25,7 @@ from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
 from sb3_cure.persistence.callback_state import nested_callbacks
 from sb3_cure.srl import SRLHead, get_srl_class
-from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments, restarts_workers
+from sb3_cure.vec_env import FiniteCheck, OverlappedVecEnv, check_environments
 
 Self = TypeVar("Self", bound="CuReBase")
 
@@ -346,7 +346,8 @@ class CuReBase(OffPolicyAlgorithm):
         # SB3 does so after each step: the first one would see where the former call ended.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         env: Any = self.env
-        if restarts_workers(env) and not isinstance(self.replay_buffer, FrameStackReplayBuffer):
+        restarts_workers = getattr(env.unwrapped, "on_env_fault", None) == "restart"
+        if restarts_workers and not isinstance(self.replay_buffer, FrameStackReplayBuffer):
             raise ValueError(
                 f"a {type(self.replay_buffer).__name__} cannot leave out the steps of workers that died: use "
                 "on_env_fault='raise', or leave replay_buffer_class out."

@@ -11,7 +11,6 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.utils import update_learning_rate
 
-from sb3_cure.data.observations import detached
 from sb3_cure.networks.encoders import Encoder
 
 #: Updates between two measurements of each source's share, which costs a backward pass for each source
@@ -115,7 +114,8 @@ class EncoderUpdate:
             with th.set_grad_enabled(graph):
                 features = self.encoder.trunk(self._views[name]())
                 self._latents[name] = self.encoder.projection(features).float()
-            self._features[name] = detached(features)
+            is_one = isinstance(features, th.Tensor)
+            self._features[name] = features.detach() if is_one else tuple(part.detach() for part in features)
         leaf = self._latents[name].detach()
         leaf.requires_grad_(source in self.mean_squares and self._latents[name].requires_grad)
         self._leaves.setdefault(source, {})[name] = leaf

@@ -301,8 +301,16 @@ class FrameStackReplayBuffer(ReplayBuffer):
         vars(self).update({name: state["counters"][name] for name in _COUNTERS})
         for ring in self.rings.values():
             ring.reserve()
-        frames = any(name.startswith("frames/") for name in state["arrays"])
-        copy_arrays(self.state_dict(frames)["arrays"], state["arrays"])
+        given = state["arrays"]
+        own = self.state_dict(frames=any(name.startswith("frames/") for name in given))["arrays"]
+        for name in sorted(own.keys() | given.keys()):
+            needed, found = (
+                f"{arrays[name].dtype} of shape {arrays[name].shape}" if name in arrays else "missing"
+                for arrays in (own, given)
+            )
+            if needed != found:
+                raise ValueError(f"the array {name:.50} is {found} in the file, but {needed} in this replay buffer")
+            own[name][...] = given[name]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what has not been written to: a pickled buffer is as large as its contents."""
@@ -319,23 +327,6 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
 #: Attributes that change together with each row
 _COUNTERS = ("pos", "full", "counts", "n_added", "_n_valid", "_breaks")
-
-
-def copy_arrays(target: dict[str, ndarray], source: dict[str, ndarray]) -> None:
-    """Copy arrays into others of the same names, shapes and types.
-
-    :param target: Arrays to write to, by name
-    :param source: Arrays to read, by name
-    :raises ValueError: If names, shapes or types differ
-    """
-    for name in sorted(target.keys() | source.keys()):
-        needed, given = (
-            f"{arrays[name].dtype} of shape {arrays[name].shape}" if name in arrays else "missing"
-            for arrays in (target, source)
-        )
-        if needed != given:
-            raise ValueError(f"the array {name:.50} is {given} in the file, but {needed} in this replay buffer")
-        target[name][...] = source[name]
 
 
 def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:

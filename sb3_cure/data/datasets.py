@@ -45,7 +45,7 @@ class RecordedEpisode(NamedTuple):
 
 
 def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
-    """Write an episode to a file.
+    """Write an episode to a file, which is there when all of it is written.
 
     :param path: The ``.npz`` file to write
     :param episode: The episode
@@ -53,7 +53,10 @@ def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
     arrays = episode._asdict()
     if isinstance(episode.observations, dict):
         arrays |= {f"observations/{key}": array for key, array in arrays.pop("observations").items()}
-    np.savez_compressed(path, **arrays)
+    draft = Path(f"{path}.part")
+    with draft.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    draft.replace(path)
 
 
 def load_episode(path: str | Path) -> RecordedEpisode:

@@ -102,12 +102,3 @@ def sensed_space(space: spaces.Space) -> spaces.Space:
     if not isinstance(space, spaces.Dict) or image_spaces(space):
         return space
     return spaces.Box(-np.inf, np.inf, (get_flattened_obs_dim(space),), np.float32)
-
-
-def detached(features: Any) -> Any:
-    """Detach features from the graph.
-
-    :param features: A tensor, or a tuple of tensors
-    :return: The same without a graph
-    """
-    return features.detach() if isinstance(features, th.Tensor) else tuple(part.detach() for part in features)

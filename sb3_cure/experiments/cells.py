@@ -358,7 +358,7 @@ def is_held(folder: Path) -> bool:
     """
     try:
         if (folder / ".lock").exists():
-            filelock.FileLock(folder / ".lock").acquire(timeout=0).lock.release()
+            filelock.FileLock(folder / ".lock", fallback_to_soft=False).acquire(timeout=0).lock.release()
     except filelock.Timeout:
         return True
     except OSError:

@@ -159,8 +159,10 @@ class SavesModels(OffPolicyAlgorithm):
         settings = {}
         for name, value in vars(self).items():
             if name not in left_out:
+                found: dict[str, th.Tensor] = {}
                 try:
-                    settings[name] = encode(value, name, tensors, named)
+                    settings[name] = encode(value, name, found, named)
+                    tensors |= found
                 except TypeError as error:
                     settings[name] = {_PLACEHOLDER: str(error)}
         content = {

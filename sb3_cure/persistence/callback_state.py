@@ -3,6 +3,8 @@
 An object that a callback keeps under two names becomes two objects.
 """
 
+import hashlib
+import inspect
 import io
 from typing import Any
 
@@ -13,6 +15,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.persistence.encoding import write_state
+from sb3_cure.persistence.env_state import has_state_dict
 
 #: Attribute with the contents of a callback's attributes when its first ``learn`` began
 _INITIAL = "_sb3_cure_initial"
@@ -54,8 +57,11 @@ def callback_state(callback: BaseCallback) -> dict[str, Any]:
     :return: Values that ``encode`` knows; ``"missing"`` names the attributes that cannot be kept
     """
     state: dict[str, Any] = {"class": type(callback).__name__, "missing": []}
-    if hasattr(callback, "state_dict"):
-        return {**state, "own": callback.state_dict()}
+    if has_state_dict(callback):
+        own = callback.state_dict()  # type: ignore[attr-defined]
+        if _content(own) is None:
+            return {**state, "changed": {}, "missing": [f"{state['class']}.state_dict()"]}
+        return {**state, "own": own}
     attributes, initial = _attributes(callback), getattr(callback, _INITIAL)
     contents = {name: _content(value) for name, value in attributes.items()}
     changed = [name for name, content in contents.items() if content is not None and content != initial.get(name)]
@@ -84,7 +90,7 @@ def _attributes(callback: BaseCallback) -> dict[str, Any]:
     return {
         name: value
         for name, value in attributes.items()
-        if not isinstance(value, kinds) and not callable(value) and not _callbacks_in(value)
+        if not (isinstance(value, (*kinds, type)) or inspect.isroutine(value) or _callbacks_in(value))
     }
 
 
@@ -94,9 +100,9 @@ def _callbacks_in(value: Any) -> list[BaseCallback]:
 
 
 def _content(value: Any) -> bytes | None:
-    """Bytes of a value in a file; None if files do not hold its type."""
+    """Digest of a value in a file; None if files do not hold its type, or so much, or what holds itself."""
     try:
         write_state(file := io.BytesIO(), {"value": value})
-    except TypeError:
+    except (TypeError, OSError, RecursionError):
         return None
-    return file.getvalue()
+    return hashlib.sha256(file.getbuffer()).digest()

@@ -32,8 +32,8 @@ class _Segment(NamedTuple):
     digest: str
 
 
-class CheckpointWriter:
-    """Writes a model's checkpoints into one folder, and each frame of its replay buffer once.
+class CheckpointFolder:
+    """Writes a model's checkpoints into one folder, each frame of its replay buffer once, and reads them.
 
     :param path: Folder
     """
@@ -57,6 +57,8 @@ class CheckpointWriter:
         state = training_state(model, run)
         buffer: Any = model.replay_buffer
         segments: dict[str, list[_Segment]] = {}
+        if not self.generations.numbers():  # removed meanwhile, and the files of frames with them
+            self.rings = {}
         # Locked, so that a second training in this folder, which is refused, removes no file that this one writes.
         with locked(self.generations.path, LOCK_SECONDS), self.generations.writing(keep) as draft:
             model.save(draft.folder / MODEL)
@@ -92,14 +94,9 @@ class CheckpointWriter:
         :param model: Model
         :param folder: Folder of the checkpoint
         :return: Training state
-        :raises CheckpointError: if it is of another number of environments
+        :raises ArchiveError: if it is of another number of environments
         """
         state = read_state(folder / STATE)
-        if model.n_envs != state["n_envs"]:
-            raise CheckpointError(
-                f"resume got {model.n_envs} environments, but {folder} was written with {state['n_envs']}: give as "
-                "many."
-            )
         buffer = model.replay_buffer = buffer_from_state(model, state.pop("buffer"), str(folder))
         self.rings = buffer.rings
         self.segments = {key: [_Segment(*each) for each in own] for key, own in state.pop("segments").items()}
@@ -165,19 +162,6 @@ class ExactCheckpoint(BaseCallback):
         if self.is_due():
             self._save()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Get the state of this callback, which is none.
-
-        :return: An empty dictionary
-        """
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore nothing.
-
-        :param state: Result of ``state_dict``
-        """
-
     @property
     def _run(self) -> Run:
         return self.model._run  # type: ignore[attr-defined]
@@ -198,7 +182,7 @@ class ExactCheckpoint(BaseCallback):
                 f"{name}.resume({str(self.path)!r}, env), or choose another path, or remove that folder."
             )
         path.mkdir(parents=True, exist_ok=True)
-        self._writer = self._run.writers.setdefault(path, CheckpointWriter(path))
+        self._run.writers.setdefault(path, CheckpointFolder(path))
 
     def _on_training_start(self) -> None:
         if getattr(self.model, "overlap", False):
@@ -233,7 +217,8 @@ class ExactCheckpoint(BaseCallback):
 
     def _write(self) -> None:
         """Write a checkpoint, and warn of what it cannot hold; Python shows a warning of equal text once."""
-        state = self._writer.write(self.model, self._run, self.keep)  # type: ignore[arg-type]
+        writer = self._run.writers[self.path.resolve()]
+        state = writer.write(self.model, self._run, self.keep)
         reason = saved_error(state["environments"])
         if reason is not None:
             warnings.warn(

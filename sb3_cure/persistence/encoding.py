@@ -361,5 +361,5 @@ def read_state(file: str | Path | BinaryIO, copy: bool = True) -> dict[str, Any]
 
 
 def _decoded(metadata: dict[str, str], tensors: Callable[[str], th.Tensor]) -> dict[str, Any]:
-    check_version(int(metadata["format"].removeprefix("sb3_cure ")), "the file")
+    check_version(int(metadata["format"]), "the file")
     return decode(json.loads(metadata["state"]), tensors)

@@ -206,7 +206,7 @@ def _layer_states(layers: list[Any]) -> list[dict[str, Any]]:
 
 def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     name, own, attributes = type(layer).__name__, None, vars(layer)
-    if _has_state_dict(layer):
+    if has_state_dict(layer):
         own, attributes = layer.state_dict(), {"_np_random": attributes.get("_np_random")}
     elif _is_dmc(layer):
         if not is_of_the_suite(layer._env):
@@ -250,13 +250,13 @@ def _load_layer(layer: Any, state: dict[str, Any]) -> None:
         for space, generator in zip(_parts(getattr(layer, key)), generators, strict=True):
             space._np_random = generator
     vars(layer).update(state["attributes"])
-    if _has_state_dict(layer):
+    if has_state_dict(layer):
         layer.load_state_dict(state["own"])
     elif _is_dmc(layer):
         load_integration_state(layer._env, state["own"])
 
 
-def _has_state_dict(layer: Any) -> bool:
+def has_state_dict(layer: Any) -> bool:
     # Of the class: an instance of VecEnvWrapper also shows what it wraps.
     return hasattr(type(layer), "state_dict") and hasattr(type(layer), "load_state_dict")
 

@@ -57,7 +57,8 @@ def locked(folder: Path, seconds: float) -> Iterator[None]:
     :param seconds: How long to wait for another process that holds it; -1: for ever
     :raises filelock.Timeout: (an ``OSError``) if it holds it still
     """
-    lock = filelock.FileLock(folder / ".lock")
+    # Not as a file that a kill would leave behind, where the file system has no locks
+    lock = filelock.FileLock(folder / ".lock", fallback_to_soft=False)
     try:
         lock.acquire(timeout=seconds)
     except filelock.Timeout:

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_cure.persistence.archive import SavesModels
 from sb3_cure.persistence.callback_state import nested_callbacks, note_contents
-from sb3_cure.persistence.checkpoints import MODEL, CheckpointWriter, ExactCheckpoint
+from sb3_cure.persistence.checkpoints import MODEL, CheckpointFolder, ExactCheckpoint
 from sb3_cure.persistence.replay_buffers import SavesReplayBuffers
 from sb3_cure.persistence.resume import Resumption, Run, load_random_state
 
@@ -40,7 +40,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
         while isinstance(env, VecEnvWrapper):
             wrappers.append(env)
             env = env.venv
-        # SB3's cannot be copied, as they keep the members of their class.
+        # `VecEnvWrapper.class_attributes` cannot be copied.
         for wrapper in reversed(wrappers):
             _copy_attributes(wrapper, "class_attributes", memo)
             vars(memo[id(wrapper)])["class_attributes"] = wrapper.class_attributes
@@ -68,10 +68,10 @@ class Persistence(SavesModels, SavesReplayBuffers):
         :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
         :param kwargs: Settings to change; training then no longer equals the one before
         :return: The model
-        :raises CheckpointError: if there is no whole checkpoint, or another number of environments
+        :raises ArchiveError: if there is no whole checkpoint, or another number of environments
         :raises ValueError: if the environments have other layers, or another id
         """
-        writer = CheckpointWriter(path)
+        writer = CheckpointFolder(path)
         folder = writer.generations.newest_whole()
         model = cls.load(folder / MODEL, env, device, custom_objects, force_reset=False, **kwargs)
         state = writer.read(model, folder)

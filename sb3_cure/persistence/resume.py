@@ -38,8 +38,6 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
     """
     assert model.env is not None
     return {
-        "num_timesteps": model.num_timesteps,
-        "n_envs": model.n_envs,
         # Before the random streams, from which a worker may draw that is replaced meanwhile
         "environments": vec_env_state(model.env),
         "callbacks": [callback_state(callback) for callback in run.callbacks],
@@ -61,7 +59,7 @@ def random_state(model: OffPolicyAlgorithm) -> dict[str, Any]:
     :param model: Model
     :return: Values that ``encode`` knows
     """
-    cuda = th.cuda.get_rng_state_all() if model.device.type == "cuda" else []
+    cuda = th.cuda.get_rng_state(model.device) if model.device.type == "cuda" else None
     return {**random_streams(), "cuda": cuda, "action_space": model.action_space.np_random.bit_generator.state}
 
 
@@ -72,8 +70,8 @@ def load_random_state(model: OffPolicyAlgorithm, state: dict[str, Any]) -> None:
     :param state: Result of ``random_state``
     """
     load_random_streams(state)
-    if state["cuda"] and model.device.type == "cuda":
-        th.cuda.set_rng_state_all(state["cuda"])
+    if state["cuda"] is not None and model.device.type == "cuda":
+        th.cuda.set_rng_state(state["cuda"], model.device)
     model.action_space.np_random.bit_generator.state = state["action_space"]
 
 

@@ -4,7 +4,7 @@ from sb3_cure.vec_env.asynchronous import OverlappedVecEnv
 from sb3_cure.vec_env.checks import check_environments
 from sb3_cure.vec_env.finite_check import BadTransitionError, FiniteCheck
 from sb3_cure.vec_env.frame_watch import EnvFaultError, FrameWatch
-from sb3_cure.vec_env.workers import FaultTolerantSubprocVecEnv, restarts_workers
+from sb3_cure.vec_env.workers import FaultTolerantSubprocVecEnv
 
 __all__ = [
     "BadTransitionError",
@@ -14,5 +14,4 @@ __all__ = [
     "FrameWatch",
     "OverlappedVecEnv",
     "check_environments",
-    "restarts_workers",
 ]

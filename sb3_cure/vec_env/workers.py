@@ -356,12 +356,3 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         for worker in self.remotes:
             fault = EnvFaultError(f"Environment {worker.index} has been closed: make the environments again.")
             worker.stop(fault, max(0.0, deadline - time.monotonic()))
-
-
-def restarts_workers(env: VecEnv | None) -> bool:
-    """Check whether workers of environments are replaced, so that a step may be lost.
-
-    :param env: Environments
-    :return: Whether they are a ``FaultTolerantSubprocVecEnv`` with ``on_env_fault="restart"``, in any wrappers
-    """
-    return env is not None and getattr(env.unwrapped, "on_env_fault", "raise") == "restart"

@@ -86,6 +86,27 @@ def test_goals_come_from_one_episode() -> None:
     assert (batch.dones == 0).all()
 
 
+def test_kill_while_an_episode_is_written_leaves_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = RecordEpisodes(VectorBox(episode_length=3), tmp_path)
+
+    def half(file: Any, **arrays: Any) -> None:
+        file.write(b"half a zip")
+        raise KeyboardInterrupt
+
+    for end in ("whole", "killed"):
+        if end == "killed":
+            monkeypatch.setattr(np, "savez_compressed", half)
+        env.reset(seed=0)
+        for _ in range(2):
+            env.step(np.zeros(2))
+        if end == "whole":
+            env.step(np.zeros(2))
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                env.step(np.zeros(2))
+    assert tiny_model("MlpPolicy", VectorBox()).load_transitions(tmp_path) == 3
+
+
 def test_lengths_of_an_episode_must_agree() -> None:
     """A camera that saw twice as often as actions were taken would pair them wrongly."""
     model, n = tiny_model("MlpPolicy", VectorBox()), 5

@@ -226,6 +226,16 @@ def test_links_are_written_through(tmp_path: Path) -> None:
     assert (tmp_path / "latest.zip").is_symlink() and CuReSAC.load(tmp_path / "model").batch_size == 7
 
 
+def test_arrays_of_a_setting_that_is_not_saved_are_not_written() -> None:
+    """Nothing would read them."""
+    model, sizes = tiny_model("MlpPolicy", VectorBox()), []
+    for own in (lambda: 0, {"array": np.zeros(10**6), "function": lambda: 0}):
+        model.own = own
+        model.save(file := io.BytesIO())
+        sizes.append(len(file.getvalue()))
+    assert sizes[1] < sizes[0] + 1000
+
+
 def test_excluded_settings_become_defaults() -> None:
     """Unless they are included, too."""
     loaded = CuReSAC.load(saved(tiny_model("MlpPolicy", VectorBox(), batch_size=7), exclude=["batch_size", "seed"]))

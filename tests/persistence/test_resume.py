@@ -2,10 +2,12 @@
 checkpoint."""
 
 import collections
+import errno
 import hashlib
 import itertools
 import pickle
 import random
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -41,7 +43,8 @@ from benchmarks.fuzz import watching
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.buffers import FrameRing, FrameStackReplayBuffer, stored_places, transitions
 from sb3_cure.persistence import ArchiveError, CheckpointError, ExactCheckpoint, Persistence, ResumableEnv, read_state
-from sb3_cure.persistence.checkpoints import CheckpointWriter
+from sb3_cure.persistence.checkpoints import CheckpointFolder
+from sb3_cure.persistence.files import locked
 from sb3_cure.persistence.generations import Generations
 from sb3_cure.persistence.resume import random_state
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -431,6 +434,51 @@ def test_callbacks_continue_from_the_checkpoint(place: str, tmp_path: Path) -> N
     assert type(best.seen) is collections.Counter and len(best._history) == 60
 
 
+class Holds(BaseCallback):
+    """A network, which is called like a function, what holds itself, and a state that files do not hold."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net, self.tree = th.nn.Linear(1, 1), {}
+        self.tree["self"] = self.tree
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class Tells(Holds):
+    def state_dict(self) -> dict[str, Any]:
+        return {"opened": Path(__file__).open()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        raise AssertionError
+
+
+def test_what_checkpoints_cannot_keep_of_callbacks_is_told(tmp_path: Path) -> None:
+    """And ends no training."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("default")
+        tiny_model("MlpPolicy", vectors()).learn(30, callback=[ExactCheckpoint(10, tmp_path), Holds(), Tells()])
+        CuReSAC.resume(tmp_path, vectors()).learn(40, callback=[Holds(), Tells()])
+    kept = {str(each.message) for each in said if "do not keep" in str(each.message)}
+    assert kept == {f"checkpoints do not keep {name}." for name in ("Holds.net", "Holds.tree", "Tells.state_dict()")}
+
+
+def test_training_survives_that_its_checkpoints_are_removed(tmp_path: Path) -> None:
+    """The next one has all frames anew."""
+
+    class Remove(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 25:
+                shutil.rmtree(tmp_path / "kept")
+            return True
+
+    model = tiny_model("CnnPolicy", pixels()())
+    model.learn(60, callback=[ExactCheckpoint(10, tmp_path / "kept"), Remove()])
+    resumed = CuReSAC.resume(tmp_path / "kept", pixels()(), device="cpu")
+    assert differences(arrays_in(model.replay_buffer), arrays_in(resumed.replay_buffer)) == []
+
+
 def test_callbacks_may_know_each_other(tmp_path: Path) -> None:
     """Each is kept once."""
 
@@ -518,14 +566,14 @@ def test_frames_of_each_image_are_written_once(tmp_path: Path) -> None:
 
 def test_random_streams_are_those_after_deferred_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With ``overlap=True`` an update waits for the next step; a checkpoint makes it, and draws its numbers."""
-    write, states = CheckpointWriter.write, []
+    write, states = CheckpointFolder.write, []
 
-    def written(self: CheckpointWriter, model: Any, run: Any, keep: int) -> dict[str, Any]:
+    def written(self: CheckpointFolder, model: Any, run: Any, keep: int) -> dict[str, Any]:
         state = write(self, model, run, keep)
         states.append((state["random"], random_state(model)))
         return state
 
-    monkeypatch.setattr(CheckpointWriter, "write", written)
+    monkeypatch.setattr(CheckpointFolder, "write", written)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         env = workers(SubprocVecEnv)
@@ -540,9 +588,9 @@ def test_two_trainings_do_not_write_at_once(tmp_path: Path, monkeypatch: pytest.
     first, second = interrupted(tmp_path), CuReSAC.resume(tmp_path, VectorBox(), device="cpu")
     tries = threading.Event()
     refused: list[Exception] = []
-    save, write = CuReSAC.save, CheckpointWriter.write
+    save, write = CuReSAC.save, CheckpointFolder.write
 
-    def note_write(self: CheckpointWriter, model: Any, *args: Any) -> Any:
+    def note_write(self: CheckpointFolder, model: Any, *args: Any) -> Any:
         if model is second:
             tries.set()
         return write(self, model, *args)
@@ -564,7 +612,7 @@ def test_two_trainings_do_not_write_at_once(tmp_path: Path, monkeypatch: pytest.
         save(model, path)
 
     monkeypatch.setattr(CuReSAC, "save", slow_save)
-    monkeypatch.setattr(CheckpointWriter, "write", note_write)
+    monkeypatch.setattr(CheckpointFolder, "write", note_write)
     first.learn(40, callback=ExactCheckpoint(10, tmp_path))
     thread.join(60)
     assert "another training writes checkpoints" in str(refused)
@@ -584,6 +632,17 @@ def test_file_systems_without_locks_take_checkpoints(
     with pytest.warns(UserWarning, match="cannot be locked"):
         train(CASES["vectors"], tmp_path)
     assert CuReSAC.resume(tmp_path, vectors(), device="cpu").num_timesteps == 60
+
+
+def test_locks_do_not_outlive_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system has no locks, a file instead of one would stay after a kill, and end all checkpoints."""
+
+    def no_locks(*args: Any) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with pytest.warns(UserWarning, match="cannot be locked"), locked(tmp_path, 1), locked(tmp_path, 1):
+        pass
 
 
 def test_loaded_replay_buffer_is_checkpointed(tmp_path: Path) -> None:
@@ -659,7 +718,7 @@ def test_unwritable_folder_is_known_before_training(tmp_path: Path) -> None:
 
 def test_checkpoints_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     train(CASES["vectors"], tmp_path)
-    with pytest.raises(CheckpointError, match=r"got 4 environments, but .* was written with 1"):
+    with pytest.raises(ArchiveError, match=r"for 1 environments, but this model has .* for 4"):
         CuReSAC.resume(tmp_path, make_vec_env(VectorBox, 4))
     with pytest.raises(ValueError, match=r"the saved state is of .*Monitor around VectorBox"):
         CuReSAC.resume(tmp_path, DummyVecEnv([lambda: Monitor(NoState(VectorBox()))]))
