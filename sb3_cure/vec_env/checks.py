@@ -1,6 +1,7 @@
 """Put environments into the checks that every training needs."""
 
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.preprocessing import get_obs_shape
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
 
 from sb3_cure.envs.copy_observations import CopyObservations
 from sb3_cure.vec_env.finite_check import FiniteCheck
@@ -14,10 +15,22 @@ def check_environments(venv: VecEnv) -> FiniteCheck:
 
     :param venv: Environments, wrapped as SB3 does
     :return: The environments in a ``FiniteCheck``
+    :raises ValueError: If ``VecNormalize`` is used in a way that makes the replay buffer store something else
     """
     if isinstance(venv, FiniteCheck):
         return venv
+    _check_normalizer(venv)
     base = venv.unwrapped
     if isinstance(base, DummyVecEnv):
         base.envs = [env if isinstance(env, CopyObservations) else CopyObservations(env) for env in base.envs]
     return FiniteCheck(venv)
+
+
+def _check_normalizer(venv: VecEnv) -> None:
+    normalizer = unwrap_vec_wrapper(venv, VecNormalize)
+    if normalizer is not None and get_obs_shape(venv.observation_space) != get_obs_shape(normalizer.observation_space):
+        raise ValueError(
+            "VecNormalize is inside of a wrapper that changes the shape of observations, but the replay buffer stores "
+            "what VecNormalize gets: put it outside, such as VecNormalize(VecTransposeImage(venv)) for images with the "
+            "channels last."
+        )
