@@ -53,7 +53,7 @@ def make(head_class: type[SRLHead], space: spaces.Box, size: int | None = None, 
     """
     name = head_class.choose_augmentation(space) if size is None else "crop"
     augmentation = make_augmentation(name, space, **({} if size is None else {"size": size}))
-    defaults = head_class.configure_encoder(augmentation, **kwargs)
+    defaults = head_class.configure_encoder(augmentation)
     encoder = PixelEncoder(augmentation.view_space, features_dim=7, n_filters=4, n_layers=2, **defaults)  # type: ignore[arg-type]
     head = head_class(encoder, space, **kwargs)
     target = copy.deepcopy(encoder).requires_grad_(False)

@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from pprint import pprint
 from typing import Any
 
 import gymnasium as gym
@@ -32,13 +33,12 @@ from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
     OWN,
-    Loader,
     check_environment,
     find_class,
     import_module,
     named_classes,
     named_wrappers,
-    read_yaml,
+    zoo_entry,
     zoo_file,
 )
 from sb3_cure.data.buffers import FrameStackReplayBuffer
@@ -90,22 +90,16 @@ class ExperimentManager(exp_manager.ExperimentManager):
             trial = self.load_trial(self.storage, self.study_name, self.trial_id)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
-        self.config = str(zoo_file(self.config))
-        env_name, resolvers = self.env_name, yaml.SafeLoader.yaml_implicit_resolvers
-        if self.config.endswith((".yml", ".yaml")):
-            # rl-zoo3 looks for the environment's own id, then for "default".
-            self.env_name = EnvironmentName(self._entry(read_yaml(Path(self.config))))
-        yaml.SafeLoader.yaml_implicit_resolvers = Loader.yaml_implicit_resolvers  # rl-zoo3 reads by it
-        try:
+        if self.algo not in ALGORITHMS and self.args.conf_file is None:  # rl-zoo3's own settings
             return super().read_hyperparameters()
-        finally:
-            self.env_name, yaml.SafeLoader.yaml_implicit_resolvers = env_name, resolvers
-
-    def _entry(self, entries: dict[str, Any]) -> str:
-        task = self.env_name.gym_id
-        names = [*(f"{module}:{task}" for module in self.args.gym_packages), task, task.rpartition("/")[0]]
-        names += ["atari"] if self._is_atari else []
-        return next((name for name in [*names, "default"] if name in entries), task)
+        path = zoo_file(self.config)
+        settings = {**zoo_entry(path, self.env_name.gym_id, self.args.gym_packages), **(self.custom_hyperparams or {})}
+        if self.env_kwargs:
+            settings["env_kwargs"] = self.env_kwargs
+        saved = OrderedDict(sorted(settings.items()))
+        print(f"Settings of {path}:")
+        pprint(saved)
+        return settings, saved
 
     def setup_experiment(self) -> tuple[BaseAlgorithm, dict[str, Any]] | None:
         algorithm = ALGOS[self.algo]

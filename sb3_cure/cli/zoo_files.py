@@ -2,7 +2,7 @@
 
 import importlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,16 +82,17 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
-def zoo_entry(path: Path, task: str) -> dict[str, Any]:
+def zoo_entry(path: Path, task: str, modules: Sequence[str] = ()) -> dict[str, Any]:
     """Read the settings that a zoo file has for a task: of its id, of its namespace, or those of ``default``.
 
     :param path: The file
     :param task: Gymnasium id, or ``my_module:My-v0``
+    :param modules: Further modules that register environments, whose ``module:id`` come first
     :return: The entry
     :raises UsageError: if there is none
     """
     entries, own = read_yaml(path), task.rpartition(":")[2]
-    for key in (task, own, own.rpartition("/")[0], "default"):
+    for key in (*(f"{module}:{own}" for module in modules), task, own, own.rpartition("/")[0], "default"):
         if isinstance(entries.get(key), dict):
             return entries[key]
     raise UsageError(f"{path} has neither a mapping {task!r} nor 'default'.")

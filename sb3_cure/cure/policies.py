@@ -161,21 +161,21 @@ class CuRePolicy(BasePolicy):
         is_vector = cls.default_encoder is DictEncoder and not image_spaces(observation_space)
         return VectorEncoder if is_vector else cls.default_encoder
 
-    def _encoder_kwargs(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> dict[str, Any]:
+    def _encoder_kwargs(self, srl_class: type[SRLHead] | None) -> dict[str, Any]:
         """Head defaults, overridden by the user's kwargs."""
         kwargs = dict(self.features_extractor_kwargs)
         if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
-            return {**srl_class.configure_encoder(self.augmentation, **srl_kwargs), **kwargs}
+            return {**srl_class.configure_encoder(self.augmentation), **kwargs}
         if srl_class is not None and issubclass(self.features_extractor_class, DictEncoder):
             kwargs_by_key = dict(kwargs.pop("by_key", {}))
             for key in image_spaces(self.sensed_space):
-                defaults = srl_class.configure_encoder(self.augmentation.of(key), **srl_kwargs)
+                defaults = srl_class.configure_encoder(self.augmentation.of(key))
                 kwargs_by_key[key] = {**defaults, **kwargs, **kwargs_by_key.get(key, {})}
             return {"by_key": kwargs_by_key}
         return kwargs
 
     def _build_encoder(self, srl_class: type[SRLHead] | None, srl_kwargs: dict[str, Any]) -> None:
-        kwargs = self._encoder_kwargs(srl_class, srl_kwargs)
+        kwargs = self._encoder_kwargs(srl_class)
         self.encoder = make_encoder(self.features_extractor_class, self.augmentation.view_space, **kwargs)
         self.encoder_target = copy.deepcopy(self.encoder).requires_grad_(False)
         self.srl = None

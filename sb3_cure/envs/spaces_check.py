@@ -12,25 +12,20 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
     """Refuse spaces that would be read as something else than meant.
 
     An image is a ``Box`` of dtype uint8 with three dimensions and bounds 0 and 255. All other boxes are vectors.
-    Refused are nested dictionaries, texts, boxes that look like images but would be read as vectors, and policies for
-    another kind of space.
+    Refused are nested dictionaries, texts, boxes that look like images but would be read as vectors, and
+    ``"MultiInputPolicy"`` for one image.
 
     :param space: Space of observations
     :param policy: Name or class of the policy; None: do not check that it fits
     :raises ValueError: If a part of the space is refused; the message names its key
     """
-    if isinstance(space, spaces.Tuple):
-        raise ValueError(
-            "Observations are a Tuple, which replay buffers cannot store: use a Dict with one key per part."
-        )
     name = policy if isinstance(policy, str) or policy is None else policy.__name__
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
             _check_part(part, f"the observation {key!r}", is_image=True)
         return
-    if name is not None and name.endswith("MultiInputPolicy"):
-        fitting = "CnnPolicy" if is_image_space(space) else "MlpPolicy"
-        raise ValueError(f"MultiInputPolicy is for dictionaries, but observations are one {space}: use {fitting!r}.")
+    if name is not None and name.endswith("MultiInputPolicy") and is_image_space(space):
+        raise ValueError(f"MultiInputPolicy is for dictionaries, but observations are one {space}: use 'CnnPolicy'.")
     _check_part(space, "the observation", is_image=name is not None and name.endswith("CnnPolicy"))
 
 
@@ -50,8 +45,8 @@ def check_action_space(space: spaces.Space) -> None:
 def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         raise ValueError(
-            f"{name} is a {type(space).__name__} inside of a Dict, which replay buffers cannot store: flatten it in an "
-            "ObservationWrapper, so that each part has a key of its own, such as 'pixels_top' for ['pixels']['top']."
+            f"{name} is a {type(space).__name__}, which replay buffers cannot store: flatten it in an "
+            "ObservationWrapper to one Dict, whose parts have keys such as 'pixels_top' for ['pixels']['top']."
         )
     if space.shape is None:
         raise ValueError(

@@ -4,10 +4,11 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from torch import nn
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
-from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
-from sb3_cure.networks.layers import RunningStandardize
+from sb3_cure.networks.decoders import PixelDecoder, squared_error
+from sb3_cure.networks.layers import RunningStandardize, small_mlp
 
 
 class Reconstruction(IntrinsicReward):
@@ -25,7 +26,7 @@ class Reconstruction(IntrinsicReward):
 
     def __init__(self, *args: Any, n_filters: int = 16, n_layers: int = 4):
         super().__init__(*args)
-        self.decoder: PixelDecoder | VectorDecoder
+        self.decoder: nn.Module
         self.vectors: RunningStandardize | None = None
         if is_image_space(self.observation_space):
             shape: tuple[int, ...] = self.observation_space.shape  # type: ignore[assignment]
@@ -33,7 +34,7 @@ class Reconstruction(IntrinsicReward):
             self.decoder = PixelDecoder(self.features_dim, shape, n_filters, n_layers)
         else:
             self.vectors = RunningStandardize(self.observation_space)
-            self.decoder = VectorDecoder(self.features_dim, get_flattened_obs_dim(self.observation_space))
+            self.decoder = small_mlp(self.features_dim, 256, get_flattened_obs_dim(self.observation_space))
 
     @classmethod
     def is_per_image(cls, **kwargs: Any) -> bool:

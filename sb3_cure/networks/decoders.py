@@ -46,19 +46,6 @@ class PixelDecoder(MixedPrecision):
         return cells if as_cells else from_cells(cells)[..., : self.shape[1], : self.shape[2]]
 
 
-class VectorDecoder(nn.Sequential):
-    """One hidden layer from latents [B, latent_dim] to a flat observation [B, out_dim], always in fp32.
-
-    :param latent_dim: Size of the latent state
-    :param out_dim: Size of the flat observation
-    :param hidden_dim: Units of the hidden layer
-    """
-
-    def __init__(self, latent_dim: int, out_dim: int, hidden_dim: int = 256):
-        super().__init__(nn.Linear(latent_dim, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, out_dim))
-        init_weights(self)
-
-
 def squared_error(
     decoder: nn.Module, latents: th.Tensor, observations: th.Tensor, target: Callable[[th.Tensor], th.Tensor]
 ) -> th.Tensor:

@@ -3,6 +3,7 @@
 Architecture, initialisation and sizes follow SAC-AE (Yarats et al., 2019), which the CuRe paper uses (appendix A).
 """
 
+import copy
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -59,7 +60,10 @@ class Encoder(BaseFeaturesExtractor):
 
         :return: The projection, with fresh weights
         """
-        return Projection(self.trunk_dim, self.features_dim, getattr(self.projection, "tanh", True))
+        fresh = copy.deepcopy(self.projection).requires_grad_(True)
+        for module in fresh.modules():
+            getattr(module, "reset_parameters", lambda: None)()
+        return fresh
 
     def update_statistics(self, views: Any) -> None:
         """Move the running statistics of vectors; encoders of images have none.
@@ -245,13 +249,6 @@ class DictEncoder(Encoder):
         self.trunk = DictTrunk({key: encoder.trunk for key, encoder in encoders.items()}, vectors)
         self.projection = DictProjection([encoder.projection for encoder in encoders.values()])
 
-    def make_projection(self) -> nn.Module:
-        """Build another projection of the same parts: one linear map of all features would drown the vectors.
-
-        :return: The projection, with fresh weights
-        """
-        return DictProjection([encoder.make_projection() for encoder in self.images.values()])
-
     def update_statistics(self, views: dict[str, th.Tensor]) -> None:
         """Move the running statistics of the vectors, if there are any.
 
@@ -299,13 +296,6 @@ class ExtractorEncoder(Encoder):
         super().__init__(extractor._observation_space, extractor.features_dim, trunk_dim=extractor.features_dim)
         self.trunk = ExtractorTrunk(extractor)
         self.projection = nn.Identity()
-
-    def make_projection(self) -> nn.Module:
-        """Build the projection of an actor, which reads the features as they are, as SB3's do.
-
-        :return: A module without parameters
-        """
-        return nn.Identity()
 
 
 def make_encoder(

@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, preprocess_obs
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
@@ -190,6 +191,17 @@ class ResidualBlock(nn.Module):
         :return: The same shape
         """
         return inputs + self.branch(inputs)
+
+
+def small_mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Sequential:
+    """Make a perceptron with one hidden layer.
+
+    :param n_inputs: Size of the input
+    :param hidden_dim: Units of the hidden layer
+    :param n_outputs: Size of the output
+    :return: The layers
+    """
+    return init_weights(nn.Sequential(*create_mlp(n_inputs, n_outputs, [hidden_dim])))
 
 
 def run_mlp(layers: Iterable[nn.Module], inputs: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:

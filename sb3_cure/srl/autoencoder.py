@@ -8,9 +8,10 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from torch import nn
 
 from sb3_cure.data.samples import Samples
-from sb3_cure.networks.decoders import PixelDecoder, VectorDecoder, squared_error
+from sb3_cure.networks.decoders import PixelDecoder, squared_error
 from sb3_cure.networks.encoders import Encoder
 from sb3_cure.networks.fast_ops import random_bytes_like
+from sb3_cure.networks.layers import small_mlp
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -56,7 +57,7 @@ class RAE(SRLHead):
                 getattr(encoder, "n_layers", 4),
             )
         else:
-            self.decoder = VectorDecoder(encoder.features_dim, get_flattened_obs_dim(encoder.view_space))
+            self.decoder = small_mlp(encoder.features_dim, 256, get_flattened_obs_dim(encoder.view_space))
 
     def target(self, views: th.Tensor, dither: bool) -> th.Tensor:
         """Compute the decoder's target.

@@ -66,11 +66,10 @@ class SRLHead(nn.Module):
         return None
 
     @classmethod
-    def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
+    def configure_encoder(cls, augmentation: Augmentation) -> dict[str, Any]:
         """Return the encoder's default arguments with this head.
 
         :param augmentation: Makes the views that the encoder will see
-        :param srl_kwargs: The head's arguments
         :return: Arguments of ``PixelEncoder`` or ``VectorEncoder``
         """
         return {}

@@ -70,11 +70,10 @@ class CURL(SRLHead):
         return "crop" if min(observation_space.shape[1:]) > LARGEST_SHIFTED else "shift"  # type: ignore[index]
 
     @classmethod
-    def configure_encoder(cls, augmentation: Augmentation, **srl_kwargs: Any) -> dict[str, Any]:
+    def configure_encoder(cls, augmentation: Augmentation) -> dict[str, Any]:
         """Leave tanh out with crops.
 
         :param augmentation: Makes the views that the encoder will see
-        :param srl_kwargs: The head's arguments
         :return: Latents of crops without tanh, as in CURL's code
         :raises ValueError: if there is no augmentation
         """

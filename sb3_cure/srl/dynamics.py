@@ -3,11 +3,10 @@
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
-from torch import nn
 
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.encoders import Encoder
-from sb3_cure.networks.layers import init_weights
+from sb3_cure.networks.layers import small_mlp
 from sb3_cure.srl.base import SRLHead, SRLOutput
 
 
@@ -103,7 +102,7 @@ class Forward(NextLatents):
         self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
     ):
         super().__init__(encoder, observation_space, action_space)
-        self.model = _mlp(self.n_inputs, hidden_dim, encoder.features_dim)
+        self.model = small_mlp(self.n_inputs, hidden_dim, encoder.features_dim)
 
     def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
         """Compute the mean squared error of each prediction.
@@ -132,7 +131,7 @@ class Inverse(SRLHead):
         self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
     ):
         super().__init__(encoder, observation_space)
-        self.model = _mlp(2 * encoder.features_dim, hidden_dim, get_action_dim(action_space))
+        self.model = small_mlp(2 * encoder.features_dim, hidden_dim, get_action_dim(action_space))
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Predict the executed action.
@@ -145,8 +144,3 @@ class Inverse(SRLHead):
         assert next_latents is not None
         error = (self.model(th.cat([latents, next_latents], dim=1)) - batch.actions).square().mean(dim=1)
         return SRLOutput(error.mean(), error.detach())
-
-
-def _mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Module:
-    """Make an MLP with one hidden layer."""
-    return init_weights(nn.Sequential(nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, n_outputs)))

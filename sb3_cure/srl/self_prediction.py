@@ -5,6 +5,7 @@ import copy
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
@@ -39,7 +40,7 @@ class SPR(NextLatents):
     ):
         super().__init__(encoder, observation_space, action_space)
         size = encoder.features_dim
-        self.transition = nn.Sequential(nn.Linear(self.n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, size))
+        self.transition = nn.Sequential(*create_mlp(self.n_inputs, size, [hidden_dim]))
         self.projection = nn.Linear(size, size)
         self.predictor = nn.Linear(size, size)
         init_weights(self)

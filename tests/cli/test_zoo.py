@@ -240,7 +240,7 @@ def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str
         asked.append(zoo.HYPERPARAMS_SAMPLER["cure_sac"](trial, 2, 1, {}))
         return 0.0
 
-    arguments = type("Arguments", (), {"gym_packages": []})()
+    arguments = type("Arguments", (), {"gym_packages": [], "conf_file": None})()
     manager = zoo.ExperimentManager(
         arguments, "cure_sac", TASK, "logs", config=config, optimize_hyperparameters=True, sampler="random",
         no_optim_plots=True, eval_freq=-1,
@@ -270,7 +270,9 @@ def test_trials_that_are_left_are_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """All of them have taken a minute; with ``--max-total-trials`` other processes make some."""
-    manager = zoo.ExperimentManager(type("Arguments", (), {"gym_packages": []})(), "cure_sac", TASK, "logs", **numbers)
+    manager = zoo.ExperimentManager(
+        type("Arguments", (), {"gym_packages": [], "conf_file": None})(), "cure_sac", TASK, "logs", **numbers
+    )
     manager._start, manager._first = time.monotonic() - 60, 0
     monkeypatch.setattr(zoo.exp_manager.ExperimentManager, "objective", lambda manager, trial: 0.0)
     for number in trials:

@@ -91,8 +91,8 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
 @pytest.mark.parametrize(
     ("part", "advice"),
     [
-        (spaces.Dict(top=image(48, 48, 3)), "is a Dict inside of a Dict.* flatten it"),
-        (spaces.Tuple([image(48, 48, 3)]), "is a Tuple inside of a Dict"),
+        (spaces.Dict(top=image(48, 48, 3)), "is a Dict, which .* flatten it"),
+        (spaces.Tuple([image(48, 48, 3)]), "is a Tuple, which"),
         (spaces.Text(16), "is a Text, .*FilterObservation"),
         (image(84, 84), r"return it as \[H, W, 1\]"),
         (image(1, 84, 84, 3), "StackFrames"),
@@ -131,10 +131,9 @@ def test_images_and_vectors_of_any_shape_pass(part: spaces.Space) -> None:
     ("space", "policy", "advice"),
     [
         (image(84, 84, 3), "MultiInputPolicy", "use 'CnnPolicy'"),
-        (spaces.Box(-1, 1, (4,)), "MultiInputPolicy", "use 'MlpPolicy'"),
         (image(84, 84), "CnnPolicy", r"return it as \[H, W, 1\]"),
         (image(4, 84, 84, 3), "CnnPolicy", "StackFrames"),
-        (spaces.Tuple([image(84, 84, 3)]), None, "use a Dict with one key per part"),
+        (spaces.Tuple([image(84, 84, 3)]), None, "is a Tuple, which .* flatten it"),
     ],
 )
 def test_policy_for_another_space_is_refused(space: spaces.Space, policy: str | None, advice: str) -> None:
@@ -198,8 +197,13 @@ def test_images_of_dictionaries_are_resized_by_key() -> None:
     with pytest.raises(ValueError, match="ResizeImages needs images"):
         ResizeImages(VectorBox(), 16)
     nested = Returns(spaces.Dict(pixels=spaces.Dict(top=image(48, 64, 3))), None)
-    with pytest.raises(ValueError, match=r"'pixels' is a Dict inside of a Dict.* flatten it"):
+    with pytest.raises(ValueError, match=r"'pixels' is a Dict, which .* flatten it"):
         ResizeImages(nested, 16)
+
+
+def test_height_and_width_may_be_a_list() -> None:
+    """As YAML and an environment's JSON have it."""
+    assert ResizeImages(camera_and_joints(), [12, 16], keys=["front"]).observation_space["front"].shape == (12, 16, 3)
 
 
 def test_own_images_are_resized_and_stacked() -> None:

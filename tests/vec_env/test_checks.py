@@ -7,9 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from dictionaries_for_tests import SensorBox
-from envs_for_tests import PixelBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
+
+from sb3_cure.vec_env import OverlappedVecEnv
 
 CHANNELS_LAST = partial(PixelBox, channels_last=True, frame_stack=1)
 SENSORS = partial(SensorBox, ("front", "joints"))
@@ -18,6 +20,11 @@ SENSORS = partial(SensorBox, ("front", "joints"))
 @pytest.mark.parametrize(
     ("venv", "sentence"),
     [
+        (
+            lambda: VecFrameStack(VecNormalize(DummyVecEnv([VectorBox])), 2),
+            "inside of a wrapper that changes the shape",
+        ),
+        (lambda: VecNormalize(DummyVecEnv([CHANNELS_LAST]), norm_obs=False), r"VecNormalize\(VecTransposeImage\(venv"),
         (lambda: VecNormalize(DummyVecEnv([PixelBox])), "vector of .* norm_obs=False"),
         (lambda: VecNormalize(DummyVecEnv([SENSORS]), clip_obs=5), "vector of .* norm_obs=False"),
     ],
@@ -65,3 +72,8 @@ def test_last_observation_of_an_episode_is_stored(env: Any) -> None:
     ]
     assert seen[0] == [100 if t % 5 == 0 else t % 5 for t in range(n_steps)]
     assert seen[1] == [t % 5 + 1 for t in range(n_steps)]
+
+
+def test_overlap_in_one_process_is_refused() -> None:
+    with pytest.raises(ValueError, match="overlap=True needs environments in other processes"):
+        OverlappedVecEnv(DummyVecEnv([VectorBox]))
