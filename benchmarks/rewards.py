@@ -40,7 +40,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "srl_error": {},
     "srl_error, per_pixel": dict(intrinsic_kwargs=dict(per_pixel=True)),
     "srl_error of curl": dict(srl="curl"),
-    "srl_error of curl, positive": dict(srl="curl", srl_kwargs=dict(error="positive")),
     "reconstruction": dict(intrinsic="reconstruction"),
     "rnd": dict(intrinsic="rnd"),
     "icm": dict(intrinsic="icm"),

@@ -14,7 +14,7 @@ from sb3_cure.srl import SRL_HEADS
     ("part", "defaults"),
     [
         (SRL_HEADS["rae"], dict(latent_penalty=1e-6, decoder_weight_decay=1e-7)),  # SAC-AE
-        (SRL_HEADS["curl"], dict(bank_size=64, error="infonce")),
+        (SRL_HEADS["curl"], dict(bank_size=64)),
         (SRL_HEADS["spr"], dict(tau=0.05)),
         (SRL_HEADS["vae"], dict(beta=1e-6)),
         (INTRINSIC_REWARDS["srl_error"], dict(per_pixel=False, decay=0.99)),

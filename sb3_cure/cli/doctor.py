@@ -146,7 +146,7 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
         raise UsageError(f"{task} wants other --env-kwargs: {one_sentence(error)}") from error
     except (ValueError, gym.error.Error) as error:
         raise UsageError(f"{task} cannot be trained: {one_sentence(error)}") from error
-    returns = play_randomly(_without_images(env))
+    returns = play_randomly(_below_camera(env))
     env.close()
     if len(returns) < MIN_EPISODES:
         raise UsageError(
@@ -163,7 +163,7 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
     return 0
 
 
-def _without_images(env: gym.Env) -> gym.Env:
+def _below_camera(env: gym.Env) -> gym.Env:
     """Return the environment below the camera of a DMC task, whose images nobody looks at, with its limit of steps."""
     inner: Any = env
     while isinstance(inner, gym.Wrapper):

@@ -32,7 +32,7 @@ from sb3_cure.cli.progress import TimeLeft, time_text
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
-    OWN,
+    CLASS_ARGUMENTS,
     check_environment,
     find_class,
     import_module,
@@ -366,7 +366,7 @@ def _parser(program: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--device", default="auto", help="PyTorch device (default: %(default)s)")
     parser.add_argument("--env-kwargs", nargs="+", action=StoreDict, metavar="NAME:VALUE", help="As for train")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="Modules that register environments")
-    for name in OWN:
+    for name in CLASS_ARGUMENTS:
         parser.add_argument(f"--{name}", metavar="MODULE.CLASS", help="Class of your own, which no saved model holds")
     parser.add_argument(
         "--trusted", action="store_true", help="Also import, call and unpickle what the run's folder names"
@@ -410,7 +410,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
         env_kwargs["render_mode"] = render_mode
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
-    objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in OWN if vars(args)[name]}
+    objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in CLASS_ARGUMENTS if vars(args)[name]}
     objects["replay_buffer_class"] = _NoReplayBuffer
     load: Any = ALGORITHMS[args.algo].load
     with _refusals_in_one_sentence(make_dmc_env):

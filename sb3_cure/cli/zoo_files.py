@@ -15,7 +15,7 @@ from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 #: Algorithms by their name for ``--algo`` and in grids
 ALGORITHMS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
 #: Arguments that may name a class of the user's, as ``my_module.MyClass``, which no saved model holds
-OWN = ("srl", "intrinsic")
+CLASS_ARGUMENTS = ("srl", "intrinsic")
 #: Settings of methods, for ``sb3-cure train --conf-file`` and for grids
 ZOO = Path(__file__).parents[1] / "zoo_configs"
 #: Grids, for ``sb3-cure experiment``
@@ -155,7 +155,7 @@ def named_classes(arguments: Mapping[str, Any]) -> dict[str, Any]:
     :return: The classes by argument
     :raises UsageError: as ``find_class``
     """
-    given = {name: arguments.get(name) for name in (*OWN, "replay_buffer_class")}
+    given = {name: arguments.get(name) for name in (*CLASS_ARGUMENTS, "replay_buffer_class")}
     return {name: find_class(value) for name, value in given.items() if isinstance(value, str) and "." in value}
 
 

@@ -22,7 +22,7 @@ _FREE, _HINGE = 0, 3
 
 # Two coordinates that show what a task is about, for every environment that has both (else the first two), and what
 # they are.
-_TELLING = {
+_MAP_COORDINATES = {
     ("hinge_1", "hinge_1_velocity"): ("pole angle (0: upright)", "pole velocity"),  # cartpole
     ("proximal", "hinge_velocity"): ("finger angle (proximal)", "body's hinge velocity"),  # finger
     ("ball_x", "ball_z"): ("ball x", "ball z"),  # ball_in_cup, and the balls of manipulator
@@ -150,7 +150,7 @@ def telling_coordinates(names: list[str]) -> tuple[str, str]:
     """
     if len(names) < 2:
         raise ValueError(f"the state has the coordinates {names}, but a map needs two: give at least two names.")
-    return next((pair for pair in _TELLING if set(pair) <= set(names)), (names[0], names[1]))
+    return next((pair for pair in _MAP_COORDINATES if set(pair) <= set(names)), (names[0], names[1]))
 
 
 def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
@@ -159,7 +159,7 @@ def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
     :param coordinates: Two coordinates of the state, by name
     :return: What to call them on the axes of a map
     """
-    return _TELLING.get(coordinates) or (coordinates[0].replace("_", " "), coordinates[1].replace("_", " "))
+    return _MAP_COORDINATES.get(coordinates) or (coordinates[0].replace("_", " "), coordinates[1].replace("_", " "))
 
 
 def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ class GLUnavailableError(RuntimeError):
     """OpenGL cannot be loaded or cannot render; the message says what to do."""
 
 
-def _missing(cause: object) -> GLUnavailableError:
+def _gl_error(cause: object) -> GLUnavailableError:
     backend = os.environ.get("MUJOCO_GL", "unset")
     first_line = str(cause).partition("\n")[0].rstrip(".")
     return GLUnavailableError(
@@ -70,9 +70,9 @@ def load_gl() -> None:
         backend = importlib.import_module("dm_control._render").BACKEND
     # PyOpenGL fails in many ways when a library is missing, most often with an AttributeError of None.
     except Exception as error:
-        raise _missing(error) from error
+        raise _gl_error(error) from error
     if backend in (None, "off"):
-        raise _missing("no rendering backend")
+        raise _gl_error("no rendering backend")
     # dm_control prefers GLFW when it is imported without MUJOCO_GL, even here, where that aborts the process.
     if backend == "glfw" and not _glfw_has_a_display():
         raise GLUnavailableError(
@@ -100,4 +100,4 @@ def check_gl() -> str:
         finally:
             physics.free()
     except Exception as error:
-        raise _missing(error) from error
+        raise _gl_error(error) from error

@@ -28,18 +28,12 @@ class CURL(SRLHead):
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images
     :param bank_size: How many stored observations serve as fixed negatives in ``error``
-    :param error: The SRL error: ``"infonce"``, the loss of each anchor, which is high where others of the batch look
-        alike; ``"positive"``, the mean squared difference between the latents of the two views alone
-    :raises ValueError: for another error
     """
 
     error_tells_novelty = False
 
-    def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64, error: str = "infonce"):
+    def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64):
         super().__init__(encoder, observation_space)
-        if error not in ("infonce", "positive"):
-            raise ValueError(f"error is {error!r} in srl_kwargs: choose 'infonce' or 'positive'.")
-        self.positive = error == "positive"
         # CURL starts W uniform in [0, 1).
         self.W = nn.Parameter(th.rand(encoder.features_dim, encoder.features_dim))
         # Negatives of `error`, the first observations of training: negatives from the batch would change with it, and a
@@ -87,7 +81,7 @@ class CURL(SRLHead):
         :param batch: Samples of the replay buffer
         :param latents: Anchors q, [B, features_dim]
         :param next_latents: Unused
-        :return: Loss, and the cross-entropy (or the distance of the two views) of each anchor, [B]
+        :return: Loss, and the cross-entropy of each anchor, [B], which is high where others of the batch look alike
         """
         if th.is_grad_enabled():  # the head learns
             self._fill_bank(batch.observations)
@@ -95,14 +89,11 @@ class CURL(SRLHead):
         labels = th.arange(len(keys), device=keys.device)
         # Row maxima are subtracted inside cross_entropy.
         error = F.cross_entropy(latents @ self.W @ keys.T, labels, reduction="none")
-        loss = error.mean()
-        if self.positive:
-            error = _distance(latents, keys)
-        return SRLOutput(loss, error.detach())
+        return SRLOutput(error.mean(), error.detach())
 
     @th.no_grad()
     def error(self, batch: Samples, latents: th.Tensor) -> th.Tensor:
-        """Compute each anchor's cross-entropy against its own key and the fixed bank, or its distance from its own key.
+        """Compute each anchor's cross-entropy against its own key and the fixed bank.
 
         Views come from a fixed seed, and other samples of the batch do not matter. A head that has not been trained has
         an empty bank: its error is 0.
@@ -114,8 +105,6 @@ class CURL(SRLHead):
         # The same offset for all, drawn as for one image of many channels: neither batch size nor order matters.
         views = self.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
-        if self.positive:
-            return _distance(latents, own)
         negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
         bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
         weighted = latents @ self.W
@@ -160,7 +149,3 @@ class CURL(SRLHead):
         self._n_banked = start + len(observations)
         self.bank[start : self._n_banked] = observations  # type: ignore[index, operator]
         self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
-
-
-def _distance(latents: th.Tensor, keys: th.Tensor) -> th.Tensor:
-    return (latents - keys).square().mean(dim=1)

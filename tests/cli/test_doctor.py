@@ -122,7 +122,7 @@ def test_doctor_gives_the_environment_its_arguments(
 
 def test_doctor_shortens_the_episodes_of_dmc_tasks() -> None:
     """Also below their camera, which it leaves out."""
-    env = doctor._without_images(gym.make("dmc_pixels/cartpole-swingup_sparse-v0", max_episode_steps=5))
+    env = doctor._below_camera(gym.make("dmc_pixels/cartpole-swingup_sparse-v0", max_episode_steps=5))
     assert not env.has_wrapper_attr("image_size")
     env.reset(seed=0)
     assert [env.step(env.action_space.sample())[3] for _ in range(5)] == [False] * 4 + [True]
