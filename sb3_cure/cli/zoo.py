@@ -97,7 +97,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
         if self.env_kwargs:
             settings["env_kwargs"] = self.env_kwargs
         saved = OrderedDict(sorted(settings.items()))
-        print(f"Settings of {path}:")
+        print(f"Loading hyperparameters from: {path}")
         pprint(saved)
         return settings, saved
 
