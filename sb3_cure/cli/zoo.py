@@ -90,9 +90,10 @@ class ExperimentManager(exp_manager.ExperimentManager):
             trial = self.load_trial(self.storage, self.study_name, self.trial_id)
             self.custom_hyperparams = {**trial, **(self.custom_hyperparams or {})}
             self.trial_id = None
-        if self.algo not in ALGORITHMS and self.args.conf_file is None:  # rl-zoo3's own settings
-            return super().read_hyperparameters()
         path = zoo_file(self.config)
+        is_yaml = path.suffix in (".yml", ".yaml")
+        if not is_yaml or (self.algo not in ALGORITHMS and self.args.conf_file is None):  # rl-zoo3's own settings
+            return super().read_hyperparameters()
         settings = {**zoo_entry(path, self.env_name.gym_id, self.args.gym_packages), **(self.custom_hyperparams or {})}
         if self.env_kwargs:
             settings["env_kwargs"] = self.env_kwargs

@@ -380,7 +380,7 @@ class CuRePolicy(BasePolicy):
             "observations": _kinds(self.observation_space),
             "views": _kinds(self.augmentation.view_space),
             "encoder": self.features_extractor_class.__name__,
-            "activation": self.activation_fn.__name__,
+            "activation": getattr(self.activation_fn, "__name__", repr(self.activation_fn)),
             "tanh": tanh if len(tanh) > 1 else next(iter(tanh.values())),
             **{name: None if each is None else each.__name__ for name, each in named.items()},
         }

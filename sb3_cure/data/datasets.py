@@ -53,7 +53,8 @@ def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
     arrays = episode._asdict()
     if isinstance(episode.observations, dict):
         arrays |= {f"observations/{key}": array for key, array in arrays.pop("observations").items()}
-    draft = Path(f"{path}.part")
+    path = Path(path if str(path).endswith(".npz") else f"{path}.npz")  # as NumPy does
+    draft = path.with_suffix(".part")
     with draft.open("wb") as file:
         np.savez_compressed(file, **arrays)
     draft.replace(path)

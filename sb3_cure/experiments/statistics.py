@@ -61,7 +61,7 @@ def stack_curves(experiment: Experiment, column: str = "return_mean") -> Curves:
     found: Curves = {}
     for task, method in experiment.arms:
         curves = [cell.curve(column) for cell in experiment.done(task, method).values()]
-        seeds = [pd.Series(values, steps) for steps, values in curves if len(steps)]
+        seeds = [pd.Series(values, steps).groupby(level=0).last() for steps, values in curves if len(steps)]
         if seeds:
             table = pd.concat(seeds, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
             found.setdefault(task, {})[method] = table.index.to_numpy(), table.to_numpy().T

@@ -6,6 +6,7 @@ An object that a callback keeps under two names becomes two objects.
 import hashlib
 import inspect
 import io
+from functools import partial
 from typing import Any
 
 from gymnasium import Env
@@ -90,7 +91,7 @@ def _attributes(callback: BaseCallback) -> dict[str, Any]:
     return {
         name: value
         for name, value in attributes.items()
-        if not (isinstance(value, (*kinds, type)) or inspect.isroutine(value) or _callbacks_in(value))
+        if not (isinstance(value, (*kinds, type, partial)) or inspect.isroutine(value) or _callbacks_in(value))
     }
 
 

@@ -183,6 +183,7 @@ class ExactCheckpoint(BaseCallback):
             )
         path.mkdir(parents=True, exist_ok=True)
         self._run.writers.setdefault(path, CheckpointFolder(path))
+        self._folder = path  # whatever the working directory is later
 
     def _on_training_start(self) -> None:
         if getattr(self.model, "overlap", False):
@@ -217,7 +218,7 @@ class ExactCheckpoint(BaseCallback):
 
     def _write(self) -> None:
         """Write a checkpoint, and warn of what it cannot hold; Python shows a warning of equal text once."""
-        writer = self._run.writers[self.path.resolve()]
+        writer = self._run.writers[self._folder]
         state = writer.write(self.model, self._run, self.keep)
         reason = saved_error(state["environments"])
         if reason is not None:

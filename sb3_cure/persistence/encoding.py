@@ -39,7 +39,7 @@ from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
 #: Of the format of what is written
-VERSION = 4
+VERSION = 5
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
     **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64"},

@@ -107,7 +107,8 @@ class Generations:
         :raises OSError: if it could not be written; the generations are then as before
         :raises CheckpointError: if another training has written here since
         """
-        if max(self.numbers(), default=-1) > self._newest:
+        numbers = self.numbers()
+        if numbers and numbers[-1] != self._newest:  # none: they have been removed
             raise CheckpointError(
                 f"another training writes checkpoints to {self.path}: end it, or choose another path."
             )

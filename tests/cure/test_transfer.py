@@ -1,5 +1,6 @@
 """Encoder, head and curious agent of a sibling task's model."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +196,14 @@ def test_equal_shapes_of_other_meaning_are_refused(name: str, tmp_path: Path) ->
     make, there, here = MEANINGS[name]
     make(**there).save(tmp_path / "model")
     check_refused(make(**here), tmp_path / "model", f"{name}.*with equal shapes")
+
+
+def test_activation_without_a_name_is_told_from_others(tmp_path: Path) -> None:
+    make = partial(untrained, policy="MlpPolicy")
+    make(policy_kwargs=dict(activation_fn=partial(th.nn.LeakyReLU, 0.1))).save(tmp_path / "model")
+    make(policy_kwargs=dict(activation_fn=partial(th.nn.LeakyReLU, 0.1))).transfer_from(tmp_path / "model")
+    other = make(policy_kwargs=dict(activation_fn=partial(th.nn.LeakyReLU, 0.2)))
+    check_refused(other, tmp_path / "model", "activation.*with equal shapes")
 
 
 def test_pickles_are_refused(tmp_path: Path) -> None:

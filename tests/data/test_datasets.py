@@ -107,6 +107,20 @@ def test_kill_while_an_episode_is_written_leaves_the_others(tmp_path: Path, monk
     assert tiny_model("MlpPolicy", VectorBox()).load_transitions(tmp_path) == 3
 
 
+def test_file_of_an_episode_has_its_suffix(tmp_path: Path) -> None:
+    """As NumPy gives it; a folder is read by it."""
+    arrays = (
+        np.zeros((3, 2), np.float32),
+        np.zeros((2, 2), np.float32),
+        np.zeros(2),
+        np.zeros(2, bool),
+        np.ones(2, bool),
+    )
+    for name in ("one", "two.npz"):
+        save_episode(tmp_path / name, RecordedEpisode(*arrays))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["one.npz", "two.npz"]
+
+
 def test_lengths_of_an_episode_must_agree() -> None:
     """A camera that saw twice as often as actions were taken would pair them wrongly."""
     model, n = tiny_model("MlpPolicy", VectorBox()), 5

@@ -246,7 +246,7 @@ def test_excluded_settings_become_defaults() -> None:
 
 @pytest.mark.parametrize("version", [3, 99])
 def test_files_of_other_versions_are_refused(version: int) -> None:
-    sentence = f"has format {version} of another version of sb3_cure, and this one reads format 4"
+    sentence = f"has format {version} of another version of sb3_cure, and this one reads format 5"
     with pytest.raises(ArchiveError, match=sentence):
         CuReSAC.load(io.BytesIO(changed_data(lambda node: node.update(format=version))()))
     header, body = parts_of(examples()["buffer"])

@@ -479,6 +479,23 @@ def test_training_survives_that_its_checkpoints_are_removed(tmp_path: Path) -> N
     assert differences(arrays_in(model.replay_buffer), arrays_in(resumed.replay_buffer)) == []
 
 
+def test_folder_of_a_new_training_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Begun after the checkpoints of a running one were removed, by a name that the working directory decides."""
+    monkeypatch.chdir(tmp_path)
+
+    class Restart(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 25:
+                shutil.rmtree(tmp_path / "kept")
+                tiny_model("MlpPolicy", vectors()).learn(10, callback=ExactCheckpoint(10, tmp_path / "kept"))
+                monkeypatch.chdir(tmp_path.parent)
+            return True
+
+    with pytest.raises(CheckpointError, match="another training writes checkpoints"):
+        tiny_model("MlpPolicy", vectors()).learn(60, callback=[ExactCheckpoint(10, "kept"), Restart()])
+    assert CuReSAC.resume(tmp_path / "kept", vectors(), device="cpu").num_timesteps == 10
+
+
 def test_callbacks_may_know_each_other(tmp_path: Path) -> None:
     """Each is kept once."""
 
