@@ -215,7 +215,7 @@ class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs)
     def __init__(self, env: gym.Env, image_size: int | tuple[int, int] = 84, keys: Sequence[str] | None = None) -> None:
         RecordConstructorArgs.__init__(self, image_size=image_size, keys=keys)
         super().__init__(env)
-        sizes = (image_size, image_size) if isinstance(image_size, int) else image_size  # a list, from YAML
+        sizes = image_size if isinstance(image_size, tuple | list) else (image_size, image_size)  # a list, from YAML
         self.image_size = image_size
         self._height, self._width = (at_least_one("image_size", size) for size in sizes)
         space = env.observation_space

@@ -161,13 +161,14 @@ def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[P
         means = [values.mean(axis=0) for arms in curves.values() for _, values in arms.values()]
         # A logarithmic axis has no place for zeros, which contrastive errors begin with
         visible = [(mean > 0).sum() if is_error else len(mean) for mean in means]
-        if max(visible, default=0) >= LEAST_POINTS:
+        is_drawn = max(visible, default=0) >= LEAST_POINTS
+        if is_drawn:
             caption = render_text(name, list(curves))
             yield _figure(name, caption, plots.learning_curves, curves, colors, label, is_error)
-        elif curves and column != "cells":
-            few[measure] = curves
         if curves and column == "cells":  # which have a table in any case
             yield tables.measured_table("Cells of the true state", {measure: curves}, render_text("cells_counted"))
+        elif curves and not is_drawn:
+            few[measure] = curves
     if few:
         yield tables.measured_table("Evaluations", few, render_text("evaluations"))
 

@@ -61,6 +61,7 @@ def stack_curves(experiment: Experiment, column: str = "return_mean") -> Curves:
     found: Curves = {}
     for task, method in experiment.arms:
         curves = [cell.curve(column) for cell in experiment.done(task, method).values()]
+        # Of steps that were counted twice the last one
         seeds = [pd.Series(values, steps).groupby(level=0).last() for steps, values in curves if len(steps)]
         if seeds:
             table = pd.concat(seeds, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()

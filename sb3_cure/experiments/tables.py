@@ -235,14 +235,14 @@ def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     :return: The table; without rows for a return that no arm reaches on a task, or above that which ends a cell
     """
     rows, end = [], experiment.grid.get("stop_at_return") or math.inf
+    lasts = {arm: statistics.summarise_arm(experiment, *arm)["last"] for arm in experiment.arms}
     for task, limit in itertools.product(experiment.tasks, [each for each in thresholds if each <= end]):
         arms = {arm: statistics.steps_to_return(experiment, task, arm, limit) for arm in experiment.methods}
         if not any(np.isfinite(steps).any() for steps in arms.values()):
             continue
         for method, steps in arms.items():
             if n := len(steps):
-                solved = statistics.summarise_arm(experiment, task, method)["last"] >= limit
-                counts = [f"{int(found.sum())} of {n}" for found in (np.isfinite(steps), solved)]
+                counts = [f"{int(found.sum())} of {n}" for found in (np.isfinite(steps), lasts[task, method] >= limit)]
                 median, shown = float(np.median(steps)), f"{limit:,.15g}".replace("-", "\N{MINUS SIGN}")
                 until = number_text(median) if np.isfinite(median) else f"> {number_text(experiment.budget)}"
                 # Unlike a median it uses all seeds, and unlike a mean of those that got there it favours no arm

@@ -34,7 +34,7 @@ class Reconstruction(IntrinsicReward):
             self.decoder = PixelDecoder(self.features_dim, shape, n_filters, n_layers)
         else:
             self.vectors = RunningStandardize(self.observation_space)
-            self.decoder = small_mlp(self.features_dim, 256, get_flattened_obs_dim(self.observation_space))
+            self.decoder = small_mlp(self.features_dim, get_flattened_obs_dim(self.observation_space))
 
     @classmethod
     def is_per_image(cls, **kwargs: Any) -> bool:

@@ -62,7 +62,8 @@ class Encoder(BaseFeaturesExtractor):
         """
         fresh = copy.deepcopy(self.projection).requires_grad_(True)
         for module in fresh.modules():
-            getattr(module, "reset_parameters", lambda: None)()
+            if hasattr(module, "reset_parameters"):
+                module.reset_parameters()  # type: ignore[operator]
         return fresh
 
     def update_statistics(self, views: Any) -> None:
@@ -198,6 +199,8 @@ class DictTrunk(nn.Module):
 
 class DictProjection(nn.Module):
     """Joined latents of what ``DictTrunk`` returns: a projection for each image; vectors are joined as they are.
+
+    One linear map of all features would drown the vectors.
 
     :param projections: Of the images, in their order
     """

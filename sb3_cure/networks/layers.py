@@ -193,12 +193,12 @@ class ResidualBlock(nn.Module):
         return inputs + self.branch(inputs)
 
 
-def small_mlp(n_inputs: int, hidden_dim: int, n_outputs: int) -> nn.Sequential:
+def small_mlp(n_inputs: int, n_outputs: int, hidden_dim: int = 256) -> nn.Sequential:
     """Make a perceptron with one hidden layer.
 
     :param n_inputs: Size of the input
-    :param hidden_dim: Units of the hidden layer
     :param n_outputs: Size of the output
+    :param hidden_dim: Units of the hidden layer
     :return: The layers
     """
     return init_weights(nn.Sequential(*create_mlp(n_inputs, n_outputs, [hidden_dim])))

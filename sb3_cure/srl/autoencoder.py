@@ -57,7 +57,7 @@ class RAE(SRLHead):
                 getattr(encoder, "n_layers", 4),
             )
         else:
-            self.decoder = small_mlp(encoder.features_dim, 256, get_flattened_obs_dim(encoder.view_space))
+            self.decoder = small_mlp(encoder.features_dim, get_flattened_obs_dim(encoder.view_space))
 
     def target(self, views: th.Tensor, dither: bool) -> th.Tensor:
         """Compute the decoder's target.

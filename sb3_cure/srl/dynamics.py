@@ -102,7 +102,7 @@ class Forward(NextLatents):
         self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
     ):
         super().__init__(encoder, observation_space, action_space)
-        self.model = small_mlp(self.n_inputs, hidden_dim, encoder.features_dim)
+        self.model = small_mlp(self.n_inputs, encoder.features_dim, hidden_dim)
 
     def distance(self, inputs: th.Tensor, target: th.Tensor) -> th.Tensor:
         """Compute the mean squared error of each prediction.
@@ -131,7 +131,7 @@ class Inverse(SRLHead):
         self, encoder: Encoder, observation_space: spaces.Space, action_space: spaces.Box, hidden_dim: int = 256
     ):
         super().__init__(encoder, observation_space)
-        self.model = small_mlp(2 * encoder.features_dim, hidden_dim, get_action_dim(action_space))
+        self.model = small_mlp(2 * encoder.features_dim, get_action_dim(action_space), hidden_dim)
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Predict the executed action.

@@ -202,8 +202,10 @@ def test_images_of_dictionaries_are_resized_by_key() -> None:
 
 
 def test_height_and_width_may_be_a_list() -> None:
-    """As YAML and an environment's JSON have it."""
-    assert ResizeImages(camera_and_joints(), [12, 16], keys=["front"]).observation_space["front"].shape == (12, 16, 3)
+    """As YAML and an environment's JSON have it; one number may be NumPy's."""
+    for size, shape in (([12, 16], (12, 16, 3)), (np.int64(12), (12, 12, 3))):
+        env = ResizeImages(camera_and_joints(), size, keys=["front"])  # type: ignore[arg-type]
+        assert env.observation_space["front"].shape == shape
 
 
 def test_own_images_are_resized_and_stacked() -> None:
