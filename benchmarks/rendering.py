@@ -1,6 +1,7 @@
 """Milliseconds per frame of the software (or GPU) renderer, by setting."""
 
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from typing import Any
 
 import gymnasium as gym
@@ -28,18 +29,20 @@ def measure(repeats: int = 7) -> dict[str, Any]:
     :return: Time of one environment step of action repeat 1, which renders one frame, by setting
     """
     make_env().close()
-    variants = {
-        f"{domain}-{task}, {size} px, {renderer}": _step_call(
-            make_dmc_env(domain, task, image_size=size, renderer=renderer, action_repeat=1)
+    envs = {
+        f"{domain}-{task}, {size} px, {renderer}": make_dmc_env(
+            domain, task, image_size=size, renderer=renderer, action_repeat=1
         )
         for domain, task in (("cartpole", "swingup"), ("cheetah", "run"))
         for size in (36, 84, 100)
         for renderer in ("dmc", "fast")
     }
-    variants |= {
-        f"{id} of Gymnasium, {size} px, {renderer}": _step_call(make_pixel_env(id, image_size=size, renderer=renderer))
+    envs |= {
+        f"{id} of Gymnasium, {size} px, {renderer}": make_pixel_env(id, image_size=size, renderer=renderer)
         for id in ("HalfCheetah-v5", "Ant-v5")
         for size in (48, 84)
         for renderer in ("env", "fast")
     }
-    return {name: summary(values) for name, values in interleaved(variants, repeats, calls=20).items()}
+    with ExitStack() as stack:  # at the exit of the process MuJoCo would end EGL before dm_control frees its contexts
+        variants = {name: _step_call(stack.enter_context(closing(env))) for name, env in envs.items()}
+        return {name: summary(values) for name, values in interleaved(variants, repeats, calls=20).items()}

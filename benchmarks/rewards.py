@@ -39,7 +39,7 @@ SIZE, PROBES, BATCH_SIZE = 36, 128, 64
 ARMS: dict[str, dict[str, Any]] = {
     "srl_error": {},
     "srl_error, per_pixel": dict(intrinsic_kwargs=dict(per_pixel=True)),
-    "srl_error of curl": dict(srl="curl"),
+    "srl_error of curl": dict(srl="curl", intrinsic="srl_error"),
     "reconstruction": dict(intrinsic="reconstruction"),
     "rnd": dict(intrinsic="rnd"),
     "icm": dict(intrinsic="icm"),

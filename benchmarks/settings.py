@@ -84,12 +84,13 @@ def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
     th.set_num_threads(setting.threads)
     own: dict[str, Any] = dict(warmup_updates=0, policy_kwargs=setting.policy_kwargs)
     env = setting.env_kwargs
+    curl: dict[str, Any] = dict(srl="curl", augmentation="shift")
     arms: dict[str, dict[str, Any]] = {
         "CuRe-RAE": {},
         "CuRe-RAE, fp32": dict(precision="fp32"),
         "CuRe-RAE, no curiosity": dict(curiosity=None),
-        "CuRe-CURL": dict(srl="curl", augmentation="shift"),
-        "CuRe-CURL, reconstruction": dict(srl="curl", augmentation="shift", intrinsic="reconstruction"),
+        "CuRe-CURL": dict(intrinsic="srl_error", **curl),  # the paper's
+        "CuRe-CURL, reconstruction": dict(intrinsic="reconstruction", **curl),
     }
     models = {name: make_model(env_kwargs=env, **own, **kwargs) for name, kwargs in arms.items()}
     models["SB3 SAC"] = make_model(SAC, env_kwargs=env, policy_kwargs=dict(net_arch=[setting.hidden] * 2))

@@ -12,6 +12,8 @@ from stable_baselines3 import SAC
 from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
 from benchmarks.sac_ae import PlainSacAe
 
+#: Of the paper, which rewards the curious agent for the head's own error
+METHODS: dict[str, dict[str, Any]] = {head: dict(srl=head, intrinsic="srl_error") for head in ("rae", "curl")}
 YARDSTICK, SB3_SAC = "plain SAC-AE, fp32", "SB3 SAC (NatureCNN, 1024)"
 
 
@@ -39,13 +41,13 @@ def measure(repeats: int = 7, precisions: tuple[str, ...] = PRECISIONS) -> dict[
     default = "joint"
     arms: list[tuple[str, str, str, str | None]] = [
         (head, mode, precision, "separate")
-        for head in ("rae", "curl")
+        for head in METHODS
         for mode in ("joint", "sequential")
         for precision in precisions
     ]
     arms += [("rae", default, precision, None) for precision in precisions]
     for head, mode, precision, curiosity in arms:
-        model = make_model(srl=head, update=mode, precision=precision, curiosity=curiosity, warmup_updates=0)
+        model = make_model(**METHODS[head], update=mode, precision=precision, curiosity=curiosity, warmup_updates=0)
         variants[_name(head, mode, precision, curiosity)] = _train_call(model)
     times = interleaved(variants, repeats)
     ratios = {}
@@ -139,4 +141,4 @@ def breakdowns() -> dict[str, Any]:
 
     :return: Result of ``breakdown`` by head, in the default mode
     """
-    return {head: breakdown(srl=head) for head in ("rae", "curl")}
+    return {head: breakdown(**method) for head, method in METHODS.items()}
