@@ -1,13 +1,14 @@
 """Algorithms, heads, rewards and sensors combined: each cell trains, is saved and continues, or is refused.
 
 ``make test`` trains cells in which every two values of two factors meet that can, and sees one refused for each reason;
-``make test-all`` runs all of them.
+``make test-all`` runs all of them. The same cells make an update on a device without memory, which any machine has.
 """
 
 import copy
 import itertools
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +66,13 @@ def pairwise() -> list[tuple[Any, ...]]:
 
 
 ONE_OF_EACH_REFUSAL = list({refusal(*cell[1:]): cell for cell in REFUSED}.values())
-CELLS = PRODUCT if os.environ.get("SB3_CURE_TEST_ALL") else [*pairwise(), *ONE_OF_EACH_REFUSAL]
+TRAINED = LEGAL if os.environ.get("SB3_CURE_TEST_ALL") else pairwise()
+CELLS = PRODUCT if os.environ.get("SB3_CURE_TEST_ALL") else [*TRAINED, *ONE_OF_EACH_REFUSAL]
 
 
-def make(algorithm: str, head: str | None, reward: str, sensors: str) -> CuReSAC:
+def make(algorithm: str, head: str | None, reward: str, sensors: str, **settings: Any) -> CuReSAC:
     intrinsic, arguments = REWARDS[reward]
-    settings: dict[str, Any] = dict(
+    settings |= dict(
         srl=head, intrinsic=intrinsic, intrinsic_kwargs=arguments, algorithm=ALGORITHMS[algorithm], curiosity_prob=0.5
     )
     if algorithm == "tqc":
@@ -117,3 +119,28 @@ def test_cell_trains_and_continues_or_is_refused(
     loaded.replay_buffer = copy.deepcopy(model.replay_buffer)
     loaded.set_logger(model.logger)
     assert differences(update(model), update(loaded)) == []
+
+
+@pytest.fixture
+def meta_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[th.device]:
+    """Torch's device of shapes without values, on which models can be built and optimised."""
+    adam = th.optim.Adam.__init__  # its fused kernel has no such device
+    monkeypatch.setattr(th.optim.Adam, "__init__", lambda *args, fused=None, **kwargs: adam(*args, **kwargs))
+    th.__future__.set_swap_module_params_on_conversion(True)  # so that optimisers follow, as from CPU to GPU
+    yield th.device("meta")
+    th.__future__.set_swap_module_params_on_conversion(False)
+
+
+@pytest.mark.parametrize(("cell", "mode"), list(zip(TRAINED, itertools.cycle(["joint", "sequential"]), strict=False)))
+def test_update_stays_on_its_device(cell: tuple[Any, ...], mode: str, meta_device: th.device) -> None:
+    """It reads no value, for which a GPU would have to be waited for, and mixes no memory of the CPU with its own."""
+    collector = make(*cell, gradient_steps=0).learn(12)
+    model = make(*cell, device=meta_device, update=mode)
+    model.replay_buffer = collector.replay_buffer
+    model.replay_buffer.device = meta_device
+    for part in model.policy.modules():  # what rewards and banks read once, when they begin
+        vars(part).update({name: 0 for name in ("_n_banked", "_is_measured") if hasattr(part, name)})
+    for _ in range(2):
+        learns_srl, learns_rl, _ = model._plan()
+        metrics = model._update(model._sample_batch(8, learns_rl), learns_srl, learns_rl)
+        assert {value.device for value in metrics.values()} == {meta_device}
