@@ -105,7 +105,7 @@ dist: .venv/.installed  ## build and check the wheel and the source archive, int
 	$(RUN) build --no-isolation
 	$(RUN) twine check --strict dist/*
 
-bench: gl  ## measure speed and memory and write results/benchmarks/ (half an hour; leave the machine alone)
+bench: gl  ## measure speed and memory and write results/benchmarks/ (an hour and more; leave the machine alone)
 	$(RUN) benchmarks
 
 mutation: gl  ## mutation testing of the method, into results/robustness/ (hours; make mutation MUTATION_ARGS="--jobs 8")

@@ -10,16 +10,16 @@ PLAIN = "no head"
 
 
 def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
-    """A part of ``make bench``, in the first of the small settings there, without curiosity.
+    """A part of ``make bench``, on two threads, in the smallest setting there, without curiosity.
 
     :param repeats: Rounds that count
     :return: By head: milliseconds of an update, and how many more these are than without a head
     """
-    small = SETTINGS[0]
+    small = SETTINGS[1]
     common: dict[str, Any] = dict(
         env_kwargs=small.env_kwargs, policy_kwargs=small.policy_kwargs, warmup_updates=0, curiosity=None
     )
     arms: dict[str, dict[str, Any]] = {PLAIN: {}, "no head, shift": dict(augmentation="shift")}
     arms |= {head: dict(srl=head) for head in SRL_HEADS}
     models = {name: make_model(**common, **{"srl": None, **arm}) for name, arm in arms.items()}
-    return added_costs(models, lambda name: PLAIN, repeats)
+    return added_costs(models, small.threads, lambda name: PLAIN, repeats)

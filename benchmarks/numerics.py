@@ -13,6 +13,7 @@ from scipy import stats
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from benchmarks.harness import make_model
+from benchmarks.update import METHODS
 
 COLUMNS = {"train/q_target": "mean Q", "train/srl_loss": "SRL loss"}
 #: Small, so that there is time for many seeds: how far runs part says more than one run of the paper's size
@@ -64,8 +65,8 @@ def measure(updates: int = 2000, tail: int = 200, seeds: tuple[int, ...] = tuple
     """
     th.set_num_threads(1)  # nothing is timed here, and the networks are small
     results: dict[str, Any] = {}
-    for head in ("rae", "curl"):
-        arguments: dict[str, Any] = dict(srl=head, env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
+    for head in METHODS:
+        arguments: dict[str, Any] = METHODS[head] | dict(env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
         state = copy.deepcopy(make_model(**arguments).get_parameters())
         found = {
             arm: np.array([_train(arm, seed, state, updates, tail, **arguments) for seed in seeds]) for arm in ARMS

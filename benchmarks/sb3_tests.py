@@ -29,6 +29,7 @@ from sb3_cure.data.observations import image_spaces
 DEFAULTS: dict[str, Any] = dict(
     learning_rate=3e-4, buffer_size=1_000_000, learning_starts=100, batch_size=256, tau=0.005, gradient_steps=1,
     ent_coef="auto", srl=None, curiosity=None, actor_update_interval=1, target_update_interval=1, ent_coef_lr_factor=1,
+    encoder_tau=0.005,
 )  # fmt: skip
 
 

@@ -120,14 +120,18 @@ def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
     }
 
 
-def added_costs(models: Mapping[str, Any], beside: Callable[[str], str], repeats: int) -> dict[str, dict[str, float]]:
+def added_costs(
+    models: Mapping[str, Any], threads: int, beside: Callable[[str], str], repeats: int
+) -> dict[str, dict[str, float]]:
     """Time that variants add to an update.
 
     :param models: Models by name
+    :param threads: Threads, also of what follows in this process
     :param beside: Name of the model that another one's update is compared with
     :param repeats: Rounds that count
     :return: By name: milliseconds of an update, and how many more these are
     """
+    th.set_num_threads(threads)
     times = interleaved({name: _block(model) for name, model in models.items()}, repeats, 1)
     median = {name: 1e3 * statistics.median(values) / BLOCK for name, values in times.items()}
     return {

@@ -5,7 +5,7 @@
     python -m benchmarks.table
 
 Reads the cells of ``zoo_configs/experiments/fast/benchmark.yml`` in ``results/fast_benchmark/``, and where one of them
-is missing that of ``time_to_return.py`` in ``results/by_the_clock/``, if it has an evaluation at the same step. The
+is missing that of ``time_to_return.py`` in ``results/by_the_clock_amx/``, if it has an evaluation at the same step. The
 random policy is played once and kept in ``results/fast_benchmark/random.csv``, with machine and versions beside it.
 """
 
@@ -37,7 +37,7 @@ ARMS = {
     "curl": "contrastive head, random shifts",
     "drq": "random shifts, no head, returns of three steps",
     "best": "the recipe of `zoo_configs/fast/best.yml`",
-    "best_cure": "the recipe with curiosity (`curiosity: separate`)",
+    "best_cure": "the recipe with curiosity (`curiosity: separate`, rewarded by RND)",
 }
 #: Arms that were chosen by their returns on a task; the profile that all share was chosen on the first one
 TUNED = {
@@ -60,7 +60,7 @@ def read_cell(results: Path, cell: Cell) -> pd.DataFrame | None:
     :param cell: Cell of the grid
     :return: Rows up to the grid's budget; None if it has not come so far
     """
-    clock = results / "by_the_clock" / short_name(cell.task) / cell.method / f"seed{cell.seed}.csv"
+    clock = results / "by_the_clock_amx" / short_name(cell.task) / cell.method / f"seed{cell.seed}.csv"
     for path in (results / cell.folder / "eval.csv", clock):
         if path.exists():
             rows = pd.read_csv(path)
@@ -191,7 +191,8 @@ with deterministic actions. The highest return is 1000. {minutes}
 
 Lines are means over seeds, bands one standard deviation; the numbers of seeds are those that have run. These pixels are
 not the papers', so that returns compare with each other and not with published ones. The cells are those of
-`zoo_configs/experiments/fast/benchmark.yml`, their raw data is in `results/fast_benchmark/`.
+`zoo_configs/experiments/fast/benchmark.yml`. Their raw data is in `results/fast_benchmark/`, of `best` on
+cartpole-swingup in `results/by_the_clock_amx/`.
 """
 
 

@@ -21,10 +21,6 @@ Count = Annotated[int, Field(ge=1)]
 # A schedule of the remaining progress
 Schedule = Callable[[float], float]
 
-#: Reward of ``intrinsic="auto"`` where the head's error does not tell novelty: of those that explored as far as the
-#: error of an autoencoder (results/curiosity.md) the cheapest
-AUTO_WITHOUT_NOVELTY = "rnd"
-
 
 class CuReArguments(BaseModel):
     """Types, ranges and choices; defaults are the constructor's."""
@@ -88,10 +84,7 @@ def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
     :param model: A CuRe model, its arguments set
     :return: Class of the reward
     """
-    if model.intrinsic != "auto":
-        return get_intrinsic_class(model.intrinsic)
-    tells = model.srl is not None and get_srl_class(model.srl).error_tells_novelty
-    return get_intrinsic_class("srl_error" if tells else AUTO_WITHOUT_NOVELTY)
+    return get_intrinsic_class(model.intrinsic, None if model.srl is None else get_srl_class(model.srl))
 
 
 def _depends_on_observation_alone(model: Any) -> bool:

@@ -60,7 +60,7 @@ class CuReBase(OffPolicyAlgorithm):
     :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
         novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
-        ``"particle"``, ``"shuffled"`` (another one without its information, as a control), or a subclass of
+        ``"particle"``, ``"shuffled"`` (that of auto without its information, as a control), or a subclass of
         ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
@@ -69,7 +69,8 @@ class CuReBase(OffPolicyAlgorithm):
     :param curiosity_bout: L: who acts is redrawn with probability 1/L per step, and at resets. 1: the paper's coin;
         ``"episode"``: at resets only
     :param curiosity_beta: beta, factor of the intrinsic reward
-    :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"``
+    :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"`` where
+        the reward is the SRL error of one observation
     :param curiosity_ent_coef: Temperature of the curious agent, as ``ent_coef``; None: like ``ent_coef``
     :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it does not: a
         reward of mean zero would otherwise make dying attractive wherever the error is low

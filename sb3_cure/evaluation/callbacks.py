@@ -1,7 +1,7 @@
 """Callbacks for ``learn``: evaluation, videos, pictures and warnings.
 
-All work with any SB3 algorithm (``DiagnosticsCallback``, ``ReconstructionCallback``: any off-policy one); without SRL
-head there are no SRL errors.
+All work with any SB3 algorithm (``DiagnosticsCallback``, ``ReconstructionCallback``: any off-policy one); SRL errors
+are those of the head or of a reward that draws, and without either there are none.
 """
 
 import contextlib
@@ -223,7 +223,7 @@ class EvalBothCallback(RolloutCallback):
 class PolicyVideoCallback(RolloutCallback):
     """Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
 
-    Below the camera's picture stand the return so far and, if the model has an SRL head, the SRL error of the
+    Below the camera's picture stand the return so far and, if the model measures one, the SRL error of the
     observation as a number and as a curve.
 
     :param eval_env: One (not vectorised) environment made with ``render_mode="rgb_array"``, not the training one
@@ -377,7 +377,7 @@ class CuriosityMapCallback(RolloutCallback):
     """Map where each policy goes and its SRL error there: ``curiosity_map_<steps>_steps.png``.
 
     Each policy acts alone for some episodes; the map is drawn over two coordinates of the environment's true state,
-    which the agent does not see. Without an SRL head only visits are drawn. CURL's error is measured against an even
+    which the agent does not see. Without an SRL error only visits are drawn. CURL's error is measured against an even
     mix of what the policies see (``sb3_cure.evaluation.rollouts.balanced_negatives``).
 
     :param eval_env: One (not vectorised) environment, not the training one

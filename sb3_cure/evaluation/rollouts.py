@@ -32,7 +32,7 @@ class Episode:
     """One episode of T agent steps.
 
     :param rewards: Reward of each step, [T]
-    :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty without a head
+    :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty if the model measures none
     :param observations: Observations before each step, [T, *shape], or such by key; images channels first, as the
         model gets them
     :param frames: ``env.render()`` before each step and after the last one, [T + 1], if requested; else empty

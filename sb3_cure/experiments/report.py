@@ -46,7 +46,12 @@ _CURVES = (
     ("cells", "cells_reached", "cells", "cells of the true state\nreached in training\n(more: explores wider)"),
     ("return_mean", "learning_curves", "return", "episode return,\ndeterministic actions\n(higher: better)"),
     ("task_srl_error", "task_srl_error", "SRL error, task policy", _ERROR("task", "lower: better")),
-    ("curious_srl_error", "curious_srl_error", "SRL error, curious policy", _ERROR("curious", "higher: unfamiliar")),
+    (
+        "curious_srl_error",
+        "curious_srl_error",
+        "SRL error, curious policy",
+        _ERROR("curious", "higher: seen worse"),
+    ),
 )
 #: Evaluations with something to see, below which a table says it better than lines
 LEAST_POINTS = 4

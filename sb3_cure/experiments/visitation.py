@@ -40,8 +40,8 @@ def visiting_actors(model: CuReSAC, cell: Cell) -> list[str]:
 def measure_visits(model: CuReSAC, cell: Cell, folder: Path) -> None:
     """Roll out each policy as it acts in training, and write ``visitation.csv`` and ``visits.npz``.
 
-    Errors are those of the model's own head and of two constant predictions: ``zero``, the middle grey, and
-    ``mean_image``, the mean of all observations of these episodes (of vectors: 0, and their mean).
+    Errors are those that the model measures (its head's, or its reward's) and of two constant predictions: ``zero``,
+    the middle grey, and ``mean_image``, the mean of all observations of these episodes (of vectors: 0, and their mean).
 
     :param model: A trained model
     :param cell: Its cell

@@ -8,6 +8,11 @@ from sb3_cure.intrinsic.particle import Particle
 from sb3_cure.intrinsic.reconstruction import Reconstruction
 from sb3_cure.intrinsic.rnd import RND
 from sb3_cure.intrinsic.srl_error import SRLError
+from sb3_cure.srl import SRLHead
+
+#: Reward of ``"auto"`` where the head's error does not tell novelty: of those that explored as far as the error of an
+#: autoencoder (results/curiosity.md) the cheapest
+AUTO_WITHOUT_NOVELTY = "rnd"
 
 INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
     "srl_error": SRLError,
@@ -20,16 +25,22 @@ INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
 }
 
 
-def get_intrinsic_class(intrinsic: str | type[IntrinsicReward]) -> type[IntrinsicReward]:
+def get_intrinsic_class(
+    intrinsic: str | type[IntrinsicReward], head: SRLHead | type[SRLHead] | None = None
+) -> type[IntrinsicReward]:
     """Return the class of an intrinsic reward.
 
-    :param intrinsic: Name of a built-in reward, or a subclass of ``IntrinsicReward``
+    :param intrinsic: Name of a built-in reward, a subclass of ``IntrinsicReward``, or ``"auto"``: the SRL error of a
+        head whose error tells novelty, else ``"rnd"``
+    :param head: The SRL head, its class, or None
     :return: The class
-    :raises ValueError: if it is neither
+    :raises ValueError: if it is none of these
     """
+    if intrinsic == "auto":
+        intrinsic = "srl_error" if head is not None and head.error_tells_novelty else AUTO_WITHOUT_NOVELTY
     if isinstance(intrinsic, str) and intrinsic in INTRINSIC_REWARDS:
         return INTRINSIC_REWARDS[intrinsic]
     if isinstance(intrinsic, type) and issubclass(intrinsic, IntrinsicReward):
         return intrinsic
-    names = ", ".join(map(repr, INTRINSIC_REWARDS))
+    names = ", ".join(map(repr, ["auto", *INTRINSIC_REWARDS]))
     raise ValueError(f"intrinsic is {intrinsic!r}: choose one of {names}, or a subclass of IntrinsicReward.")

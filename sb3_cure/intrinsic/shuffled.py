@@ -14,16 +14,14 @@ class Shuffled(IntrinsicReward):
 
     :param args: As of ``IntrinsicReward``
     :param settings: As of ``make_reward``
-    :param of: Name or class of the other reward
+    :param of: Name or class of the other reward; ``"auto"``: the one that ``intrinsic="auto"`` takes with this head
     :param kwargs: Its arguments
     """
 
-    def __init__(
-        self, *args: Any, settings: dict[str, Any], of: str | type[IntrinsicReward] = "srl_error", **kwargs: Any
-    ):
+    def __init__(self, *args: Any, settings: dict[str, Any], of: str | type[IntrinsicReward] = "auto", **kwargs: Any):
         super().__init__(*args)
         spaces_of = self.observation_space, self.action_space
-        self.of = make_reward(get_intrinsic_class(of), *spaces_of, self.features_dim, settings, kwargs)
+        self.of = make_reward(get_intrinsic_class(of, settings["srl"]), *spaces_of, self.features_dim, settings, kwargs)
         self.random = OwnGenerator(stream=1)
         for name in ("needs_srl", "trains_encoder", "measures"):
             setattr(self, name, getattr(self.of, name))

@@ -39,6 +39,7 @@ class DictHead(SRLHead):
         #: Keys of the images, and their parts of the latents
         self.keys, self.slices = tuple(encoder.images), tuple(encoder.slices.values())
         self.mean_error = MeanError(len(self.keys))
+        self.error_tells_novelty = head_class.error_tells_novelty  # type: ignore[misc]
         self.optimizer_kwargs = self.heads[0].optimizer_kwargs  # type: ignore[assignment]
 
     def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:

@@ -37,8 +37,8 @@ PRODUCT = list(itertools.product(*FACTORS))
 def refusal(head: str | None, reward: str, sensors: str) -> str | None:
     """Words of the sentence that refuses a cell, by what its parts declare; None: it is legal."""
     intrinsic, arguments = REWARDS[reward]
-    if head is None:  # "shuffled" wraps the SRL error by default
-        return "srl is None" if intrinsic == "shuffled" or get_intrinsic_class(intrinsic).needs_srl else None
+    if head is None:
+        return "srl is None" if get_intrinsic_class(intrinsic).needs_srl else None
     head_class = get_srl_class(head)
     if head == "curl" and sensors == "vector":
         return "two views of one image"

@@ -280,6 +280,15 @@ def test_auto_follows_the_errors_that_tell_novelty(
         assert equal(groups(again).get("reward", []), groups(model).get("reward", []))
 
 
+@pytest.mark.parametrize(("srl", "expected"), [("rae", SRLError), ("curl", RND)])
+def test_shuffled_control_is_of_the_reward_that_auto_takes(srl: str, expected: type[IntrinsicReward]) -> None:
+    """Also with a head for each image of a dictionary, where each image has a reward."""
+    reward: Any = filled_model(pixels=True, srl=srl, intrinsic="shuffled").policy.intrinsic
+    assert type(reward.of) is expected
+    reward = sensor_model(srl=srl, intrinsic="shuffled").policy.intrinsic
+    assert type(getattr(reward.of, "rewards", [reward.of])[0]) is expected
+
+
 def test_auto_takes_the_word_of_a_head_of_the_users() -> None:
     """A head that says nothing is followed, as in the paper."""
 
@@ -321,7 +330,7 @@ def test_rewards_draw_from_generators_of_their_own() -> None:
     [
         (dict(intrinsic="novelty"), "intrinsic is"),
         (dict(intrinsic=nn.Linear), "intrinsic"),
-        (dict(srl=None, intrinsic="shuffled"), "srl is None"),
+        (dict(srl=None, intrinsic="shuffled", intrinsic_kwargs=dict(of="srl_error")), "srl is None"),
         (dict(srl="inverse", intrinsic="srl_error", intrinsic_kwargs=dict(per_pixel=True)), "Inverse does not draw"),
         (dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="novelty")), "choose one of"),
         (dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="mine")), "encoder is 'mine'"),
