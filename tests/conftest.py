@@ -2,6 +2,8 @@
 
 import os
 
+# Tests compare with the CPU's numbers. With CUDA_VISIBLE_DEVICES=0 those that need a GPU run, too.
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 # Without a display MuJoCo needs to be told to render off-screen, before it is imported.
 os.environ.setdefault("MUJOCO_GL", "egl")
 # For the processes that tests start; see below.

@@ -46,7 +46,8 @@ class SRLError(IntrinsicReward):
                 "that implements reconstruct, or intrinsic='reconstruction'."
             )
         self._srl: tuple[Any] = (srl,)
-        example = th.as_tensor(self.observation_space.sample())[None]
+        where = next(srl.parameters()).device  # type: ignore[union-attr]
+        example = th.as_tensor(self.observation_space.sample(), device=where)[None]
         self.register_buffer("variance", th.zeros(self._target(example).shape[1:]))
         self.register_buffer("weight", th.zeros(()))
 

@@ -19,7 +19,8 @@ def has_fast_bf16(device: th.device) -> bool:
     :return: True for GPUs and CPUs with bf16 instructions
     """
     if device.type == "cuda":
-        return th.cuda.is_bf16_supported(including_emulation=False)
+        with th.cuda.device(device):
+            return th.cuda.is_bf16_supported(including_emulation=False)
     # Without these instructions bf16 on a CPU is emulated and slower than fp32.
     supported = getattr(th.cpu, "_is_avx512_bf16_supported", None)
     return device.type == "cpu" and supported is not None and supported()
@@ -42,7 +43,7 @@ def resolve_precision(precision: str, device: th.device, observation_space: spac
 def compute_in(module: nn.Module, precision: str) -> Iterator[None]:
     """Within this context every ``MixedPrecision`` part of a module computes in the given format.
 
-    Outside of it networks compute in fp32, so that acting, measuring and exporting do not depend on the hardware.
+    Outside of it networks compute in fp32, to act, to measure and to export.
 
     :param module: Usually the whole policy
     :param precision: ``"fp32"`` or ``"bf16"``

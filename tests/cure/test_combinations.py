@@ -144,3 +144,27 @@ def test_update_stays_on_its_device(cell: tuple[Any, ...], mode: str, meta_devic
         learns_srl, learns_rl, _ = model._plan()
         metrics = model._update(model._sample_batch(8, learns_rl), learns_srl, learns_rl)
         assert {value.device for value in metrics.values()} == {meta_device}
+
+
+@pytest.mark.parametrize(("reward", "sensors"), sorted({cell[2:] for cell in LEGAL if cell[1] == "rae"}))
+def test_curious_agent_added_later_is_on_the_device(reward: str, sensors: str, meta_device: th.device) -> None:
+    """As for pretraining of an agent without curiosity."""
+    policy = make("sac", "rae", reward, sensors, device=meta_device, curiosity=None).policy
+    intrinsic, arguments = REWARDS[reward]
+    policy.add_curious_agent(get_intrinsic_class(intrinsic, policy.srl), arguments)
+    assert {each.device for each in (*policy.parameters(), *policy.buffers())} == {meta_device}
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU, and CUDA_VISIBLE_DEVICES=0")
+@pytest.mark.parametrize("cell", TRAINED)
+def test_from_gpu_to_cpu_and_back(cell: tuple[Any, ...], tmp_path: Path) -> None:
+    """Trained on one, loaded on the other, where it acts alike, and trained on."""
+    model = make(*cell, device="cuda").learn(25)
+    for device in ("cpu", "cuda"):
+        model.save(tmp_path / "model")
+        loaded = ALGORITHMS[cell[0]].load(tmp_path / "model", env=model.get_env(), device=device)
+        observation = model.get_env().reset()  # type: ignore[union-attr]
+        actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
+        np.testing.assert_allclose(*actions, atol=1e-2)  # convolutions may compute in TF32 there
+        assert {each.device.type for each in loaded.policy.parameters()} == {device}
+        model = loaded.learn(25, reset_num_timesteps=False)

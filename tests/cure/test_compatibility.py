@@ -478,21 +478,6 @@ def test_policy_alone_is_saved_and_loaded(extras: dict[str, Any], policy: str, e
     np.testing.assert_array_equal(*actions)
 
 
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
-@both_modes
-def test_from_gpu_to_cpu_and_back(extras: dict[str, Any], tmp_path: Path) -> None:
-    """Trained on one, loaded on the other, trained on."""
-    observation = VectorBox().reset(seed=0)[0]
-    for device, other in (("cuda", "cpu"), ("cpu", "cuda")):
-        model = vector_model(device=device, **extras).learn(20)
-        model.save(tmp_path / "model")
-        loaded = CuReSAC.load(tmp_path / "model", env=vec_env(), device=other)
-        actions = [each.predict(observation, deterministic=True)[0] for each in (model, loaded)]
-        np.testing.assert_allclose(*actions, atol=1e-5)
-        assert next(loaded.policy.parameters()).device.type == other
-        assert loaded.learn(20, reset_num_timesteps=False).num_timesteps == 40
-
-
 @pytest.mark.parametrize("srl", ["rae", "curl"])
 def test_pixels_of_dm_control(srl: str, tmp_path: Path) -> None:
     """Trained, saved, loaded, trained on: on a real task, with whichever versions are installed."""

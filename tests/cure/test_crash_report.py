@@ -91,6 +91,13 @@ def test_deferred_error_forbids_saving(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_guard_keeps_a_step_without_parameters_on_the_device() -> None:
+    """All values are read at once, from one device."""
+    guard = FiniteGuard(deferred=True)
+    guard.check("nothing to learn", [], th.ones((), device="meta"))
+    assert guard._seen[0][2].device.type == "meta"
+
+
 @pytest.mark.parametrize("deferred", [False, True])
 @pytest.mark.parametrize(
     "loss, gradient, sound",
