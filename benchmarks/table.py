@@ -208,7 +208,8 @@ def write_page(results: Path, page: Path) -> None:
     costs = json.loads(file.read_text()) if file.exists() else {"tasks": {}, "conditions": {}}
     texts, curves = collect(results, grid, costs["tasks"])
     colors = arm_colors(list(ARMS), RANDOM)
-    learning_curves(folder / "benchmark.png", curves, colors, "episode return\n(deterministic actions)")
+    drawn = {task: by_arm for task, by_arm in curves.items() if len(by_arm) > 1} or curves  # not random alone
+    learning_curves(folder / "benchmark.png", drawn, colors, "episode return\n(deterministic actions)")
     cpus = sorted({f"{each['processor']} ({each['instructions']})" for each in costs["conditions"].values()})
     minutes = "Minutes: agent steps times the CPU time of one, on one thread of " + ", ".join(cpus) + "."
     lines = [f"| | {' | '.join(curves)} |", "|---" * (1 + len(curves)) + "|"]
