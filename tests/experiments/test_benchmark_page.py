@@ -37,7 +37,7 @@ def test_only_cells_at_the_budget_count(results: Path, tmp_path: Path) -> None:
     arms = results / "fast_benchmark" / "cartpole-swingup"
     write_cell(arms / "curl" / "seed20" / "eval.csv", [0, 100_000], [20, 500])
     write_cell(arms / "sac_ae" / "seed20" / "eval.csv", [0, 90_000], [20, 300])
-    clock = results / "by_the_clock" / "cartpole-swingup" / "best" / "seed20.csv"
+    clock = results / "by_the_clock_amx" / "cartpole-swingup" / "best" / "seed20.csv"
     write_cell(clock, [0, 100_000, 200_000], [20, 600, 900])
     table.main(["--results", str(results), "--page", str(tmp_path / "page.md")])
     page = (tmp_path / "page.md").read_text()

@@ -227,6 +227,7 @@ def test_killed_ray_worker_costs_nothing(tmp_path: Path, slow_grid: Any, monkeyp
     path = slow_grid(kind="visitation", seeds=2, budget=600, evaluation=dict(every=200, episodes=1))
     grid, out = load_grid(path), tmp_path / "out"
     with monkeypatch.context() as card:
+        card.delenv("CUDA_VISIBLE_DEVICES")  # of the tests; Ray sets those of its workers
         card.setenv("CARDS", str(tmp_path / "seen"))
         card.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1, "CPU": 4}')  # Ray takes any machine's word for its cards
         ray = ["--engine", "ray", "--gpus-per-cell", "0.5", "--checkpoint-minutes", "0"]
