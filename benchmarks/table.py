@@ -191,8 +191,8 @@ with deterministic actions. The highest return is 1000. {minutes}
 
 Lines are means over seeds, bands one standard deviation; the numbers of seeds are those that have run. These pixels are
 not the papers', so that returns compare with each other and not with published ones. The cells are those of
-`zoo_configs/experiments/fast/benchmark.yml`. Their raw data is in `results/fast_benchmark/`, of `best` on
-cartpole-swingup in `results/by_the_clock_amx/`.
+`zoo_configs/experiments/fast/benchmark.yml`. Their raw data is in `results/fast_benchmark/`; those that have not run
+there are taken from `results/by_the_clock_amx/`.
 """
 
 

@@ -16,7 +16,7 @@ from sb3_cure.evaluation.plots import arm_colors, in_style, save
 from sb3_cure.evaluation.result_files import Row, read_rows, write_csv, write_text
 from sb3_cure.experiments.grid import read_json
 from sb3_cure.experiments.statistics import area_under_curve
-from sb3_cure.experiments.tables import NONE, Table
+from sb3_cure.experiments.tables import NONE, Table, mean_std_text
 
 #: The arm that the others are compared with
 OURS = "best"
@@ -225,7 +225,7 @@ def _arm_row(rows: Sequence[Row], task: str, arm: str, seeds: Seeds) -> list[str
     texts = [_median_text(row) for row in rows if (row["task"], row["arm"]) == (task, arm)]
     for minutes in TIMES:
         returns = np.array([run.return_after(minutes) for run in seeds.values()])
-        texts.append(NONE if np.isnan(returns).any() else f"{returns.mean():.0f} ± {returns.std():.0f}")
+        texts.append(NONE if np.isnan(returns).any() else mean_std_text(returns))
     steps, cpu, wall = np.mean(
         [
             (run.rows[-1]["agent_steps"], run.details["training_seconds"], run.details["training_wall_seconds"])

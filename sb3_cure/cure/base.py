@@ -60,7 +60,7 @@ class CuReBase(OffPolicyAlgorithm):
     :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
         novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
-        ``"particle"``, ``"shuffled"`` (that of auto without its information, as a control), or a subclass of
+        ``"particle"``, ``"shuffled"`` (another one, by default that of auto, without its information), or a subclass of
         ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the

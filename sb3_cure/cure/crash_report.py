@@ -64,10 +64,10 @@ class FiniteGuard:
         :param loss: Scalar
         :raises NonFiniteError: if something is not finite, unless that is found out later
         """
-        value = th.zeros((), device=gradients[0].device) if loss is None else loss.detach().float()
+        value = th.zeros(()) if loss is None else loss.detach().float()
         norm = th.stack(th._foreach_norm(gradients)).norm().float() if gradients else th.zeros_like(value)
         if self.deferred:
-            self._seen.append((name, self.update, th.stack([value, norm])))
+            self._seen.append((name, self.update, th.stack([value.to(norm.device), norm])))
         elif not (math.isfinite(value) and norm <= LARGEST_NORM):
             raise NonFiniteError(name, float(value), float(norm), self.update)
 

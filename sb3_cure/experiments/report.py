@@ -50,7 +50,7 @@ _CURVES = (
         "curious_srl_error",
         "curious_srl_error",
         "SRL error, curious policy",
-        _ERROR("curious", "higher: seen worse"),
+        _ERROR("curious", "higher: represented worse"),
     ),
 )
 #: Evaluations with something to see, below which a table says it better than lines

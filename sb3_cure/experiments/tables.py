@@ -138,7 +138,13 @@ def _digits(value: float) -> int:
     return 2 - math.floor(math.log10(value)) if 0 < value < 10 else 0
 
 
-def _mean_std(values: np.ndarray, digits: int = 0) -> str:
+def mean_std_text(values: np.ndarray, digits: int = 0) -> str:
+    """Format a mean and, of several values, their standard deviation (n - 1).
+
+    :param values: [n]
+    :param digits: Digits after the point
+    :return: The text; of no values ``""``
+    """
     std = f" ± {number_text(float(values.std(ddof=1)), digits)}" if len(values) > 1 else ""
     return f"{number_text(float(values.mean()), digits)}{std}" if len(values) else ""
 
@@ -202,7 +208,7 @@ def curves_table(experiment: Experiment) -> Table:
     for task, method in experiment.arms:
         digits, arm = return_digits(experiment, task), statistics.summarise_arm(experiment, task, method)
         missing = NONE if experiment.done(task, method) else _state(experiment, task, method)
-        row = [_mean_std(arm[measure].to_numpy(), digits) or missing for measure in ("area", "final")]
+        row = [mean_std_text(arm[measure].to_numpy(), digits) or missing for measure in ("area", "final")]
         rows.append([task, method, str(len(arm)), *row])
     return _table("Learning curves", "task; arm; >seeds; >area under curve; >final return", rows, render_text("curves"))
 
@@ -219,7 +225,7 @@ def measured_table(title: str, measured: Mapping[str, Curves], note: str) -> Tab
     for measure, tasks in measured.items():
         for task, arms in tasks.items():
             for method, (steps, values) in arms.items():
-                texts = [_mean_std(each, _digits(abs(each.mean()))) for each in values.T]
+                texts = [mean_std_text(each, _digits(abs(each.mean()))) for each in values.T]
                 rows[measure, task, method, str(len(values))] = dict(zip(steps, texts, strict=True))
     numbers = pd.DataFrame(list(rows.values())).sort_index(axis=1).fillna(NONE)
     numbers.columns = [f">at {number_text(step)}" for step in numbers]
@@ -353,7 +359,12 @@ def coverage_table(experiment: Experiment, rows: Sequence[Occupancy]) -> Table:
     """
     shown = []
     for row in rows:
-        numbers = [str(len(row.values)), number_text(row.steps), _mean_std(row.values), value_and_interval(row.ratio)]
+        numbers = [
+            str(len(row.values)),
+            number_text(row.steps),
+            mean_std_text(row.values),
+            value_and_interval(row.ratio),
+        ]
         shown.append([row.task, row.method, row.actor, *numbers, value_and_interval(row.task_ratio)])
     columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS])
     dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
@@ -377,7 +388,7 @@ def rewards_met_table(experiment: Experiment) -> Table:
         if len(met) == 0 or (met < 0).any():
             continue
         parts = [final(task, method, f"rewards_met_{part}") for part in ("task", "curious", "late")]
-        numbers = [_mean_std(met), *(_mean_std(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
+        numbers = [mean_std_text(met), *(mean_std_text(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
         difference = NONE
         if method != experiment.baseline_of(method):
             difference = value_and_interval(statistics.rewards_met_difference(experiment, task, method))

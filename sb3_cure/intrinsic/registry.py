@@ -26,13 +26,13 @@ INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
 
 
 def get_intrinsic_class(
-    intrinsic: str | type[IntrinsicReward], head: SRLHead | type[SRLHead] | None = None
+    intrinsic: str | type[IntrinsicReward], head: SRLHead | type[SRLHead] | None
 ) -> type[IntrinsicReward]:
     """Return the class of an intrinsic reward.
 
     :param intrinsic: Name of a built-in reward, a subclass of ``IntrinsicReward``, or ``"auto"``: the SRL error of a
         head whose error tells novelty, else ``"rnd"``
-    :param head: The SRL head, its class, or None
+    :param head: The agent's SRL head, its class, or None; ``"auto"`` asks it
     :return: The class
     :raises ValueError: if it is none of these
     """

@@ -20,8 +20,9 @@ class Shuffled(IntrinsicReward):
 
     def __init__(self, *args: Any, settings: dict[str, Any], of: str | type[IntrinsicReward] = "auto", **kwargs: Any):
         super().__init__(*args)
+        reward_class = get_intrinsic_class(of, settings.get("srl"))
         spaces_of = self.observation_space, self.action_space
-        self.of = make_reward(get_intrinsic_class(of, settings["srl"]), *spaces_of, self.features_dim, settings, kwargs)
+        self.of = make_reward(reward_class, *spaces_of, self.features_dim, settings, kwargs)
         self.random = OwnGenerator(stream=1)
         for name in ("needs_srl", "trains_encoder", "measures"):
             setattr(self, name, getattr(self.of, name))

@@ -1,5 +1,6 @@
 """The paper's reward: the error of the state representation (section "CuRe")."""
 
+from itertools import chain
 from typing import Any
 
 import torch as th
@@ -46,7 +47,7 @@ class SRLError(IntrinsicReward):
                 "that implements reconstruct, or intrinsic='reconstruction'."
             )
         self._srl: tuple[Any] = (srl,)
-        where = next(srl.parameters()).device  # type: ignore[union-attr]
+        where = next(chain(srl.parameters(), srl.encoder.parameters())).device  # type: ignore[union-attr]
         example = th.as_tensor(self.observation_space.sample(), device=where)[None]
         self.register_buffer("variance", th.zeros(self._target(example).shape[1:]))
         self.register_buffer("weight", th.zeros(()))

@@ -43,7 +43,7 @@ def resolve_precision(precision: str, device: th.device, observation_space: spac
 def compute_in(module: nn.Module, precision: str) -> Iterator[None]:
     """Within this context every ``MixedPrecision`` part of a module computes in the given format.
 
-    Outside of it networks compute in fp32, to act, to measure and to export.
+    Outside of it, when acting, measuring and exporting, networks compute in fp32.
 
     :param module: Usually the whole policy
     :param precision: ``"fp32"`` or ``"bf16"``

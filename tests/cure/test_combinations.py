@@ -38,7 +38,7 @@ def refusal(head: str | None, reward: str, sensors: str) -> str | None:
     """Words of the sentence that refuses a cell, by what its parts declare; None: it is legal."""
     intrinsic, arguments = REWARDS[reward]
     if head is None:
-        return "srl is None" if get_intrinsic_class(intrinsic).needs_srl else None
+        return "srl is None" if get_intrinsic_class(intrinsic, None).needs_srl else None
     head_class = get_srl_class(head)
     if head == "curl" and sensors == "vector":
         return "two views of one image"
@@ -126,9 +126,10 @@ def meta_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[th.device]:
     """Torch's device of shapes without values, on which models can be built and optimised."""
     adam = th.optim.Adam.__init__  # its fused kernel has no such device
     monkeypatch.setattr(th.optim.Adam, "__init__", lambda *args, fused=None, **kwargs: adam(*args, **kwargs))
+    before = th.__future__.get_swap_module_params_on_conversion()
     th.__future__.set_swap_module_params_on_conversion(True)  # so that optimisers follow, as from CPU to GPU
     yield th.device("meta")
-    th.__future__.set_swap_module_params_on_conversion(False)
+    th.__future__.set_swap_module_params_on_conversion(before)
 
 
 @pytest.mark.parametrize(("cell", "mode"), list(zip(TRAINED, itertools.cycle(["joint", "sequential"]), strict=False)))
