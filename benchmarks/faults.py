@@ -120,7 +120,7 @@ def _make_model() -> CuReSAC:
 
 
 def _digest(model: CuReSAC) -> str:
-    """Of all that a checkpoint holds."""
+    """Digest of everything that a checkpoint holds."""
     digest = hashlib.sha256()
 
     def take(value: Any) -> None:

@@ -33,7 +33,7 @@ from sb3_cure import CuReSAC
 from sb3_cure.evaluation.result_files import describe_run
 from sb3_cure.persistence import read_state, write_state
 
-#: What a load may take besides what the process had before, bytes, and how long, seconds
+#: Limits of a load: memory beyond what the process had before, bytes, and time, seconds
 MEMORY, SECONDS = 2**29, 10
 #: What no load of an untrusted file may do (Python's audit events); writing files is found out by the mode
 FORBIDDEN = ("pickle.find_class", "os.system", "subprocess.Popen", "os.exec", "os.posix_spawn", "os.fork")
@@ -313,7 +313,7 @@ _ODD: list[Any] = [
 
 
 def _changed(node: Any, rng: random.Random) -> Any:
-    """JSON of which one part is another value, missing, doubled or deeper."""
+    """Return JSON with one part changed, removed, renamed, repeated or nested."""
     if isinstance(node, dict | list) and node and rng.random() < 0.93:
         keys: list[Any] = list(node) if isinstance(node, dict) else list(range(len(node)))
         key = rng.choice(keys)

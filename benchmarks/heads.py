@@ -10,7 +10,7 @@ PLAIN = "no head"
 
 
 def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
-    """A part of ``make bench``, on two threads, in the smallest setting there, without curiosity.
+    """Time updates by head, as a part of ``make bench``: in its smallest setting on two threads, without curiosity.
 
     :param repeats: Rounds that count
     :return: By head: milliseconds of an update, and how many more these are than without a head

@@ -1,7 +1,7 @@
 """What bfloat16 changes: from one state and on one fixed buffer, the same updates in fp32 and in bf16.
 
-Training is chaotic: two runs part after the slightest difference. So there is a third arm, fp32 from weights that
-differ in their last digits, whose distance from fp32 is what a difference that means nothing looks like.
+Training is chaotic: two runs diverge after the slightest difference. So there is a third arm, fp32 from weights that
+differ in their last digits: its distance from fp32 shows the size of a difference that means nothing.
 """
 
 import copy

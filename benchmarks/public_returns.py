@@ -48,7 +48,7 @@ def public_cell(cell: Cell) -> Cell:
 
 
 class PublicTraining:
-    """Its training loop, on an environment of ours.
+    """Training loop of the public implementation, on one of our environments.
 
     :param checkout: Folder that holds the public implementation's files
     :param cell: What to run
@@ -64,7 +64,7 @@ class PublicTraining:
         shape, actions = self.env.observation_space.shape, self.env.action_space
         assert isinstance(actions, gym.spaces.Box) and shape is not None and shape[0] < shape[1]
         assert (actions.low == -1).all() and (actions.high == 1).all()
-        #: Updates after the warm-up's last step: it counts steps, not updates, so that each of them includes the actor
+        #: Updates after the warm-up's last step. The step's number decides on the actor: all of these updates train it
         self.first_updates = self.settings["learning_starts"]
         self.log, self.losses = Log(), list[float]()
         self.updates = 0

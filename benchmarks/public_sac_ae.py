@@ -72,7 +72,7 @@ class Log:
 
 
 class _Buffer:
-    """The same batches for both, in turn; observations are bytes, which either makes floats of in its update."""
+    """Returns the same batches to both, in turn; observations are bytes, which either converts in its update."""
 
     def __init__(self, batches: list[ReplayBufferSamples]) -> None:
         self._batches: Iterator[ReplayBufferSamples] = itertools.cycle(batches)

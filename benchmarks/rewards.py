@@ -180,7 +180,7 @@ def visits(arm: str, seed: int, steps: int) -> dict[str, float]:
 
 
 def costs(repeats: int = 7) -> dict[str, dict[str, float]]:
-    """A part of ``make bench``, on two threads, in the smallest setting there.
+    """Time updates by reward, as a part of ``make bench``: in its smallest setting on two threads.
 
     :param repeats: Rounds that count
     :return: By reward: milliseconds of an update, and how many more these are than with the error of the same head

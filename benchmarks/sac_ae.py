@@ -188,7 +188,7 @@ class PlainSacAe:
 
     @staticmethod
     def dither(images: th.Tensor) -> th.Tensor:
-        """Reduce images to 5 bits, with dither.
+        """Draw the noise that dithers images of 5 bits.
 
         :param images: [B, C, H, W]
         :return: Uniform noise in [0, 1) of that shape

@@ -1,7 +1,7 @@
 """Updates by setting: the paper's, and the small images and networks that people without a GPU train.
 
-The floor of an update is what its products of matrices and its convolutions take alone, each by the fastest of the
-number formats at these very shapes: no update of these layers can be faster with torch's kernels.
+The floor of an update is the time of its matrix products and convolutions alone, each at its own shape and in the
+fastest number format: no update of these layers can be faster with torch's kernels.
 """
 
 import statistics

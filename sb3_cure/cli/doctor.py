@@ -164,7 +164,7 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
 
 
 def _below_camera(env: gym.Env) -> gym.Env:
-    """Return the environment below the camera of a DMC task, whose images nobody looks at, with its limit of steps."""
+    """Unwrap a DMC task to the environment below its camera, so that nothing is rendered; keep its step limit."""
     inner: Any = env
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, DMCPixels):

@@ -54,7 +54,7 @@ TRUSTED_SETTINGS = ("env_wrapper", "vec_env_wrapper", "normalize")
 
 @contextlib.contextmanager
 def _refusals_in_one_sentence(*functions: Any) -> Iterator[None]:
-    """Settings that are refused, or name an unknown argument, are the user's: show no traceback."""
+    """Report refused settings and unknown arguments, which are the user's to fix, in one sentence without traceback."""
     try:
         yield
     except UsageError:
@@ -72,14 +72,14 @@ class ExperimentManager(exp_manager.ExperimentManager):
     """rl-zoo3's manager, which reads the settings and makes environments and model, with additions.
 
     - ``--conf-file fast/cure_sac_ae`` is one of the package's files;
-    - an entry ``dmc_pixels:`` of a YAML file holds for the tasks of this namespace that have none of their own, and
-      ``my_module:My-v0:`` for an environment that this module registers;
+    - an entry ``dmc_pixels:`` of a YAML file applies to all tasks of this namespace without an entry of their own, and
+      ``my_module:My-v0:`` to an environment that ``my_module`` registers;
     - in a file 1e-3 is a number, as in grids;
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
-    - ``--trial-id 0`` is the first trial, not none;
-    - settings that cannot be used are refused in one sentence, and training tells the time that is left;
+    - ``--trial-id 0`` selects the first trial, instead of being taken for no trial;
+    - settings that cannot be used are refused in one sentence, and training prints the remaining time;
     - ``optimize`` samples only what the chosen kind of curiosity uses.
     """
 
@@ -168,7 +168,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
             print(f"Stopped: {kept if self.storage else 'without --storage no trial is kept for another call'}.")
             raise
         finally:
-            # Of a study that several processes work on, those of all of them since this one began.
+            # If several processes share a study, count the trials of all of them since this one began.
             number, ended = trial.number + 1, trial.number + 2 - self._first
             last = self.max_total_trials or self._first - 1 + (self.n_trials or 0)
             left = (time.monotonic() - self._start) / ended * (last - number)
@@ -270,7 +270,7 @@ def train(arguments: Sequence[str]) -> None:
 
 
 def _check_values(arguments: Sequence[str]) -> None:
-    """Refuse what rl-zoo3's own parser would end in a traceback for."""
+    """Refuse values that would make rl-zoo3 end in a traceback."""
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=StoreDict)
@@ -384,7 +384,7 @@ def _parse_all(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> arg
 
 
 def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyAlgorithm, VecEnv, Path]:
-    """The model with the smallest replay buffer, its run's environment, and its path."""
+    """Load a run's model without a replay buffer, and return it with its environment and its path."""
     for package in args.gym_packages:
         import_module(package)
     check_environment(args.env)
@@ -423,7 +423,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
 
 
 class _NoReplayBuffer(FrameStackReplayBuffer):
-    """Takes the place of the run's: nothing is stored, and its class may not be in the archive."""
+    """Stand-in for the run's replay buffer: nothing is stored, and the archive may not hold the buffer's class."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         """Allocate nothing."""

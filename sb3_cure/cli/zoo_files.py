@@ -83,7 +83,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def zoo_entry(path: Path, task: str, modules: Sequence[str] = ()) -> dict[str, Any]:
-    """Read the settings that a zoo file has for a task: of its id, of its namespace, or those of ``default``.
+    """Read a task's settings from a zoo file: the entry of its id, else of its namespace, else ``default``.
 
     :param path: The file
     :param task: Gymnasium id, or ``my_module:My-v0``
@@ -105,8 +105,8 @@ _NOT_OF_MODEL = ("n_timesteps", "policy", "n_envs", "env_kwargs", "env_wrapper")
 def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
     """Read the arguments of a model from a zoo file: ``CuReSAC("CnnPolicy", env, **recipe("fast/best"))``.
 
-    Left out is what the file says of the environment (``env_kwargs``, ``env_wrapper``, ``n_envs``), and so are
-    ``policy`` and ``n_timesteps``.
+    The settings of the environment (``env_kwargs``, ``env_wrapper``, ``n_envs``), ``policy`` and ``n_timesteps`` are
+    left out.
 
     :param name: A file of the package, such as ``"fast/best"``, or the path of your own with suffix
     :param task: Gymnasium id whose entry is read; by default that for any environment

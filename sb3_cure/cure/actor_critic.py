@@ -49,8 +49,8 @@ class TrunkActor(MixedPrecision, Actor):
         :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B, 1]
         """
         mean, log_std, _ = self.get_action_dist_params(obs)
-        # What SB3's SquashedDiagGaussianDistribution computes; torch's Normal would read its arguments to check them,
-        # for which a GPU has to stop.
+        # The same numbers as SB3's SquashedDiagGaussianDistribution. torch's Normal would validate its arguments, for
+        # which a GPU has to synchronise.
         noise = th.randn_like(mean)
         actions = th.tanh(mean + noise * log_std.exp())
         log_prob = -0.5 * (noise.square() + math.log(2 * math.pi)) - log_std

@@ -20,7 +20,7 @@ POLICIES: dict[str, type[BasePolicy]] = {
 
 
 class CuReSAC(Pretraining, Persistence, CuRe, SAC):  # type: ignore[misc]
-    """Soft actor-critic from pixels, with state representation learning and a policy that seeks what it does badly.
+    """SAC from pixels, with state representation learning and a curious policy that seeks badly represented states.
 
     All arguments are described at ``CuReBase``.
     """

@@ -88,7 +88,7 @@ def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
 
 
 def _depends_on_observation_alone(model: Any) -> bool:
-    """Whether a transition's intrinsic reward depends on the observation that it begins with alone."""
+    """Whether the intrinsic reward of a transition (s, a, s') depends on s alone."""
     is_error = issubclass(choose_intrinsic(model), SRLError) and model.srl is not None
     return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
 

@@ -1,4 +1,4 @@
-"""What CuRe is besides its algorithm: arguments, set-up, environments and what is saved."""
+"""Everything of CuRe but its algorithm: arguments, set-up, environments and saving."""
 
 import warnings
 from typing import Any, ClassVar, TypeVar
@@ -36,7 +36,7 @@ class CuReBase(OffPolicyAlgorithm):
     Defaults are the paper's table of hyperparameters. Timesteps are *agent* steps, as everywhere in SB3: environment
     steps divided by the action repeat.
 
-    With ``srl=None, curiosity=None`` it is the base class with one encoder, shared and trained by the critics alone.
+    With ``srl=None, curiosity=None`` it is SAC or TQC with one shared encoder, which the critics alone train.
 
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for dictionaries of
         both, or a subclass of ``CuRePolicy``
@@ -52,16 +52,17 @@ class CuReBase(OffPolicyAlgorithm):
     :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), ``"vae"``, ``"spr"``,
         ``"forward"``, ``"inverse"`` (see ``sb3_cure.srl``), a subclass of ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
-    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of ``srl_period``
-        gradient steps, two updates in each, in turn: after whole periods both were updated as often as simultaneously
+    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of SRL and of RL in
+        turn, each of ``srl_period`` gradient steps of two updates, so that after a pair of phases both have had as many
+        updates as if simultaneous
     :param srl_period: Gradient steps per phase when alternating
-    :param srl_interval: Updates between two of head and encoder by the SRL loss; each of them in the burst, where
-        nothing else is learned, and when alternating
+    :param srl_interval: The SRL loss trains head and encoder in every ``srl_interval``-th update. It does so in every
+        update in the burst, when alternating (in the phases of SRL), and where nothing else is learned
     :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
         novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
         the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
-        ``"particle"``, ``"shuffled"`` (another one, by default that of auto, without its information), or a subclass of
-        ``IntrinsicReward``
+        ``"particle"``, ``"shuffled"`` (another reward, by default that of ``"auto"``, in a random order: a control), or
+        a subclass of ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
         task's; ``"random"``: the second actor draws a uniform action for each bout (control); None: off
@@ -77,14 +78,15 @@ class CuReBase(OffPolicyAlgorithm):
     :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
-    :param curious_interval: Updates between two of the curious agent and its reward; in the burst each of them
+    :param curious_interval: The curious agent and its reward learn in every ``curious_interval``-th update, or in each
+        update of the burst
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
     :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: what the head wants (RAE:
         1000), or 0 where there is no warm-up. In each of them actors, temperatures and targets are updated, as in
         SAC-AE's code
-    :param actor_update_interval: Updates of critics between two of actors and temperatures
+    :param actor_update_interval: Updates of the critics per update of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
     :param update: ``"joint"`` (one encoder pass for all) or ``"sequential"`` (a pass and a step for each loss:

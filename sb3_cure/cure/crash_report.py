@@ -22,7 +22,7 @@ class NonFiniteError(ValueError):
     """A loss or a gradient was not finite.
 
     :param source: Name of the step, e.g. ``"task critic"``
-    :param loss: Value of the loss; 0 of the encoder, which follows several
+    :param loss: Value of the loss; 0 for the encoder, whose step follows several losses
     :param norm: Norm of its gradient
     :param update: Number of the update
     """
@@ -44,8 +44,8 @@ class NonFiniteError(ValueError):
 class FiniteGuard:
     """Checks the loss and the gradient of each step.
 
-    On a CPU it raises before the step. Reading a value from a GPU would wait for it: there the values are kept and read
-    once, in ``report``. Parameters may have taken the bad step by then, so that the model is not to be saved.
+    On a CPU it raises before the step. On a GPU each reading would synchronise: there the values are kept, and read
+    once, in ``report``. Parameters may have taken the bad step by then, so that the model must not be saved.
 
     :param deferred: Whether to read the values later
     """
@@ -60,9 +60,9 @@ class FiniteGuard:
         """Check one step.
 
         :param name: Name of the step
-        :param gradients: What it follows
+        :param gradients: Gradients that the step follows
         :param loss: Scalar
-        :raises NonFiniteError: if something is not finite, unless that is found out later
+        :raises NonFiniteError: if something is not finite, unless the check is deferred
         """
         value = th.zeros(()) if loss is None else loss.detach().float()
         norm = th.stack(th._foreach_norm(gradients)).norm().float() if gradients else th.zeros_like(value)

@@ -174,7 +174,7 @@ class CuRe(CuReBase):
         return srl_phase, not srl_phase, 2
 
     def _is_due(self, n_before: int, interval: int) -> bool:
-        """Whether something that is done once per interval is done now; in the burst everything is."""
+        """Whether a step that is made once per ``interval`` updates is due now; in the burst it always is."""
         return self._in_burst or n_before % interval == 0
 
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
@@ -188,12 +188,12 @@ class CuRe(CuReBase):
         learners = self._learners() if learns_rl else {}
         srl = self._srl_loss(batch) if learns_srl else None
         rewarded = "task" if self.curiosity == "bonus" else "curious"
-        # Of head and encoder before their steps
+        # Computed before the steps of head and encoder
         rewards = self._intrinsic_rewards(batch, srl) if rewarded in learners else None
         if srl is not None:
             reward: Any = policy.intrinsic
             if rewards is not None and reward.trains_encoder and self.update == "sequential":
-                srl = self._srl_loss(batch)  # of the encoder as the reward's loss has left it
+                srl = self._srl_loss(batch)  # computed anew, as the reward's loss has stepped the encoder
             self._update_srl(srl.loss)
         if "task" in learners:
             self._update_task(batch, learners["task"], rewards if rewarded == "task" else None)
@@ -241,12 +241,12 @@ class CuRe(CuReBase):
         return SRLOutput(loss.float(), error.float())
 
     def _srl_error(self, batch: Samples, srl_output: SRLOutput | None) -> th.Tensor:
-        """SRL error that rewards a transition: the observation's, its own, or the next observation's, [B]."""
+        """SRL error that rewards a transition, [B]: of the observation, the next one, or the transition itself."""
         srl: Any = self.policy.srl
         if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
             return (srl_output or self._srl_loss(batch, learns=False)).error
         views = self.policy.augmentation(batch.next_observations)
-        # With nothing else, so that no head takes (s', a, s') for a transition.
+        # All other fields are None, so that no head takes (s', a, s') for a transition.
         alone = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
         with th.no_grad():
             return srl.loss(alone, self.policy.encoder(views)).error.float()  # type: ignore[no-any-return]
@@ -265,7 +265,7 @@ class CuRe(CuReBase):
         srl.after_step()
 
     def _intrinsic_rewards(self, batch: Samples, srl: SRLOutput | None) -> th.Tensor:
-        """Scaled intrinsic reward of this batch, [B, 1], never stored, so never stale; and the step of its own loss."""
+        """Step the reward's own loss, and return the batch's scaled reward, [B, 1]: never stored, so never stale."""
         reward: Any = self.policy.intrinsic
         loss, raw = reward.loss(self._reward_inputs(batch, srl))
         raw = raw.detach().float()
@@ -292,7 +292,7 @@ class CuRe(CuReBase):
         self._update_actor_critic("task", n_before, batch.actions, rewards, discounts, next_view)
 
     def _update_curious(self, batch: Samples, n_before: int, rewards: Any) -> None:
-        """UpdateCuriousAC: episodes do not end, unless ``curiosity_episodic`` says so."""
+        """UpdateCuriousAC: returns continue where episodes terminate, unless ``curiosity_episodic``."""
         continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
         discounts = continues * self.curiosity_gamma
         self._update_actor_critic("curious", n_before, batch.actions, rewards, discounts, "next_observations")
@@ -374,7 +374,7 @@ class CuRe(CuReBase):
     def _reward_inputs(self, batch: Samples, srl: SRLOutput | None) -> RewardInputs:
         """What an intrinsic reward may read of this batch, of the encoder and of the replay buffer."""
         policy, encoder = self.policy, self.policy.encoder_update
-        # Without augmentation the centred views are those that everyone else sees, whose losses need the graph.
+        # Without augmentation the centred views are also those of the other losses, which need their graph.
         shared = type(policy.augmentation) is Augmentation
         graph = shared or policy.intrinsic.trains_encoder  # type: ignore[union-attr]
 

@@ -30,7 +30,7 @@ class EncoderUpdate:
     number of sources of this update: Adam divides by the size of the sum, which for uncorrelated gradients of equal
     size is that root times the size of each.
 
-    Views are made, and the encoder runs, when something reads them; again only after it has been stepped.
+    Views are made and encoded when they are first read, and encoded again only after the encoder has been stepped.
 
     :param encoder: The shared encoder; it may have no parameters
     :param target: Its moving average
@@ -105,7 +105,7 @@ class EncoderUpdate:
     def latents(self, source: str, name: str = "observations", graph: bool = True) -> th.Tensor:
         """Latents for a loss: a copy in which its gradient stops, until it is collected.
 
-        :param source: Name of the loss; of one that is no source of the encoder's, they have no gradient
+        :param source: Name of the loss; latents of a loss that does not train the encoder carry no gradient
         :param name: Name of the views
         :param graph: Whether these views need their graph, for this loss or for another one, whatever the grad mode
         :return: fp32, [B, features_dim]
@@ -163,7 +163,7 @@ class EncoderUpdate:
             self._step()
 
     def finish(self) -> None:
-        """End the update: joint: step along the gradients that were collected; and drop what was computed."""
+        """End the update: if joint, step along the collected gradients; then drop everything that was computed."""
         self._step()
         self._reset({})
 
@@ -212,7 +212,7 @@ class EncoderUpdate:
         self._gradients: dict[str, dict[str, th.Tensor]] = {}
 
     def _reset(self, views: Mapping[str, Callable[[], Any]]) -> None:
-        """Take the views of another update; between updates none, as graphs would forbid copies of the model."""
+        """Set the views of an update; between updates there are none, as a model that holds graphs cannot be copied."""
         self._views = {name: cache(make) for name, make in views.items()}
         self._target_latents: dict[str, th.Tensor] = {}
         self._forget()

@@ -103,7 +103,7 @@ class CuRePolicy(BasePolicy):
         curiosity_encoder_grad: bool = True,
         update: str = "joint",
     ):
-        # First of all, while nothing else is local: what `_get_constructor_parameters` gives back
+        # First of all, while `locals()` has the arguments alone: `_get_constructor_parameters` returns them
         arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         super().__init__(
             observation_space,
@@ -157,7 +157,7 @@ class CuRePolicy(BasePolicy):
 
     @classmethod
     def _choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-        """The default, but for dictionaries without images, which act as one vector."""
+        """Return the default encoder, or ``VectorEncoder`` for dictionaries without images, which act as one vector."""
         is_vector = cls.default_encoder is DictEncoder and not image_spaces(observation_space)
         return VectorEncoder if is_vector else cls.default_encoder
 
@@ -342,7 +342,7 @@ class CuRePolicy(BasePolicy):
         return flatten_vectors(observations, self.observation_space)
 
     def samples(self, sampled: Any, random: bool = True) -> Samples:
-        """Make of a batch what heads and rewards get.
+        """Convert a batch to the ``Samples`` that heads and rewards get.
 
         :param sampled: Batch of a replay buffer
         :param random: Whether the views are random ones, to learn from; else the centred ones, to measure
@@ -389,7 +389,7 @@ class CuRePolicy(BasePolicy):
 
     @property
     def measures_errors(self) -> bool:
-        """Whether ``error`` has something to measure by."""
+        """Whether ``error`` can be computed: there is a head, or a reward that measures errors."""
         return self.srl is not None or (self.intrinsic is not None and self.intrinsic.measures)
 
     def error(self, batch: Samples) -> th.Tensor:
@@ -407,7 +407,7 @@ class CuRePolicy(BasePolicy):
         """Draw observations from their latents, by the head or else by the intrinsic reward.
 
         :param observations: As stored, [B, *shape]
-        :return: What was to be drawn, and what was drawn (of dictionaries, the images by key); None if neither draws
+        :return: Targets and reconstructions (for dictionaries, images by key); None if neither of them reconstructs
         """
         observations = self.sense(observations)
         latents = self.encode(observations)

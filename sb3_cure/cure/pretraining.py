@@ -30,7 +30,7 @@ class Pretraining(CuRe):
     def __init__(self, *args: Any, **kwargs: Any):
         #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
         self._before_pretraining: dict[str, Any] | None = None
-        #: Whether ``learn`` comes right after ``pretrain``, and begins as without it
+        #: Whether the next ``learn`` follows a pretraining, and begins with the random streams that it has without one
         self._is_pretrained = False
         #: Whether encoder and head are kept as they are
         self.representation_frozen = False
@@ -68,7 +68,8 @@ class Pretraining(CuRe):
     def fit_representation(self: Self, updates: int, log_interval: int = 1000) -> Self:
         """Train the representation alone, on what the replay buffer holds: ``pretrain`` without collecting.
 
-        Keeps what ``pretrain`` keeps, and the replay buffer as well; of a model that was trained before, all of it.
+        Keeps what ``pretrain`` keeps, and the replay buffer as well. A model that was trained before keeps everything
+        else, too, and continues its training where it was.
 
         :param updates: Updates of encoder and head
         :param log_interval: Updates between two dumps of the logger
@@ -96,11 +97,11 @@ class Pretraining(CuRe):
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
         """Begin with encoder, head and, where both models have one, the curious agent of a model of a sibling task.
 
-        Observations may be augmented otherwise than there: to act, either model sees the centred view.
+        The models may have different augmentations: both act on centred views.
 
-        :param path: A model's archive, of which nothing is executed
-        :param freeze: Whether encoder and head then stay as they are, with all their statistics, also when the model is
-            saved and loaded. The target encoder becomes the encoder
+        :param path: A model's archive; no code in it is run
+        :param freeze: Whether encoder and head stay as they are from then on, with all their statistics, also when the
+            model is saved and loaded. The target encoder becomes a copy of the encoder
         :return: self
         :raises ArchiveError: if the file is damaged or pickled
         :raises ValueError: if networks of the two models differ in their shapes, or would mean something else: other
@@ -157,9 +158,9 @@ class Pretraining(CuRe):
         """Train the representation alone: a ``learn`` with ``task=False``, after which the settings are as before.
 
         Keeps encoder, target encoder, head and their optimisers (and the curious agent, if curiosity is on), empties
-        the replay buffer and starts counting anew. Of a model with a seed the ``learn`` that follows begins with the
-        environments and random numbers that it would begin with without pretraining, so that both have the same random
-        warm-up. So pretraining with ``"random"`` begins with the same actions as that warm-up.
+        the replay buffer and starts counting anew. If the model has a seed, the ``learn`` that follows begins with the
+        same seeds of environments and random numbers as without pretraining, so that both have the same random warm-up.
+        Pretraining with ``"random"`` therefore begins with the same actions as that warm-up.
 
         :param total_timesteps: Agent steps
         :param collector: Who collects: ``"curious"``, a policy trained by the intrinsic reward alone (built for the

@@ -24,9 +24,9 @@ class FrameStackReplayBuffer(ReplayBuffer):
     """SB3's ``ReplayBuffer`` and ``DictReplayBuffer`` in about a sixth of their memory for three stacked frames.
 
     Consecutive observations share all their frames but one, and so do an observation and its successor. The buffer
-    keeps each frame of an image once, in a ring of frames per image, and per transition the slots of its frames there;
-    stacks are rebuilt when they are sampled. Whatever is no image is kept as SB3 does. With equal seeds and an equal
-    stream it returns the same batches as SB3's buffers, bit for bit.
+    keeps each frame once, in one ring for each image, and for each transition the slots of its frames in the ring;
+    stacks are rebuilt when they are sampled. Everything else is stored as in SB3. With equal seeds and an equal stream
+    it returns the same batches as SB3's buffers, bit for bit.
 
     Nothing is assumed about the stream: where an observation does not continue the stored one (after a reset, another
     ``learn()`` or ``set_env``), its frames are stored anew. A ring has room for 4 % more frames than transitions,
@@ -41,8 +41,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
     :param optimize_memory_usage: Ignored: frames are kept once in any case
     :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
         as an infinite horizon task
-    :param frame_stack: Frames per observation, which channels do not show: by key (1 for other images), or one number
-        for all (in dictionaries 1 where it does not divide the channels)
+    :param frame_stack: Frames per observation, which the number of channels does not tell: by key (1 for images
+        that are not named), or one number for all (in dictionaries 1 for images whose channels it does not divide)
     :param info_shapes: What to keep of each step's ``info``, for rewards and heads of your own: shapes by key, such as
         ``{"contacts": (4,)}``; ``rows["infos/contacts"]`` has it as float32
     :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
@@ -50,11 +50,11 @@ class FrameStackReplayBuffer(ReplayBuffer):
         first ``add`` reserves the room on the disk (``OSError`` if there is too little)
     """
 
-    #: Row arrays by name, [buffer_size, n_envs, ...] each; also ``slots/<key>`` of images, of everything else
-    #: ``observations/<key>`` and ``next_observations/<key>`` (the key of a single observation is ``""``), and
-    #: ``infos/<key>``
+    #: Row arrays by name, [buffer_size, n_envs, ...] each. Images have ``slots/<key>``, everything else has
+    #: ``observations/<key>`` and ``next_observations/<key>`` (the key of a single observation is ``""``), and kept
+    #: infos have ``infos/<key>``
     rows: dict[str, ndarray]
-    #: Of these: whether a row's observation is not the successor in the row before, bool [buffer_size, n_envs]
+    #: ``rows["starts"]``: whether a row's observation does not continue the row before, bool [buffer_size, n_envs]
     starts: ndarray
     #: Rings of frames by the key of their image
     rings: dict[str, FrameRing]

@@ -10,8 +10,8 @@ import numpy as np
 import torch as th
 from numpy import ndarray
 
-#: Share of frames beyond one per transition: an episode has one frame more than steps. With everything else that a row
-#: holds, images of 84x84 stay below 1.05 frames per transition.
+#: Share of frames beyond one per transition: an episode has one frame more than steps. With all else that a row holds,
+#: a transition of 84x84 images takes the memory of less than 1.05 frames.
 SPARE_FRAMES = 0.04
 
 #: Size of the pieces in which frames are written to files and read, unless a frame is larger

@@ -45,7 +45,7 @@ def check_images(observations: Any, space: spaces.Space) -> None:
 
 
 def by_key(value: Any) -> dict[str, Any]:
-    """Name the parts of an observation, or of what there is for each of them.
+    """Return an observation, or anything that is kept for each of its parts, as a dictionary by key.
 
     :param value: Anything, or a dictionary
     :return: The dictionary; anything else has the key ``""``, as in ``image_spaces``

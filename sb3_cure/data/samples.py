@@ -24,8 +24,8 @@ class Samples(NamedTuple):
     """A batch of B transitions, as heads, intrinsic rewards and critics get it.
 
     The first fields are those of SB3's ``ReplayBufferSamples``. Observations are as stored: images uint8 in 0-255,
-    channels first; vectors float32; dictionaries of both by key (those without images are one vector here). Images lie
-    in NHWC memory order, of which ``flatten`` and ``reshape`` make vectors, but ``view`` cannot.
+    channels first; vectors float32; dictionaries of both by key (those without images are one vector here). Images are
+    in NHWC memory order: turn them into vectors by ``flatten`` or ``reshape``, as ``view`` fails.
 
     :param observations: What the agent saw, [B, *shape]
     :param actions: What it did, scaled to [-1, 1], float32 [B, action_dim]
@@ -48,7 +48,7 @@ class Samples(NamedTuple):
     n_step: NStep | None = None
 
     def of(self, key: str) -> "Samples":
-        """The batch as an agent sees it that has this image alone.
+        """Return the batch as seen by an agent whose only observation is this image.
 
         :param key: Key of an image in dictionaries of observations
         :return: The batch with the observations of that image, without ``n_step``

@@ -1,8 +1,8 @@
 """What is seen behind a robot in place of sky and floor: distractors, which say nothing about the task.
 
 As in the benchmarks of Zhang et al. (2018), "Natural Environment Benchmarks for Reinforcement Learning", and Stone et
-al. (2021), "The Distracting Control Suite". Where the robot is MuJoCo's own segmentation says, so that all tasks and
-cameras are alike; it is rendered along with each frame.
+al. (2021), "The Distracting Control Suite". MuJoCo's own segmentation, rendered along with each frame, shows where the
+robot is, so that all tasks and cameras are treated alike.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ _GEOM = 5
 
 
 class Background:
-    """Replaces the sky and the ground of the world, such as floor, walls and hills, with the shadows on it.
+    """Replaces the sky and the ground of the world (floor, walls and hills), including the shadows on the ground.
 
     :param source: ``"noise"``: random pixels, new ones in each frame; or a folder of images, one of which is drawn for
         each episode, cut to a square
@@ -82,8 +82,8 @@ class Background:
         """Put this background behind the robot.
 
         :param frame: uint8 [size, size, 3]
-        :param mask: Of the same state
-        :return: The frame before this background
+        :param mask: Result of ``mask`` for the same state
+        :return: The frame, with this background where the mask is true
         """
         image = self._image if self._images is not None else self.rng.integers(0, 256, frame.shape, dtype=np.uint8)
         return np.where(mask[..., None], image, frame)

@@ -1,4 +1,4 @@
-"""Visits of cells of the true state, in the info and as a reward; and the task's reward below other ones."""
+"""Wrappers that report or reward visits to cells of the true state, and one that reports the task's reward."""
 
 from collections.abc import Mapping
 from typing import Any

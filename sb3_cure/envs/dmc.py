@@ -245,7 +245,7 @@ def _make_shimmy_env(domain: str, task: str, seed: int | None, **kwargs: Any) ->
     )
     base: Any = env.unwrapped
     base.np_random = np.random.RandomState(seed)
-    # What nobody sees would be computed in every environment step: a tenth of cartpole's time in 36 px.
+    # Its own observations, which nobody sees, would be computed in every step: a tenth of cartpole's time at 36 px.
     base.task.get_observation = _no_observation
     base.observation_space = spaces.Dict()
     # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.

@@ -100,9 +100,9 @@ def physics_state(env: gym.Env) -> np.ndarray:
 class Proprioception:
     """What a robot of the DeepMind Control suite can sense of itself: positions and velocities of its own joints.
 
-    Neither of objects and targets nor of the robot's place in the world, which no encoder in a joint measures: left out
-    are the joints of other bodies (balls, pegs, boxes, the spinner of finger) and those with which a robot floats
-    (free joints, ``rootx``, ``rooty``, ``rootz``). Slides are in metres, hinges in radians, or as cosine and sine where
+    Encoders in its joints measure neither objects and targets nor the robot's place in the world: the joints of other
+    bodies (balls, pegs, boxes, the spinner of finger) and those with which a robot floats (free joints, ``rootx``,
+    ``rooty``, ``rootz``) are left out. Slides are in metres, hinges in radians, or as cosine and sine where
     they turn all around; velocities are in metres or radians per second.
 
     :param env: As of ``physics_state_names``

@@ -96,7 +96,7 @@ def try_rendering() -> dict[str, Any]:
 
     :return: Its result, or ``error``: a sentence
     """
-    # Modules are found where they are found here: the working directory, with a random.py perhaps, must not come first.
+    # Search modules in the same folders as here: the working directory, perhaps with a random.py, must not come first.
     folders = list(map(str, sys.path))  # notebooks add a Path
     program = f"import sys; sys.path[:] = {folders!r}; from sb3_cure.envs import render_check; render_check.main()"
     command = [sys.executable, "-P", "-c", program]

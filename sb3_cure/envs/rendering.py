@@ -29,7 +29,7 @@ def is_headless() -> bool:
 
 
 def _glfw_has_a_display() -> bool:
-    """Whether GLFW can open the display that is named: not that of an ``ssh -X`` that has ended, or of another node."""
+    """Whether GLFW can open the named display, which may be that of an ended ``ssh -X`` or of another node."""
     if is_headless():
         return False
     try:
@@ -42,11 +42,11 @@ def _glfw_has_a_display() -> bool:
 
 
 def choose_backend() -> None:
-    """Let MuJoCo, which reads it when imported, render by EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
+    """Set ``MUJOCO_GL=egl``, which MuJoCo reads when imported, if it is not set and GLFW finds no display.
 
     Mesa's software renderer gets no extra threads, unless ``LP_NUM_THREADS`` is set.
     """
-    # It starts a thread per core for each environment, which small images only slow down.
+    # Mesa would start a thread per core for each environment, which only slows small images down.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     if not os.environ.get("MUJOCO_GL") and not _glfw_has_a_display():
         os.environ["MUJOCO_GL"] = "egl"
@@ -55,7 +55,7 @@ def choose_backend() -> None:
 def load_gl() -> None:
     """Load the OpenGL backend of dm_control: EGL if ``MUJOCO_GL`` is not set and GLFW finds no display.
 
-    Mesa's software renderer gets no extra threads, as by ``choose_backend``, and SDL's windows to do without
+    Mesa's software renderer gets no extra threads, as in ``choose_backend``, and SDL's windows do without
     OpenGL, unless ``SDL_FRAMEBUFFER_ACCELERATION`` is set. No rendering context is made, so a process that has only
     called this can still be forked.
 

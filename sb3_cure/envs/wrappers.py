@@ -18,8 +18,8 @@ from sb3_cure.envs.spaces_check import check_observation_space
 
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
-#: How many rows and columns of a fast frame make one of the image: drawing more pixels and averaging them smooths edges
-#: as multisampling does, which takes software renderers several times as long
+#: Rows and columns of a fast frame that are averaged to one of the image. This smooths edges as multisampling does,
+#: which takes software renderers several times as long
 OVERSAMPLING = 2
 
 
@@ -68,7 +68,7 @@ def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def draw_fast(env: gym.Env, image_size: int) -> None:
-    """Let an environment draw frames of little more than what is observed, without shadows and reflections.
+    """Let an environment draw frames of ``OVERSAMPLING`` times the observed size, without shadows and reflections.
 
     :param env: A MuJoCo environment of Gymnasium or Gymnasium-Robotics that has not rendered yet
     :param image_size: Height and width of the observation in pixels
@@ -90,9 +90,9 @@ def draw_fast(env: gym.Env, image_size: int) -> None:
 class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Takes float32 actions in [-1, 1], clips them to that range and scales them to the bounds of the environment.
 
-    Actions without bounds are clipped and not scaled; with one bound, they are what lies within 2 of it. Unlike
-    :class:`gymnasium.wrappers.RescaleAction`, this accepts them, does not take the float64 of the environment's space
-    for its own, and clips. What the environment gets is of its space: of its dtype and within its bounds.
+    Actions without bounds are clipped and not scaled; with one bound, [-1, 1] is scaled to the range within 2 of it.
+    Unlike :class:`gymnasium.wrappers.RescaleAction`, this accepts missing bounds, always takes float32, and clips. The
+    environment gets actions of its space: in its dtype and within its bounds.
 
     :param env: An environment whose actions are floats in a ``Box``
     """
@@ -268,8 +268,8 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     :param env: An environment whose observations are arrays, such as images, or dictionaries with images
     :param frame_stack: Number of observations in a stack
-    :param padding: What stands before the first one of an episode: ``"first"``, itself, or ``"zeros"``, as in SB3's
-        ``VecFrameStack`` (which stacks the vectors of dictionaries, too)
+    :param padding: What fills the stack before an episode's first observation: ``"first"``, that observation, or
+        ``"zeros"``, as in SB3's ``VecFrameStack`` (which stacks the vectors of dictionaries, too)
     :raises ValueError: If ``frame_stack`` is not an integer of at least 1, or gives images more channels than rows, or
         for another ``padding``
     """

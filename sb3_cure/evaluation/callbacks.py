@@ -85,7 +85,7 @@ class PeriodicCallback(BaseCallback):
         return True
 
     def on_period(self) -> None:
-        """Do it; ``self.model``, ``self.num_timesteps`` and ``self.logger`` are there, as in any callback."""
+        """Do the work; ``self.model``, ``self.num_timesteps`` and ``self.logger`` are there, as in any callback."""
         raise NotImplementedError(f"{type(self).__name__} must implement on_period()")
 
     def _path(self, folder: Path, name: str) -> Path:
@@ -263,7 +263,7 @@ class ReconstructionCallback(PeriodicCallback):
 
     :param folder: Where to write
     :param every: Agent steps between two rows
-    :param columns: How many observations of the replay buffer to draw, spread over their time in the first row
+    :param columns: Number of observations to draw, spread evenly over the replay buffer at the time of the first row
     :param decoder_updates: Updates of the decoder; 0: no picture for heads that do not reconstruct
     :param verbose: 1 prints the file's name
     :param title: Added to the picture's title, such as the names of task and method
@@ -390,7 +390,7 @@ class CuriosityMapCallback(RolloutCallback):
     :param bins: Bins along each axis
     :param kwargs: ``actors``, ``n_episodes``, ``deterministic``, ``seed``, ``verbose`` of ``RolloutCallback``;
         verbose=1 prints the name of each map
-    :raises ValueError: if a name is unknown, or the environment's state is
+    :raises ValueError: if the name of a coordinate or the environment's state is unknown
     :raises ImportError: if matplotlib is not installed
     """
 
@@ -514,7 +514,7 @@ class DiagnosticsCallback(PeriodicCallback):
         return super()._on_step()
 
     def on_period(self) -> None:
-        """Look, log and warn; after a problem nothing is looked at that it may explain."""
+        """Check, log and warn; stop after a problem, as it may explain those that follow."""
         for name, value, problem in filter(None, diagnostics.look(self.model, self._reward_std)):
             self.logger.record(f"diagnostics/{name}", float(value))
             if self.verbose >= 1:

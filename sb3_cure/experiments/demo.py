@@ -58,8 +58,8 @@ SETTINGS: dict[str, Any] = recipe("fast/best", ID) | dict(
     intrinsic_kwargs=dict(n_filters=8, n_layers=2),  # a fifth of an update less than with four layers
     curious_interval=4,  # the task's agent gets most of the time
     curiosity_encoder_grad=False,  # in so few updates the curious critic's gradient slows the task down
-    # Curious by episodes: among single curious steps the task's agent hardly sees a pole that stays up. Ever fewer, in
-    # the first half alone: then all that is collected is the task's.
+    # Whole curious episodes: with single curious steps in between, the task's agent hardly sees a pole that stays up.
+    # Their share falls to 0 in the first half; after that, the task's agent collects everything.
     curiosity_prob=LinearSchedule(0.2, 0, 0.5),
     curiosity_bout="episode",
     learning_rate=LateFall(1e-3, 2e-5),

@@ -118,7 +118,7 @@ class Method(_Part):
     :param algo: A key of ``ALGORITHMS``
     :param pretrain: The phase before training, if any
     :param train: Whether the task is learned at all
-    :param baseline: Another method, from which its difference is taken instead of from the grid's baseline
+    :param baseline: Method to compare it with, instead of the grid's baseline
     """
 
     config: str
@@ -411,7 +411,7 @@ def _validation_message(error: Any) -> str:
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
-    """Change the budget; that of pretraining, and when cells are counted, in proportion."""
+    """Change the budget; pretraining's budget and the steps at which cells are counted change in proportion."""
     if file.budget == 0:
         raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
     for method in file.methods.values():
@@ -466,7 +466,7 @@ def _merged(mapping: Any, overrides: Any) -> Any:
 
 
 def _check_pixels(arms: Sequence[Cell], path: Path) -> None:
-    """Refuse arms that see other pixels than those by which common heads judge them."""
+    """Refuse arms of a task with different ``env_kwargs``: common heads judge all of them on the same pixels."""
     first: dict[str, dict[str, Any]] = {}
     for cell in arms:
         if first.setdefault(cell.task, cell.env_kwargs) != cell.env_kwargs:
@@ -486,7 +486,8 @@ def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> s
 def check_arms(cells: Iterable[Cell]) -> None:
     """Build the model of each arm on each task once, before the first of them is trained.
 
-    On the CPU, as the cells may run on another machine, and with the smallest replay buffer, which may fill the memory.
+    On the CPU, as the cells may run on another machine, and with the smallest replay buffer, as theirs may fill the
+    memory.
 
     :param cells: Cells that are to be run
     :raises UsageError: for the first that cannot be built

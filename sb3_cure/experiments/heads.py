@@ -51,7 +51,7 @@ class CommonHeads:
         return Path(self.grid.experiment, short_name(self.task), "common_heads")
 
     def seeds(self, results: Path) -> dict[int, list[Cell]]:
-        """All arms by seed, of the seeds of which all arms are finished and have kept their model.
+        """All arms by seed, for the seeds whose arms are all finished and have kept their models.
 
         :param results: Folder of all results
         :return: Cells by seed
@@ -67,7 +67,7 @@ class CommonHeads:
         return {seed: cells for seed, cells in arms.items() if all(map(is_ready, cells))}
 
     def fingerprint(self, results: Path) -> dict[str, Any]:
-        """Content of their record: with further seeds, or a cell run again, it differs, and they are fitted anew."""
+        """Content of their record; it changes with further seeds or a cell run again, and they are fitted anew then."""
         finished = {
             str(cell.folder): read_json(results / cell.folder / "run.json")["finished"]
             for cells in self.seeds(results).values()
@@ -133,7 +133,7 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
 
 
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
-    """The episodes of ``measure_visits`` again by policy, without the known policies."""
+    """Roll out the episodes of ``measure_visits`` again, by policy; policies in ``known`` are left out."""
     path = results / cell.folder / "model.zip"
     model = ALGORITHMS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
     with contextlib.closing(cell.make_eval_env()) as env:

@@ -36,7 +36,7 @@ def reconstruction_callbacks(cell: Cell, action_repeat: int, folder: Path) -> li
     :param cell: A cell that is about to be trained
     :param action_repeat: Environment steps per agent step
     :param folder: Where to write ``reconstructions.png``, one row per time
-    :return: The callbacks; none without an SRL head, and of dictionaries
+    :return: The callbacks; none without an SRL head, or for other policies than ``"CnnPolicy"``
     """
     if cell.arguments["policy"] != "CnnPolicy" or cell.arguments.get("srl", "rae") is None:
         return []

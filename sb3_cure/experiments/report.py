@@ -53,7 +53,7 @@ _CURVES = (
         _ERROR("curious", "higher: represented worse"),
     ),
 )
-#: Evaluations with something to see, below which a table says it better than lines
+#: Least number of visible evaluations for which lines are drawn; a table shows fewer
 LEAST_POINTS = 4
 
 

@@ -14,7 +14,7 @@ COLUMNS = ("rewards_met", "rewards_met_task", "rewards_met_curious", "rewards_me
 
 
 class RewardsMet(BaseCallback):
-    """Sum the task's rewards of all transitions that training collects, also below an oracle's.
+    """Sum the task's rewards of all transitions that training collects, also where an oracle's reward replaces them.
 
     The sums are plain attributes, which checkpoints keep.
     """

@@ -140,7 +140,7 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
 
 
 def _run_on_worker(run_unit: RunUnit, has_gpu: bool, unit: Unit, results: Path) -> bool:
-    """Run a unit in a process of Ray, which does not hide the GPUs from a task that needs none."""
+    """Run a unit in a Ray worker, and hide the GPUs from it if it needs none, which Ray does not do."""
     if not has_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
     return run_unit(unit, results)

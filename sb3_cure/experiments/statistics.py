@@ -76,8 +76,8 @@ def summarise_arm(experiment: Experiment, task: str, method: str) -> pd.DataFram
     :param task: Short name of the task
     :param method: Name of the arm
     :return: By seed: ``area`` under the curve, return of the ``final`` evaluation, mean return of the ``last`` three
-        (not of the first one, before training), and of the first one ``start_return`` and ``start_error``, the SRL
-        error (nan: not measured)
+        evaluations (without the first one, which is before training), and return (``start_return``) and SRL error
+        (``start_error``; nan: not measured) of the first one
     """
     rows = {}
     for seed, cell in experiment.done(task, method).items():

@@ -13,7 +13,7 @@ from sb3_cure.experiments.statistics import Estimate, paired_ratio
 
 #: Heads by which policies are compared; others are yardsticks
 HEADS = ("own", "common")
-#: Of the range of the random policy, or of the whole circle, along each of two coordinates
+#: Number of cells along each of two coordinates, over the range of the random policy or the whole circle
 GRID_INTERVALS = 10
 _ACTORS = ("random", "task", "curious")
 #: Arm, actor and seed
@@ -28,9 +28,10 @@ class Measured:
     :param method: Name of the arm
     :param actor: ``"random"``, ``"task"`` or ``"curious"``
     :param values: [seeds]
-    :param ratio: Over the random policy's of the same cell (geometric mean over seeds, t interval of the logarithms);
-        nan for the random policy
-    :param task_ratio: Over that of the baseline's task policy of the same seed; nan for both of these
+    :param ratio: Ratio to the random policy's of the same cell (geometric mean over seeds, t interval of the
+        logarithms); nan for the random policy
+    :param task_ratio: Ratio to that of the baseline's task policy of the same seed; nan for this policy and for the
+        random one
     """
 
     task: str
@@ -153,7 +154,7 @@ def occupied_cells(states: np.ndarray, low: np.ndarray, width: np.ndarray) -> li
     :param states: True states, [n, d]
     :param low: Lower edge of a cell, [d]; the grid has no end on any side
     :param width: Width of the cells, > 0, [d]
-    :return: Of each pair of coordinates (with one coordinate: of it)
+    :return: Number of occupied cells for each pair of coordinates (or for the only coordinate)
     """
     places = np.floor((states - low) / width).astype(np.int64)
     places -= places.min(axis=0)

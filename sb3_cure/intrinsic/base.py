@@ -201,9 +201,9 @@ class RewardScale(nn.Module):
         :param reward: Raw reward of each sample, [B]
         :param beta: Factor of the reward, beta in the paper
         :param normalize: Whether to standardise; False is the paper's formula
-        :param center: Whether to subtract the mean when standardising. Not for a bonus added to a task's reward, which
-            would make long episodes neither better nor worse: it is divided by its root mean square, as in units of
-            its deviation an error that varies little would be clipped to a constant
+        :param center: Whether to subtract the mean when standardising. False for a bonus added to a task's reward: with
+            mean zero it would make long episodes neither better nor worse. It is then divided by its root mean square:
+            divided by its deviation, an error that varies little would be clipped to a constant
         :return: Scaled reward, [B, 1]
         """
         if normalize:
@@ -212,6 +212,6 @@ class RewardScale(nn.Module):
             reward = reward - reward.mean() if center else reward
             move_average(self.variance, self.weight, th.maximum(reward.square().mean(), least), self.decay)
             deviation = (self.variance / self.weight).sqrt() + 1e-8
-            # Infinite rewards become NaN, which the check of losses finds, and not the clip's largest.
+            # `0 * reward` turns infinite rewards into NaN, which the check of losses finds, instead of clipping them.
             reward = (reward / deviation).clamp(-self.clip, self.clip) + 0 * reward
         return beta * reward.unsqueeze(1)

@@ -14,7 +14,7 @@ from sb3_cure.networks.layers import EnsembleLinear
 class Disagreement(IntrinsicReward):
     """Variance over the members of an ensemble, which predict the next latents (Pathak et al., 2019, eq. 1).
 
-    Of noise that nobody can predict all members predict the mean, so they agree in the end. The members begin
+    For noise that cannot be predicted all members predict the mean, so they agree in the end. The members begin
     differently, and each learns from a random part of all transitions, chosen by a hash of their places in the replay
     buffer. (If a replay buffer of your own has no ``last_sampled``: from a random part of each batch.)
 

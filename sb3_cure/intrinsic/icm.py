@@ -13,8 +13,8 @@ from sb3_cure.intrinsic.reward_networks import MLP, make_network, scaled
 class ICM(IntrinsicReward):
     """Error of a forward model in features that an inverse model trains (Pathak et al., 2017, eq. 2 to 6).
 
-    The forward model's own loss does not reach the features, which would make them easy to predict by making them
-    constant (Burda et al., 2019, section 2.1).
+    The forward model's own loss does not reach the features: it would make them constant, hence easy to predict (Burda
+    et al., 2019, section 2.1).
 
     :param args: As of ``IntrinsicReward``
     :param encoder: ``"shared"``: the features are the agent's latents, and the inverse model trains their encoder, too;

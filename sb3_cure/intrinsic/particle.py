@@ -49,8 +49,8 @@ class Particle(IntrinsicReward):
         # The memory, [memory, 2]: number of the row among all that were ever added (-1: none), and environment
         self.places = np.full((memory, 2), -1)
         self.cursor = 0
-        # Episode of each stored transition, another number for each environment, [buffer_size, n_envs]; how many rows
-        # had been added when they were numbered, and the starts of their buffer: held, as a later one may have its id
+        # Number of each stored transition's episode, unique among environments, [buffer_size, n_envs]; how many rows
+        # had been added when they were numbered; and their buffer's `starts`: the array, as a later one may have its id
         self._episodes: ndarray | None = None
         self._n_numbered = 0
         self._starts: ndarray | None = None

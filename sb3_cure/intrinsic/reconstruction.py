@@ -14,8 +14,8 @@ from sb3_cure.networks.layers import RunningStandardize, small_mlp
 class Reconstruction(IntrinsicReward):
     """Squared error of a decoder, trained on detached latents, of where the step leads; vectors are standardised.
 
-    The SRL error of an autoencoder without its head: the encoder may learn by contrast, whose own error falls with
-    novelty, and pictures show what its latents hold.
+    This is an autoencoder's error for an encoder with another head, such as a contrastive one, whose own error falls
+    with novelty. The decoder's pictures show what the latents hold.
 
     :param args: As of ``IntrinsicReward``
     :param n_filters: Channels of the decoder's hidden layers (images)

@@ -10,8 +10,8 @@ from sb3_cure.intrinsic.rnd import RND
 from sb3_cure.intrinsic.srl_error import SRLError
 from sb3_cure.srl import SRLHead
 
-#: Reward of ``"auto"`` where the head's error does not tell novelty: of those that explored as far as the error of an
-#: autoencoder (results/curiosity.md) the cheapest
+#: Reward of ``"auto"`` where the head's error does not tell novelty: it explored as far as the error of an autoencoder
+#: (results/curiosity.md), needs no head that draws, and costs little
 AUTO_WITHOUT_NOVELTY = "rnd"
 
 INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {

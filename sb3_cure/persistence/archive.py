@@ -1,7 +1,8 @@
 """Models as a ``.zip`` of JSON and safetensors, which can be loaded from strangers.
 
-``data`` is the JSON of the settings, in which the tensors of ``tensors.safetensors`` are named. What is no data (a
-function, a user's class) is there as a placeholder that names it, and ``load`` needs it in ``custom_objects``.
+``data`` holds settings and states as JSON, which refers to the tensors in ``tensors.safetensors`` by name. An object
+that is no data (a function, a user's class) is replaced by a placeholder with its name, and ``load`` needs it in
+``custom_objects``.
 """
 
 import json

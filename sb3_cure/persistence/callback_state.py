@@ -101,7 +101,7 @@ def _callbacks_in(value: Any) -> list[BaseCallback]:
 
 
 def _content(value: Any) -> bytes | None:
-    """Digest of a value in a file; None if files do not hold its type, or so much, or what holds itself."""
+    """Digest of a value in a file; None if its type cannot be written, it is too large, or it contains itself."""
     try:
         write_state(file := io.BytesIO(), {"value": value})
     except (TypeError, OSError, RecursionError):

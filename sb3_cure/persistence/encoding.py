@@ -1,8 +1,8 @@
 """Values as JSON, with the arrays and tensors in them set apart, and files of both without pickle.
 
-JSON stands for itself; what it cannot express is an object with one key, which begins with ``!`` and names the type.
-Reading runs no code of a file and imports nothing that it names: tensors are read by safetensors, objects are those of
-``_KINDS``, classes those of ``NAMED`` and the policies that a model registers.
+What JSON can express stays as it is; any other value is an object with one key, which begins with ``!`` and names the
+type. Reading runs no code of a file and imports nothing that it names: tensors are read by safetensors, objects are
+those of ``_KINDS``, classes those of ``NAMED`` and the policies that a model registers.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ from sb3_cure.intrinsic import INTRINSIC_REWARDS
 from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
-#: Of the format of what is written
+#: Version of the file format
 VERSION = 5
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
@@ -48,9 +48,9 @@ _DTYPES = {
 
 
 class ArchiveError(ValueError):
-    """A file is not what it should be, in one sentence.
+    """A file cannot be read, or does not fit; the message is one sentence.
 
-    :param sentence: It may quote the file, whose control characters are left out
+    :param sentence: The message; it may quote the file, so control characters are left out
     """
 
     def __init__(self, sentence: str):

@@ -269,7 +269,7 @@ def _keeps_nothing(value: Any) -> bool:
     """Whether a value is a class, or a function without an object or a closure that could hold state."""
     if not inspect.isroutine(value):
         return inspect.isclass(value)
-    # Those that known layers make themselves hold their constructor's arguments alone.
+    # Functions that known layers make themselves hold nothing but constructor arguments.
     is_known = (getattr(value, "__module__", None) or "").startswith(_KNOWN)
     holder = getattr(value, "__closure__", None) or getattr(value, "__self__", None)
     return is_known or holder is None or inspect.ismodule(holder)

@@ -18,9 +18,9 @@ PathOrFile: TypeAlias = str | Path | io.BufferedIOBase
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Write a file next to another, which it replaces at once when all of it is on the disk.
+    """Write a file under another name, and rename it to replace the old one when all of it is on the disk.
 
-    Killed, out of disk space or with an exception in between, the old file stays as it was.
+    After a kill, a full disk or an exception in between, the old file is as it was.
 
     :param path: File to write or to replace, in a folder that exists
     :return: Name to write under meanwhile, in the same folder
@@ -57,7 +57,7 @@ def locked(folder: Path, seconds: float) -> Iterator[None]:
     :param seconds: How long to wait for another process that holds it; -1: for ever
     :raises filelock.Timeout: (an ``OSError``) if it holds it still
     """
-    # Not as a file that a kill would leave behind, where the file system has no locks
+    # Where the file system has no locks, do not fall back to a lock file, which a kill would leave behind
     lock = filelock.FileLock(folder / ".lock", fallback_to_soft=False)
     try:
         lock.acquire(timeout=seconds)

@@ -1,4 +1,4 @@
-"""Folder of checkpoints, of which a kill, a full disk or a damaged file costs the last one at most.
+"""Folder of checkpoints: a kill, a full disk or a damaged file costs the last one at most.
 
 Layout::
 

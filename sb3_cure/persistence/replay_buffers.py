@@ -1,7 +1,7 @@
-"""Replay buffers in files without pickle, of which the used part is written and read without a copy in memory.
+"""Save and load replay buffers without pickle: the used part alone, and without a copy in memory.
 
-These are the ``FrameStackReplayBuffer`` of all models of this package, which any algorithm of SB3 can use; all others
-are SB3's pickles.
+This holds for ``FrameStackReplayBuffer``, which all models of this package have and any algorithm of SB3 can use; all
+other replay buffers are pickled, as in SB3.
 """
 
 from pathlib import Path

@@ -64,7 +64,7 @@ def random_state(model: OffPolicyAlgorithm) -> dict[str, Any]:
 
 
 def load_random_state(model: OffPolicyAlgorithm, state: dict[str, Any]) -> None:
-    """Set these generators.
+    """Set the generators of ``random_state``.
 
     :param model: Model
     :param state: Result of ``random_state``

@@ -17,8 +17,9 @@ class VAE(RAE):
 
     The posterior is N(z, diag(sigma(z)^2)): its mean is the encoder's latents, which actors and critics read without
     noise, and sigma is a linear map of them that the head owns. Loss: mean squared error per pixel + ``beta`` KL. The
-    mean's share of the KL is the latent penalty of ``RAE``, and ``beta`` has its default; the beta that makes it the
-    evidence bound of n pixels of deviation s is 2 s^2 / n. The noise comes from torch's stream, as ``RAE``'s dither.
+    mean's share of the KL is the latent penalty of ``RAE``, and ``beta`` has its default. With ``beta`` = 2 s^2 / n the
+    loss is the evidence bound for n pixels with noise of deviation s. The posterior's noise comes from torch's stream,
+    as ``RAE``'s dither.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images, or anything that SB3 can flatten

@@ -256,9 +256,9 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     - ``terminal_observation``: the last good observation, and ``TimeLimit.truncated``: the task did not end;
     - no ``episode``: a ``Monitor`` in the worker forgets the episode.
 
-    ``CuReSAC`` stores nothing of such a step. SB3's own off-policy algorithms store one transition that stands still.
-    Frozen frames always raise, since transitions before the error are wrong, too; and so does a worker that is lost
-    between two steps, when an attribute or a method is read.
+    ``CuReSAC`` stores nothing of such a step. SB3's own off-policy algorithms store one transition from the last
+    observation to itself. Frozen frames always raise, since transitions before the error are wrong, too; and so does a
+    worker that is lost between two steps, when an attribute or a method is read.
 
     :param env_fns: Functions that make the environments
     :param timeout: Seconds that a step, or any other answer, may take
