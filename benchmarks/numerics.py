@@ -65,8 +65,8 @@ def measure(updates: int = 2000, tail: int = 200, seeds: tuple[int, ...] = tuple
     """
     th.set_num_threads(1)  # nothing is timed here, and the networks are small
     results: dict[str, Any] = {}
-    for head in METHODS:
-        arguments: dict[str, Any] = METHODS[head] | dict(env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
+    for head, method in METHODS.items():
+        arguments: dict[str, Any] = method | dict(env_kwargs=ENV, policy_kwargs=NETWORKS, warmup_updates=0)
         state = copy.deepcopy(make_model(**arguments).get_parameters())
         found = {
             arm: np.array([_train(arm, seed, state, updates, tail, **arguments) for seed in seeds]) for arm in ARMS

@@ -66,8 +66,8 @@ def pairwise() -> list[tuple[Any, ...]]:
 
 
 ONE_OF_EACH_REFUSAL = list({refusal(*cell[1:]): cell for cell in REFUSED}.values())
-TRAINED = LEGAL if os.environ.get("SB3_CURE_TEST_ALL") else pairwise()
-CELLS = PRODUCT if os.environ.get("SB3_CURE_TEST_ALL") else [*TRAINED, *ONE_OF_EACH_REFUSAL]
+TRAINED, CHECKED = (LEGAL, REFUSED) if os.environ.get("SB3_CURE_TEST_ALL") else (pairwise(), ONE_OF_EACH_REFUSAL)
+CELLS = [*TRAINED, *CHECKED]
 
 
 def make(algorithm: str, head: str | None, reward: str, sensors: str, **settings: Any) -> CuReSAC:
