@@ -30,7 +30,9 @@ class Pretraining(CuRe):
     def __init__(self, *args: Any, **kwargs: Any):
         #: ``task`` and ``curiosity`` as they were before the running pretraining; None: there is none
         self._before_pretraining: dict[str, Any] | None = None
-        #: Whether the next ``learn`` follows a pretraining, and begins with the random streams that it has without one
+        #: Whether the running pretraining leaves its transitions in the replay buffer
+        self._keeps_replay_buffer = False
+        #: Whether the next ``learn`` begins with the random streams that it has without a pretraining before it
         self._is_pretrained = False
         #: Whether encoder and head are kept as they are
         self.representation_frozen = False
@@ -154,13 +156,16 @@ class Pretraining(CuRe):
         tb_log_name: str = "pretrain",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
+        *,
+        keep_replay_buffer: bool = False,
     ) -> Self:
         """Train the representation alone: a ``learn`` with ``task=False``, after which the settings are as before.
 
         Keeps encoder, target encoder, head and their optimisers (and the curious agent, if curiosity is on), empties
         the replay buffer and starts counting anew. If the model has a seed, the ``learn`` that follows begins with the
         same seeds of environments and random numbers as without pretraining, so that both have the same random warm-up.
-        Pretraining with ``"random"`` therefore begins with the same actions as that warm-up.
+        Pretraining with ``"random"`` therefore begins with the same actions as that warm-up. Where the replay buffer is
+        kept, which would then hold these twice, random numbers go on.
 
         :param total_timesteps: Agent steps
         :param collector: Who collects: ``"curious"``, a policy trained by the intrinsic reward alone (built for the
@@ -170,12 +175,15 @@ class Pretraining(CuRe):
         :param tb_log_name: Name of the run in TensorBoard
         :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was taken
         :param progress_bar: Show a progress bar (needs tqdm and rich)
+        :param keep_replay_buffer: Let the task learn from what was collected, too: the environment's rewards are stored
+            with it
         :return: self
         :raises ValueError: if there is no SRL head, or no such collector
         """
         self._check_that_srl_learns("pretrain")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector must be 'curious' or 'random', but is {collector!r}.")
+        self._keeps_replay_buffer = keep_replay_buffer
         self._begin_pretraining(collector)
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -229,17 +237,18 @@ class Pretraining(CuRe):
         policy.default_agent = "task" if self.task or policy.curious is None else "curious"
 
     def _end_pretraining(self) -> None:
-        """End a pretraining, if there is one: forget what was collected, and count anew."""
+        """End a pretraining, if there is one: forget what was collected, unless it is kept, and count anew."""
         if self._before_pretraining is None:
             return
         self._restore_settings()
-        _empty(self.replay_buffer)  # type: ignore[arg-type]
-        if self.policy.intrinsic is not None:
-            self.policy.intrinsic.forget()
+        if not self._keeps_replay_buffer:
+            _empty(self.replay_buffer)  # type: ignore[arg-type]
+            if self.policy.intrinsic is not None:
+                self.policy.intrinsic.forget()
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
         self._warmed_up = False
         self._last_obs = None
-        self._is_pretrained = True
+        self._is_pretrained = not self._keeps_replay_buffer
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_initial_rng_state"]

@@ -44,9 +44,9 @@ _EPISODE_COLUMNS = ("environment_steps", "actor", "episode", "return")
 def run_cell(cell: Cell, results: str | Path, checkpoint_minutes: float = 10.0, pictures: bool = True) -> Path:
     """Train and measure one cell, unless that is done.
 
-    Writes ``config.json``, ``eval.csv``, ``episodes.csv``, ``run.json``, ``model.zip`` and pictures into the cell's
-    folder; ``DONE`` comes last. A cell that was interrupted continues at its last checkpoint; rows that it wrote after
-    the checkpoint are dropped, so that no row appears twice.
+    Writes ``config.json``, ``eval.csv``, ``episodes.csv``, ``run.json``, ``model.zip`` (and ``pretrained.zip``, the
+    model before the task) and pictures into the cell's folder; ``DONE`` comes last. A cell that was interrupted
+    continues at its last checkpoint; rows that it wrote after the checkpoint are dropped, so that no row appears twice.
 
     :param cell: The cell
     :param results: Folder of all results
@@ -111,9 +111,13 @@ def _run(cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool) ->
             model, pretrain = cell.make_model(env), cell.pretrain
         # The same calls in every attempt: a resumed model does what is left of them.
         if pretrain is not None:
-            clock = TimeLeft(f"{cell.folder} (pretraining)")
-            steps = record.agent_steps(pretrain.budget)
-            model.pretrain(steps, pretrain.collector, callback=[record, checkpoints, clock])
+            model.pretrain(
+                record.agent_steps(pretrain.budget),
+                pretrain.collector,
+                callback=[record, checkpoints, TimeLeft(f"{cell.folder} (pretraining)")],
+                keep_replay_buffer=cell.keep_replay_buffer,
+            )
+            model.save(folder / "pretrained.zip")
         record.evaluates = True
         if cell.budget > 0:
             clock = TimeLeft(str(cell.folder), best_return=record.best_return)

@@ -117,7 +117,9 @@ class Method(_Part):
     :param overrides: Changes of the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
     :param algo: A key of ``ALGORITHMS``
     :param pretrain: The phase before training, if any
+    :param keep_replay_buffer: Whether the task learns from what pretraining has collected, too
     :param train: Whether the task is learned at all
+    :param budget: Environment steps of training, instead of the grid's
     :param baseline: Method to compare it with, instead of the grid's baseline
     """
 
@@ -125,7 +127,9 @@ class Method(_Part):
     overrides: dict[str, Any] = {}
     algo: Literal["cure_sac", "cure_tqc"] = "cure_sac"
     pretrain: Pretraining | None = None
+    keep_replay_buffer: bool = False
     train: bool = True
+    budget: PositiveInt | None = None
     baseline: str | None = None
 
 
@@ -188,6 +192,7 @@ class Cell:
     :param env_kwargs: Arguments of ``gymnasium.make``
     :param arguments: Arguments of the algorithm but for environment and seed
     :param pretrain: The phase before training, if any
+    :param keep_replay_buffer: Whether the task learns from what pretraining has collected, too
     :param algo: A key of ``ALGORITHMS``
     :param coverage: Cells of the true state to count, if any
     :param eval_curious: ``"end"``: evaluate the curious policy in the last evaluation only
@@ -206,6 +211,7 @@ class Cell:
     env_kwargs: dict[str, Any]
     arguments: dict[str, Any]
     pretrain: Pretraining | None = None
+    keep_replay_buffer: bool = False
     algo: str = "cure_sac"
     coverage: Coverage | None = None
     eval_curious: Literal["end"] | None = None
@@ -365,7 +371,7 @@ def load_grid(
     :param seeds: Instead of the file's: a number of seeds (the first of the file's list, else from 0), or a list
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
-    :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
+    :param budget: Environment steps, instead of the file's; those of arms and of pretraining change in proportion
     :return: The grid
     :raises UsageError: with one sentence about what is wrong
     """
@@ -411,16 +417,20 @@ def _validation_message(error: Any) -> str:
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
-    """Change the budget; pretraining's budget and the steps at which cells are counted change in proportion."""
+    """Change the budget; those of arms and of pretraining, and when cells are counted, change in proportion."""
     if file.budget == 0:
         raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
+
+    def scaled(steps: int) -> int:
+        return max(round(steps * budget / file.budget), 1)
+
     for method in file.methods.values():
+        if method.budget is not None:
+            method.budget = scaled(method.budget)
         if method.pretrain is not None:
-            steps = max(round(method.pretrain.budget * budget / file.budget), 1)
-            method.pretrain = replace(method.pretrain, budget=steps)
+            method.pretrain = replace(method.pretrain, budget=scaled(method.pretrain.budget))
     if file.coverage is not None:
-        at = sorted({max(round(step * budget / file.budget), 1) for step in file.coverage.at})
-        file.coverage = replace(file.coverage, at=at)
+        file.coverage = replace(file.coverage, at=sorted(set(map(scaled, file.coverage.at))))
     file.budget = budget
 
 
@@ -445,13 +455,14 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
         task=task,
         method=name,
         seed=file.seeds[0],
-        budget=file.budget if method.train else 0,
+        budget=(method.budget or file.budget) if method.train else 0,
         eval_every=file.evaluation.every,
         eval_episodes=file.evaluation.episodes,
         n_envs=entry.pop("n_envs", 1),
         env_kwargs=entry.pop("env_kwargs", {}),
         arguments=entry,
         pretrain=method.pretrain,
+        keep_replay_buffer=method.keep_replay_buffer,
         algo=method.algo,
         coverage=file.coverage,
         eval_curious=file.evaluation.curious,

@@ -3,6 +3,7 @@
 import json
 import math
 import random
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -305,10 +306,17 @@ def power(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return counter
 
 
-@pytest.mark.parametrize("minutes", [0, 10], ids=["each step is kept", "only starts are kept"])
-def test_killed_cell_ends_like_one_that_was_not(minutes: float, tmp_path: Path, power: SimpleNamespace) -> None:
+@pytest.mark.parametrize(
+    ("minutes", "keeps"),
+    [(0, False), (0, True), (10, False)],
+    ids=["each step is kept", "and what pretraining collected", "only starts are kept"],
+)
+def test_killed_cell_ends_like_one_that_was_not(
+    minutes: float, keeps: bool, tmp_path: Path, power: SimpleNamespace
+) -> None:
     """Random numbers start anew with training, not before and not when it is resumed."""
     *_, cell = pretrained_grid(tmp_path, TASK, warm_up=20, budget=120).cells
+    cell = replace(cell, keep_replay_buffer=keeps)
 
     def outcome(folder: Path) -> Any:
         evaluations = [{**row, "seconds": 0, "cpu_seconds": 0} for row in read_rows(folder / "eval.csv")]
@@ -316,6 +324,8 @@ def test_killed_cell_ends_like_one_that_was_not(minutes: float, tmp_path: Path, 
 
     expected = outcome(run_cell(cell, tmp_path / "whole", minutes, pictures=False))
     assert power.n_steps == 30 + 20 + 30 + 20
+    assert CuReSAC.load(tmp_path / "whole" / cell.folder / "model.zip")._keeps_replay_buffer == keeps
+    assert CuReSAC.load(tmp_path / "whole" / cell.folder / "pretrained.zip").num_timesteps == 0
     # In pretraining's warm-up, among its updates, at its end; in the first evaluation, in training's updates
     for power.fails_at in (10, 26, 31, 60, 76):
         power.n_steps, folder = 0, tmp_path / f"killed-{power.fails_at}"
