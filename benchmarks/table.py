@@ -37,7 +37,7 @@ ARMS = {
     "curl": "contrastive head, random shifts",
     "drq": "random shifts, no head, returns of three steps",
     "best": "the recipe of `zoo_configs/fast/best.yml`",
-    "best_cure": "the recipe with curiosity (`curiosity: separate`, rewarded by RND)",
+    "best_cure": "the recipe with curiosity, `zoo_configs/fast/best_cure.yml`",
 }
 #: Arms that were chosen by their returns on a task; the profile that all share was chosen on the first one
 TUNED = {

@@ -42,11 +42,11 @@ EXTRAS = {
 #: What to do, by the share of random episodes that meet a reward at most
 ADVICE = {
     0.05: (
-        "Hardly any: exploration decides. Try curiosity in bouts (--conf-file fast/cure_sac_ae -params "
-        "curiosity_bout:25); it is not known to learn such tasks."
+        "Hardly any: exploration decides. Try curiosity in bouts (--conf-file fast/best_cure). On one such task it "
+        "found rewards that its control did not, and began to learn."
     ),
     0.5: (
-        "Some: try it with curiosity (fast/cure_sac_ae) and without (fast/best). On one such task curiosity met three "
+        "Some: try it with curiosity (fast/best_cure) and without (fast/best). On one such task curiosity met three "
         "times the rewards in training; returns were still zero."
     ),
     1.0: "Most: leave curiosity out (curiosity=None). It was not shown to learn faster, and its updates take longer.",
