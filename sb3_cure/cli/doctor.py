@@ -43,7 +43,7 @@ EXTRAS = {
 ADVICE = {
     0.05: (
         "Hardly any: exploration decides. Try curiosity in bouts (--conf-file fast/best_cure). On one such task it "
-        "found rewards that its control did not, and began to learn."
+        "found rewards that a control did not, and began to learn."
     ),
     0.5: (
         "Some: try it with curiosity (fast/best_cure) and without (fast/best). On one such task curiosity met three "

@@ -5,6 +5,7 @@ model of another task (the paper's outlook).
 """
 
 import functools
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -93,7 +94,8 @@ class Pretraining(CuRe):
         finally:
             self._restore_settings()
             self._n_updates, self._n_batches = counted  # training goes on where it was
-            self._is_pretrained = self._is_pretrained or self.num_timesteps == 0
+            begins = self.num_timesteps == 0 and not self._keeps_replay_buffer
+            self._is_pretrained = self._is_pretrained or begins
         return self
 
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
@@ -173,7 +175,8 @@ class Pretraining(CuRe):
         :param callback: SB3 callback(s)
         :param log_interval: Episodes between two dumps of the logger
         :param tb_log_name: Name of the run in TensorBoard
-        :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was taken
+        :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was taken, with the
+            arguments of before
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :param keep_replay_buffer: Let the task learn from what was collected, too: the environment's rewards are stored
             with it
@@ -241,7 +244,9 @@ class Pretraining(CuRe):
         if self._before_pretraining is None:
             return
         self._restore_settings()
-        if not self._keeps_replay_buffer:
+        if self._keeps_replay_buffer:
+            _end_episode(self.replay_buffer)  # type: ignore[arg-type]
+        else:
             _empty(self.replay_buffer)  # type: ignore[arg-type]
             if self.policy.intrinsic is not None:
                 self.policy.intrinsic.forget()
@@ -259,6 +264,12 @@ class Pretraining(CuRe):
         if self.seed is not None:
             self.set_random_seed(self.seed)
             th.set_rng_state(self._initial_rng_state)
+
+
+def _end_episode(buffer: ReplayBuffer) -> None:
+    if isinstance(buffer, HerReplayBuffer):  # whose episode would go on with the first one of `learn`
+        with warnings.catch_warnings(action="ignore"):
+            buffer.truncate_last_trajectory()
 
 
 def _empty(buffer: ReplayBuffer) -> None:

@@ -119,7 +119,6 @@ class Method(_Part):
     :param pretrain: The phase before training, if any
     :param keep_replay_buffer: Whether the task learns from what pretraining has collected, too
     :param train: Whether the task is learned at all
-    :param budget: Environment steps of training, instead of the grid's
     :param baseline: Method to compare it with, instead of the grid's baseline
     """
 
@@ -129,7 +128,6 @@ class Method(_Part):
     pretrain: Pretraining | None = None
     keep_replay_buffer: bool = False
     train: bool = True
-    budget: PositiveInt | None = None
     baseline: str | None = None
 
 
@@ -371,7 +369,7 @@ def load_grid(
     :param seeds: Instead of the file's: a number of seeds (the first of the file's list, else from 0), or a list
     :param tasks: Only these: ids, or ids without namespace and version
     :param methods: Only these arms
-    :param budget: Environment steps, instead of the file's; those of arms and of pretraining change in proportion
+    :param budget: Environment steps, instead of the file's; those of pretraining change in proportion (at least 1)
     :return: The grid
     :raises UsageError: with one sentence about what is wrong
     """
@@ -417,7 +415,7 @@ def _validation_message(error: Any) -> str:
 
 
 def _scale(file: GridFile, budget: int, path: Path) -> None:
-    """Change the budget; those of arms and of pretraining, and when cells are counted, change in proportion."""
+    """Change the budget; pretraining's budget and the steps at which cells are counted change in proportion."""
     if file.budget == 0:
         raise UsageError(f"budget in {path} is 0 (pretraining alone), which cannot be scaled.")
 
@@ -425,8 +423,6 @@ def _scale(file: GridFile, budget: int, path: Path) -> None:
         return max(round(steps * budget / file.budget), 1)
 
     for method in file.methods.values():
-        if method.budget is not None:
-            method.budget = scaled(method.budget)
         if method.pretrain is not None:
             method.pretrain = replace(method.pretrain, budget=scaled(method.pretrain.budget))
     if file.coverage is not None:
@@ -455,7 +451,7 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
         task=task,
         method=name,
         seed=file.seeds[0],
-        budget=(method.budget or file.budget) if method.train else 0,
+        budget=file.budget if method.train else 0,
         eval_every=file.evaluation.every,
         eval_episodes=file.evaluation.episodes,
         n_envs=entry.pop("n_envs", 1),

@@ -422,6 +422,13 @@ def test_hindsight_after_pretraining(n_steps: int) -> None:
     assert buffer.sample(200).observations["observation"].max() <= 1
 
 
+def test_hindsight_after_pretraining_that_keeps_its_transitions() -> None:
+    """The episode that pretraining broke off does not go on with the task's first one, of another goal."""
+    her: dict[str, Any] = dict(replay_buffer_class=HerReplayBuffer, buffer_size=100, learning_starts=10)
+    model: Any = tiny_model("MultiInputPolicy", Goal(), **her).pretrain(35, keep_replay_buffer=True).learn(30)
+    assert model.replay_buffer.pos == 65 and model.replay_buffer.ep_length.max() == 10
+
+
 # ------------------------------------------------------ parameters and files
 
 

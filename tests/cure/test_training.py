@@ -446,7 +446,7 @@ def test_pretraining_that_keeps_its_transitions() -> None:
     model.pretrain(44, callback=watch, keep_replay_buffer=True)
     assert model.replay_buffer.size() == 44 and model.num_timesteps == 0
     assert (model.policy.intrinsic.places >= 0).any()  # its memory refers to the replay buffer
-    model.learn(35)
+    model.fit_representation(2).learn(35)
     buffer = model.replay_buffer
     assert buffer.size() == 44 + 35
     for name, before in kept[-1].items():
