@@ -436,21 +436,15 @@ def test_training_after_pretraining_begins_as_without() -> None:
 def test_pretraining_that_keeps_its_transitions() -> None:
     """The task learns from them, too, and its warm-up does not repeat theirs."""
     model = tiny_model("CnnPolicy", PixelBox(), learning_starts=30, intrinsic="particle", seed=0)
-    kept: list[dict[str, np.ndarray]] = []
-
-    def watch(locals_: dict[str, Any], _: Any) -> bool:
-        buffer = model.replay_buffer
-        kept.append({name: getattr(buffer, name)[: buffer.size()].copy() for name in ("actions", "rewards")})
-        return True
-
-    model.pretrain(44, callback=watch, keep_replay_buffer=True)
-    assert model.replay_buffer.size() == 44 and model.num_timesteps == 0
+    model.pretrain(44, keep_replay_buffer=True)
+    buffer = model.replay_buffer
+    assert buffer.size() == 44 and model.num_timesteps == 0
+    kept = {name: getattr(buffer, name)[:44].copy() for name in ("actions", "rewards")}
     assert (model.policy.intrinsic.places >= 0).any()  # its memory refers to the replay buffer
     model.fit_representation(2).learn(35)
-    buffer = model.replay_buffer
     assert buffer.size() == 44 + 35
-    for name, before in kept[-1].items():
-        np.testing.assert_array_equal(getattr(buffer, name)[:43], before[:43])
+    for name, before in kept.items():
+        np.testing.assert_array_equal(getattr(buffer, name)[:44], before)
     assert not (buffer.actions[44:74] == buffer.actions[:30]).all(axis=(1, 2)).any()
 
 
