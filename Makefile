@@ -6,6 +6,18 @@ SHELL := bash
 .DEFAULT_GOAL := .venv
 .PHONY: .venv gl screens demo test test-all test-oldest check docs dist bench mutation notebooks clean help
 
+# $(call pip_install,PYTHON,ARGUMENTS) installs into the virtual environment of a Python. Without an NVIDIA GPU it takes
+# torch's build for the CPU, if its index can be reached: the default one brings gigabytes of CUDA libraries.
+CPU_TORCH := https://download.pytorch.org/whl/cpu/
+define pip_install
+	index=
+	if ! command -v nvidia-smi >/dev/null && \
+		$(1) -c 'import urllib.request; urllib.request.urlopen("$(CPU_TORCH)", timeout=10)' 2>/dev/null; then
+		index=--extra-index-url=$(CPU_TORCH)
+	fi
+	$(1) -m pip install -q --disable-pip-version-check $$index $(2)
+endef
+
 # The first Python that runs and is 3.11 or 3.12. Finding its name is not enough: pyenv puts a name
 # on the PATH for every version it has, and those that are not active only print an error.
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 13))
@@ -54,7 +66,7 @@ endef
 	rm -f $@
 	touch .venv/.unfinished
 	echo "Installing sb3_cure into .venv (some minutes the first time) ..."
-	$(RUN) pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(call pip_install,.venv/bin/python,-c constraints.txt -e '.[dev]')
 	mv .venv/.unfinished $@
 
 # Prints the OpenGL renderer in use, or one sentence about what is missing.
@@ -86,7 +98,7 @@ SMOKE := tests/cure/test_update_equals_sb3.py tests/cure/test_compatibility.py t
 	@rm -rf .venv-oldest
 	$(RUN) venv .venv-oldest
 	echo "Installing the oldest supported versions into .venv-oldest ..."
-	.venv-oldest/bin/python -m pip install -q --disable-pip-version-check -c constraints-oldest.txt -e . pytest hypothesis
+	$(call pip_install,.venv-oldest/bin/python,-c constraints-oldest.txt -e . pytest hypothesis)
 	touch $@
 
 test-oldest: gl .venv-oldest/.installed  ## run some tests with the oldest versions that are supported (.venv-oldest)
