@@ -10,6 +10,8 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
 
 from sb3_cure import CuReSAC, CuReTQC
+from sb3_cure.data.buffers import transitions
+from sb3_cure.data.observations import by_key
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.fast_ops import from_cells, to_cells
 from sb3_cure.networks.layers import RunningStandardize
@@ -40,7 +42,16 @@ def sampled(model: CuReSAC) -> Samples:
     :param model: Not trained yet, so that the statistics of its first batch stay as they are when it comes again
     """
     np.random.seed(1)
-    batch = Samples(*model.replay_buffer.sample(BATCH))  # type: ignore[union-attr]
+    buffer: Any = model.replay_buffer
+    batch = Samples(*buffer.sample(BATCH))
+    if model.curiosity == "separate" and not model.curiosity_episodic:
+        rows, envs = buffer.last_sampled
+        following = by_key(transitions(buffer, (rows + 1) % buffer.buffer_size, envs).observations)
+        goes_on = batch.dones[:, 0].bool() & th.as_tensor((rows + 1) % buffer.buffer_size != buffer.pos)
+        restarts = {key: part.clone() for key, part in by_key(batch.next_observations).items()}
+        for key, part in restarts.items():
+            part[goes_on] = following[key][goes_on]
+        batch = batch._replace(restarts=restarts.get("", restarts))
     th.manual_seed(1)
     batch = batch._replace(views=model.policy.augmentation(batch.observations))
     for encoder in (model.policy.encoder, model.policy.encoder_target):
@@ -107,13 +118,16 @@ def moved(before: dict[str, list[th.Tensor]], after: dict[str, list[th.Tensor]])
 
 @th.no_grad()
 def prepare(model: CuReSAC) -> None:
-    """Let some transitions terminate, errors differ between observations, targets from what they follow."""
+    """Let some transitions end where they began, errors differ between observations, targets from what they follow."""
     policy, buffer = model.policy, model.replay_buffer
     if policy.srl is not None:
         for parameter in policy.srl.parameters():
             parameter.normal_(std=0.3, generator=th.Generator().manual_seed(parameter.numel()))
     buffer.dones[::3] = 1  # type: ignore[union-attr]
     buffer.timeouts[:] = 0  # type: ignore[union-attr]
+    for name, array in buffer.rows.items():  # type: ignore[union-attr]
+        if name.startswith("slots/"):
+            array[::3, :, 1] = array[::3, :, 0]
     for target in (policy.encoder_target, *(agent.critic_target for agent in policy.agents.values())):
         for parameter in target.parameters():
             parameter.mul_(1.1)
@@ -224,7 +238,8 @@ class StraightLine:
         self.standardise_by(batch.views)
         obs = self.scaled(batch.views)
         # Drawn where it is first read
-        self.next_obs = functools.cache(lambda: self.scaled(self.model.policy.augmentation(batch.next_observations)))
+        views = self.model.policy.augmentation
+        self.next_obs = functools.cache(lambda: self.scaled(views(batch.next_observations)))
         shared = self.encoder(obs)
         pulls: list[list[th.Tensor]] = []
 
@@ -260,10 +275,11 @@ class StraightLine:
         rewards = batch.rewards[:, 0]
         if self.model.curiosity == "bonus":  # scaled, not centred
             rewards = rewards + self.model.curiosity_beta * errors / errors.square().mean().sqrt()
-        self.learn_agent("task", batch, rewards, self.model.gamma * (1 - ends), learn, found)
+        self.learn_agent("task", batch, rewards, self.model.gamma * (1 - ends), self.next_obs(), learn, found)
         if self.model.curiosity == "separate":
             discounts = self.model.curiosity_gamma * (1 - curious_ends)
-            self.learn_agent("curious", batch, curious, discounts, learn, found)
+            goes_on = self.next_obs() if batch.restarts is None else self.scaled(views(batch.restarts))
+            self.learn_agent("curious", batch, curious, discounts, goes_on, learn, found)
         if not sequential:
             with th.no_grad():
                 for parameter, *steps in zip(self.encoder.parameters(), *pulls, strict=True):
@@ -279,12 +295,13 @@ class StraightLine:
         batch: Samples,
         rewards: th.Tensor,
         discounts: th.Tensor,
+        next_obs: th.Tensor,
         learn: Any,
         found: dict[str, th.Tensor],
     ) -> None:
         """Critic, actor and temperature, with the encoder as it is by now."""
         agent, prefix = self.agents[name], "" if name == "task" else "curious_"
-        obs, next_obs = self.scaled(batch.views), self.next_obs()
+        obs = self.scaled(batch.views)
         alpha = agent.log_ent_coef.detach().exp()
         with th.no_grad():
             next_actions, next_log_prob = agent.actor.action_log_prob(self.encoder.trunk(next_obs))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from sb3_cure.cure.policies import CuRePolicy
@@ -71,7 +72,7 @@ def check_arguments(model: Any) -> None:
         or_none = " or None" if type(None) in get_args(CuReArguments.model_fields[name].annotation) else ""
         raise ValueError(f"{name}={first['input']!r} is not valid: {first['msg'].lower()}{or_none}.") from None
     for name, value in checked:
-        if isinstance(value, int | float):  # converted, where a file has 1e3 or "0.1"
+        if isinstance(value, int | float):  # YAML may give 1e3 or "0.1" as strings
             setattr(model, name, value)
     for is_wrong, sentence in _conflicts(model):
         if is_wrong:
@@ -122,6 +123,11 @@ def _conflicts(model: Any) -> list[tuple[bool, str]]:
             issubclass(buffer, NStepReplayBuffer) or (model.n_steps > 1 and not ours),
             f"{buffer.__name__} has no n-step returns that keep the next observation of one step, which heads and "
             "rewards need: leave replay_buffer_class out, and set n_steps.",
+        ),
+        (
+            model.overlap and issubclass(buffer, HerReplayBuffer),
+            "overlap=True updates while the environments step, when HerReplayBuffer cannot ask them for rewards: use "
+            "overlap=False.",
         ),
         (
             model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer),

@@ -73,13 +73,14 @@ class CuReBase(OffPolicyAlgorithm):
     :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"`` where
         the reward is the SRL error of one observation
     :param curiosity_ent_coef: Temperature of the curious agent, as ``ent_coef``; None: like ``ent_coef``
-    :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it does not: a
-        reward of mean zero would otherwise make dying attractive wherever the error is low
+    :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it goes on with
+        the first observation of the next episode: a reward of mean zero would otherwise make dying attractive wherever
+        the error is low. (Replay buffers of SB3: with the terminal observation)
     :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
-    :param curious_interval: The curious agent and its reward learn in every ``curious_interval``-th update, or in each
-        update of the burst
+    :param curious_interval: The separate curious agent and its reward learn in every ``curious_interval``-th update, or
+        in each update of the burst
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)

@@ -20,7 +20,7 @@ from sb3_cure.cure.actor_critic import ActorCritic
 from sb3_cure.cure.base import CuReBase
 from sb3_cure.cure.crash_report import crash_report
 from sb3_cure.cure.metrics import PREFIXES, Metrics, log_reconstructions, means
-from sb3_cure.data.buffers import transitions
+from sb3_cure.data.buffers import FrameStackReplayBuffer, transitions
 from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import RewardInputs
@@ -160,6 +160,9 @@ class CuRe(CuReBase):
         batch = self.policy.samples(buffer.sample(batch_size, env=self._vec_normalize_env))
         if self.n_steps > 1 and self.task and learns_rl:
             batch = batch._replace(n_step=buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env))
+        goes_on = self._has_curious_agent and learns_rl and not self.curiosity_episodic
+        if goes_on and isinstance(buffer, FrameStackReplayBuffer):
+            batch = batch._replace(restarts=buffer.restarts(self._vec_normalize_env))
         return batch
 
     def _plan(self) -> tuple[bool, bool, int]:
@@ -210,6 +213,7 @@ class CuRe(CuReBase):
             "observations": lambda: batch.views,
             "next_observations": lambda: policy.augmentation(batch.next_observations),
             "n_step": lambda: policy.augmentation(policy.sense(n_step.next_observations)),  # type: ignore[union-attr]
+            "restarts": lambda: policy.augmentation(policy.sense(batch.restarts)),
             "centred observations": lambda: policy.center(batch.observations),
             "centred next_observations": lambda: policy.center(batch.next_observations),
         }
@@ -268,6 +272,11 @@ class CuRe(CuReBase):
         """Step the reward's own loss, and return the batch's scaled reward, [B, 1]: never stored, so never stale."""
         reward: Any = self.policy.intrinsic
         loss, raw = reward.loss(self._reward_inputs(batch, srl))
+        if raw.shape != (len(batch.actions),):
+            raise ValueError(
+                f"{type(reward).__name__}.loss returned a reward of shape {tuple(raw.shape)}, but it must be one "
+                "number per sample."
+            )
         raw = raw.detach().float()
         if loss is not None:
             self._learn("intrinsic", "intrinsic reward", loss.float(), reward.optimizer)
@@ -292,10 +301,14 @@ class CuRe(CuReBase):
         self._update_actor_critic("task", n_before, batch.actions, rewards, discounts, next_view)
 
     def _update_curious(self, batch: Samples, n_before: int, rewards: Any) -> None:
-        """UpdateCuriousAC: returns continue where episodes terminate, unless ``curiosity_episodic``."""
+        """UpdateCuriousAC: unless ``curiosity_episodic``, returns go on in the next episode where one terminates.
+
+        As in RND (Burda et al., 2019): a terminal observation is never acted on, so that no loss corrects its value.
+        """
         continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
         discounts = continues * self.curiosity_gamma
-        self._update_actor_critic("curious", n_before, batch.actions, rewards, discounts, "next_observations")
+        next_view = "next_observations" if batch.restarts is None else "restarts"
+        self._update_actor_critic("curious", n_before, batch.actions, rewards, discounts, next_view)
 
     def _update_actor_critic(
         self,

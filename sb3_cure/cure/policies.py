@@ -140,7 +140,7 @@ class CuRePolicy(BasePolicy):
         # Always there, as the same buffers are then in every archive; it costs two numbers.
         self.scale = RewardScale()
         if intrinsic_class is not None:
-            self._build_intrinsic()
+            self._build_intrinsic(intrinsic_class, intrinsic_kwargs or {})
         if curious:
             self.curious = self._make_actor_critic()
         self.encoder_update = EncoderUpdate(
@@ -199,15 +199,15 @@ class CuRePolicy(BasePolicy):
             return srl_class(self.encoder, self.sensed_space, **srl_kwargs)
         return DictHead(srl_class, self.encoder, self.sensed_space, **srl_kwargs)
 
-    def _build_intrinsic(self) -> None:
+    def _build_intrinsic(self, intrinsic_class: type[IntrinsicReward], intrinsic_kwargs: dict[str, Any]) -> None:
         with _forked_rng(self._head_seed + 1):
             self.intrinsic = make_reward(
-                self._arguments["intrinsic_class"],
+                intrinsic_class,
                 self.sensed_space,
                 self.action_space,  # type: ignore[arg-type]
                 self.encoder.features_dim,
                 settings={**(self._arguments["reward_settings"] or {}), "srl": self.srl},
-                kwargs=self._arguments["intrinsic_kwargs"] or {},
+                kwargs=intrinsic_kwargs,
             )
         parameters = [parameter for parameter in self.intrinsic.parameters() if parameter.requires_grad]
         self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
@@ -249,9 +249,9 @@ class CuRePolicy(BasePolicy):
         :param intrinsic_class: Class of the reward
         :param intrinsic_kwargs: Its arguments
         """
-        self._arguments |= dict(intrinsic_class=intrinsic_class, intrinsic_kwargs=intrinsic_kwargs, curious=True)
         if self.intrinsic is None:
-            self._build_intrinsic()
+            self._build_intrinsic(intrinsic_class, intrinsic_kwargs)
+        self._arguments |= dict(intrinsic_class=intrinsic_class, intrinsic_kwargs=intrinsic_kwargs, curious=True)
         self.curious = self._make_actor_critic()
         self.to(self.device)
         self.encoder_update.set_sources(self._encoder_sources())
@@ -350,9 +350,9 @@ class CuRePolicy(BasePolicy):
         """
         fields = sampled._asdict()
         for name in ("observations", "next_observations"):
-            fields[name] = _channels_last(self.sense(fields[name]))
+            fields[name] = _prepared(self.sense(fields[name]))
         view = self.augmentation if random else self.augmentation.center
-        return Samples(**{**fields, "views": _channels_last(view(fields["observations"]))})
+        return Samples(**{**fields, "views": _prepared(view(fields["observations"]))})
 
     def center(self, observations: Any) -> Any:
         """Make the view of observations that has no randomness, as when acting.
@@ -491,12 +491,12 @@ def _kinds(space: spaces.Space) -> Any:
     return f"{'image' if is_image_space(space) else type(space).__name__} {space.shape}"
 
 
-def _channels_last(views: Any) -> Any:
-    """Images in NHWC memory order; vectors, and None, as they are."""
-    if isinstance(views, dict):
-        return {key: _channels_last(view) for key, view in views.items()}
-    is_images = isinstance(views, th.Tensor) and views.dim() == 4
-    return views.contiguous(memory_format=th.channels_last) if is_images else views
+def _prepared(observations: Any) -> Any:
+    """Images in NHWC memory order, vectors in float32."""
+    if isinstance(observations, dict):
+        return {key: _prepared(part) for key, part in observations.items()}
+    is_image = observations.dim() == 4
+    return observations.contiguous(memory_format=th.channels_last) if is_image else observations.float()
 
 
 @contextlib.contextmanager

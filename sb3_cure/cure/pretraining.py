@@ -220,15 +220,15 @@ class Pretraining(CuRe):
             raise ValueError(f"{call} trains the representation, which transfer_from(freeze=True) keeps as it is.")
 
     def _begin_pretraining(self, collector: str) -> None:
-        if self._before_pretraining is None:
-            self._before_pretraining = {"task": self.task, "curiosity": self.curiosity}
-        self.task, self.curiosity = False, "separate" if collector == "curious" else "random"
-        if not self._has_curious_agent:
-            return
-        if self.policy.curious is None:  # for this pretraining alone
+        is_curious = collector == "curious"
+        if is_curious and self.policy.curious is None:  # for this pretraining alone; first, as it may fail
             self.policy.add_curious_agent(choose_intrinsic(self), self.intrinsic_kwargs)
             self._set_temperature("curious")
-        self.policy.default_agent = "curious"
+        if self._before_pretraining is None:
+            self._before_pretraining = {"task": self.task, "curiosity": self.curiosity}
+        self.task, self.curiosity = False, "separate" if is_curious else "random"
+        if is_curious:
+            self.policy.default_agent = "curious"
 
     def _restore_settings(self) -> None:
         """Restore what ``_begin_pretraining`` has changed."""

@@ -279,6 +279,27 @@ class FrameStackReplayBuffer(ReplayBuffer):
             discounts=self.to_torch(gamma ** counted.sum(axis=1, keepdims=True).astype(np.float32)),
         )
 
+    def restarts(self, env: VecNormalize | None = None) -> Any | None:
+        """Successors for the batch sampled last: where an episode terminated, the first observation of the next one.
+
+        An episode after which nothing has been stored yet keeps its terminal observation.
+
+        :param env: VecEnv to normalize the observations with
+        :return: Observations on ``device``; None if they are those of ``sample``
+        """
+        assert self.last_sampled is not None, "restarts is of the batch sampled last: call sample() before it"
+        rows, env_inds = self.last_sampled
+        terminated = self.dones[rows, env_inds] * (1 - self.timeouts[rows, env_inds]) > 0
+        terminated &= rows != (self.pos - 1) % self.buffer_size
+        if not terminated.any():
+            return None
+        (successors,) = self.observations_at(rows, env_inds, slice(1, None))
+        first = (rows[terminated] + 1) % self.buffer_size, env_inds[terminated]
+        parts = by_key(successors)
+        for key, observations in by_key(self.observations_at(*first, slice(1))[0]).items():
+            parts[key][terminated] = observations
+        return _to_torch(self, self._normalize_obs(successors, env))
+
     def state_dict(self, frames: bool = True) -> dict[str, Any]:
         """State as plain values and views of the used part of all arrays.
 

@@ -36,6 +36,8 @@ class Samples(NamedTuple):
     :param discounts: Discounts of a custom buffer, float32 [B, 1]; None: the discount factor of the agent
     :param views: ``observations`` as the encoder saw them (shifted or cropped), in 0-255, [B, *view shape]
     :param n_step: Returns of n steps, for the task's critic alone; None unless ``n_steps > 1``
+    :param restarts: ``next_observations``, but where the episode terminated the first observation of the next one, for
+        the curious critic alone; None if they are the same
     """
 
     observations: th.Tensor
@@ -46,13 +48,14 @@ class Samples(NamedTuple):
     discounts: th.Tensor | None = None
     views: th.Tensor = None  # type: ignore[assignment]
     n_step: NStep | None = None
+    restarts: th.Tensor | None = None
 
     def of(self, key: str) -> "Samples":
         """Return the batch as seen by an agent whose only observation is this image.
 
         :param key: Key of an image in dictionaries of observations
-        :return: The batch with the observations of that image, without ``n_step``
+        :return: The batch with the observations of that image, without what is for critics alone
         """
         fields = self._asdict().items()
         parts = {name: value[key] if isinstance(value, dict) else value for name, value in fields}
-        return Samples(**{**parts, "n_step": None})
+        return Samples(**{**parts, "n_step": None, "restarts": None})

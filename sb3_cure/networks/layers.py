@@ -376,8 +376,8 @@ class RunningStandardize(nn.Module):
         :return: fp32, [B, n]
         """
         deviation = self.variance.sqrt()
-        # A deviation below 1e-5 of an entry's size is rounding.
-        scale = th.where(deviation > 1e-5 * self.mean.abs(), 1 / deviation, 0.0)
+        # A deviation below 1e-6 of an entry's size is rounding, of which float32 has 6e-8.
+        scale = th.where(deviation > 1e-6 * self.mean.abs(), 1 / deviation, 0.0)
         vectors = flatten_vectors(observations, self.observation_space)
         return ((vectors - self.mean) * scale).clamp(-self.clip, self.clip)
 

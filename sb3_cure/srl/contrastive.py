@@ -34,6 +34,7 @@ class CURL(SRLHead):
 
     def __init__(self, encoder: Encoder, observation_space: spaces.Space, bank_size: int = 64):
         super().__init__(encoder, observation_space)
+        self.choose_augmentation(observation_space)  # refuses all but images
         # CURL starts W uniform in [0, 1).
         self.W = nn.Parameter(th.rand(encoder.features_dim, encoder.features_dim))
         # Negatives of `error`, the first observations of training: negatives from the batch would change with it, and a
@@ -69,11 +70,19 @@ class CURL(SRLHead):
 
         :param augmentation: Makes the views that the encoder will see
         :return: Latents of crops without tanh, as in CURL's code
+        """
+        return {"tanh": False} if isinstance(augmentation, RandomCrop) else {}
+
+    def bind(self, target_encoder: Encoder, augmentation: Augmentation) -> None:
+        """Set target encoder and augmentation.
+
+        :param target_encoder: The moving average of the encoder
+        :param augmentation: The policy's
         :raises ValueError: if there is no augmentation
         """
         if type(augmentation) is Augmentation:
             raise ValueError("srl='curl' compares two random views, but augmentation is None: use 'shift' or 'crop'.")
-        return {"tanh": False} if isinstance(augmentation, RandomCrop) else {}
+        super().bind(target_encoder, augmentation)
 
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Compute eq. 3: cross-entropy of each anchor's own key among the keys of the batch.

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.sac.policies import CnnPolicy, MultiInputPolicy
 
@@ -77,6 +78,11 @@ def test_bad_values_are_named() -> None:
         (dict(use_sde=True), "use_sde=True"),
         (dict(curiosity_ent_coef="auto_0"), "'auto_0' must begin above 0"),
         (dict(srl="curl", augmentation=None), "augmentation is None"),
+        (
+            dict(srl="curl", augmentation=None, policy_kwargs=dict(features_extractor_class=NatureCNN)),
+            "augmentation is None",
+        ),
+        (dict(overlap=True, replay_buffer_class=HerReplayBuffer), "overlap=False"),
         (dict(augmentation="crop", augmentation_kwargs=dict(size=84)), "cannot cut 84 x 84 pixels out of images of 36"),
     ],
 )

@@ -448,6 +448,16 @@ def test_pretraining_that_keeps_its_transitions() -> None:
     assert not (buffer.actions[44:74] == buffer.actions[:30]).all(axis=(1, 2)).any()
 
 
+def test_pretraining_that_cannot_begin_changes_nothing() -> None:
+    model = tiny_model("MlpPolicy", VectorBox(), curiosity=None, learning_starts=10, intrinsic_kwargs={"of": "nothing"})
+    model.learn(20)
+    with pytest.raises(TypeError, match="of"):
+        model.pretrain(10)
+    assert (model.task, model.curiosity, model.is_pretraining) == (True, None, False)
+    model.learn(10, reset_num_timesteps=False)
+    assert (model.num_timesteps, model.replay_buffer.size()) == (30, 30)
+
+
 def test_pretraining_of_a_bonus() -> None:
     """Each run has its burst; the bonus is scaled anew, by its size and not by the spread of another reward."""
     model = tiny_model("MlpPolicy", VectorBox(), curiosity="bonus", ent_coef=0.1, warmup_updates=5).pretrain(14)

@@ -35,6 +35,7 @@ from twins_for_tests import (
 
 from sb3_cure.data import buffers
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack, stored_places, transitions
+from sb3_cure.data.observations import by_key
 
 pytestmark = pytest.mark.filterwarnings("ignore:Frames do not slide", "ignore:The full replay buffer needs")
 all_kinds = pytest.mark.parametrize("kind", KINDS)
@@ -54,6 +55,25 @@ def test_any_stream_equals_sb3s(twins: Twins) -> None:
     """Breaks, jumps, ends, resets, copies and wrap-around, of images, vectors, numbers and dictionaries."""
     twins.check()
     event(f"wrapped: {twins.ours.full}, rows lost: {twins.ours.size() < twins.sb3.size()}, {twins.kind}")
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(streams())
+def test_restarts_are_the_next_episodes_first_observations(twins: Twins) -> None:
+    """After terminations, not after timeouts, and not after the newest row, which nothing follows yet."""
+    buffer, (rows, envs, ages) = twins.ours, stored_places(twins.ours)
+    buffer.last_sampled = rows, envs
+    found = buffer.restarts()
+    sampled, following = (transitions(twins.sb3, each % buffer.buffer_size, envs) for each in (rows, rows + 1))
+    goes_on = (sampled.dones[:, 0] > 0) & th.as_tensor(ages > 0)
+    event(f"terminated: {bool(goes_on.any())}")
+    if not goes_on.any():
+        assert found is None
+        return
+    after, first = by_key(sampled.next_observations), by_key(following.observations)
+    for key, observations in by_key(found).items():
+        mask = goes_on.reshape(-1, *[1] * (observations.dim() - 1))
+        assert th.equal(observations, th.where(mask, first[key], after[key]))
 
 
 def distinct_frame(number: int) -> np.ndarray:

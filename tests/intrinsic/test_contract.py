@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
@@ -141,6 +142,27 @@ def test_reward_reads_what_the_info_said(tmp_path: Path) -> None:
         reward: Any = each.policy.intrinsic
         inputs = reward.given[-1]
         assert th.equal(inputs.info("place"), inputs.batch.next_observations)
+
+
+@pytest.mark.parametrize("shape", [(1,), (-1, 1)])
+def test_reward_is_one_number_per_sample(shape: tuple[int, ...]) -> None:
+    """One number would be broadcast to the batch."""
+
+    class OtherShape(IntrinsicReward):
+        def loss(self, inputs: RewardInputs) -> Any:
+            return None, inputs.batch.rewards.flatten()[: None if shape[0] < 0 else 1].reshape(shape)
+
+    with pytest.raises(ValueError, match=r"OtherShape.loss returned a reward of shape .* one number per sample"):
+        train_once(filled_model(srl=None, intrinsic=OtherShape))
+
+
+def test_heads_get_vectors_in_float32() -> None:
+    """Gymnasium's MuJoCo observes float64."""
+    env = VectorBox()
+    env.observation_space = gym.spaces.Box(-1, 1, env.observation_space.shape, np.float64)
+    model = tiny_model("MlpPolicy", env, srl=None, intrinsic=LatentStep, learning_starts=10).learn(12)
+    batch = model.policy.intrinsic.given[-1].batch
+    assert {each.dtype for each in (batch.observations, batch.next_observations, batch.views)} == {th.float32}
 
 
 @UPDATES

@@ -303,6 +303,18 @@ def test_entries_are_standardised_each_by_itself() -> None:
     assert not found[:, 3].any()
 
 
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e6])
+def test_large_numbers_that_vary_are_no_constants(size: float) -> None:
+    """Absolute positions and encoder ticks: five parts in a million are told from rounding."""
+    standardize = RunningStandardize(spaces.Box(-np.inf, np.inf, (2,)))
+    noise = th.randn(500, 256, 1, generator=th.Generator().manual_seed(0))
+    for batch in th.cat([size * (1 + 5e-6 * noise), th.full_like(noise, 1.1 * size)], dim=2):
+        standardize.update(batch)
+    found = standardize(batch)
+    assert 0.8 < float(found[:, 0].std()) < 1.2
+    assert not found[:, 1].any()
+
+
 def test_old_batches_fade() -> None:
     standardize = standardizer(decay=0.9)
     for seed in range(100):
