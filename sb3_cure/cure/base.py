@@ -229,7 +229,8 @@ class CuReBase(OffPolicyAlgorithm):
         if self.replay_buffer_class in (None, FrameStackReplayBuffer):
             self.replay_buffer_class = FrameStackReplayBuffer
             self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
-        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):  # else SB3's `learn` ends an episode in it
+        if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
+            # Else SB3's `learn` marks the newest row as done.
             self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
         if own := sorted(user_kwargs.keys() & settings.keys()):
@@ -296,9 +297,9 @@ class CuReBase(OffPolicyAlgorithm):
         return check_environments(OffPolicyAlgorithm._wrap_env(env, verbose, monitor_wrapper))
 
     def get_env(self) -> VecEnv | None:
-        """Get the environments without the checks around them, as callbacks compare their kind with that of others.
+        """Get the environments.
 
-        :return: The environments
+        :return: Without ``FiniteCheck``, as callbacks compare the types of training and evaluation environments
         """
         return self.env.venv if isinstance(self.env, FiniteCheck) else self.env
 
@@ -347,7 +348,7 @@ class CuReBase(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-        # SB3 does so after each step: the first one would see where the former call ended.
+        # As SB3 does after each step; else the first one sees the previous call's progress.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         env: Any = self.env
         restarts_workers = getattr(env.unwrapped, "on_env_fault", None) == "restart"

@@ -92,7 +92,7 @@ class CuRe(CuReBase):
             rollout = super().collect_rollouts(self._overlapped or env, *args, **kwargs)
             continues = rollout.continue_training
         finally:
-            if not continues:  # a step was made and not stored: another `learn` begins with a reset
+            if not continues:  # SB3 made a step without storing it: reset in the next `learn`
                 self._last_obs = None
         if continues and not self._warmed_up and self.num_timesteps > self.learning_starts:
             self._warm_up()
@@ -129,7 +129,7 @@ class CuRe(CuReBase):
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         """Sample, update, repeat."""
         self.policy.set_training_mode(True)
-        task = self.policy.task  # callbacks that anneal its temperature set SB3's attributes, the model's
+        task = self.policy.task  # callbacks may have replaced the temperature on the model
         task.log_ent_coef, task.ent_coef_optimizer = self.log_ent_coef, self.ent_coef_optimizer
         task.ent_coef_tensor = self.ent_coef_tensor
         learning_rate = self.lr_schedule(self._progress_remaining)
@@ -157,12 +157,14 @@ class CuRe(CuReBase):
     def _sample_batch(self, batch_size: int, learns_rl: bool) -> Samples:
         """Draw transitions and the views of them that the encoder sees."""
         buffer: Any = self.replay_buffer
+        sense = self.policy.sense
         batch = self.policy.samples(buffer.sample(batch_size, env=self._vec_normalize_env))
         if self.n_steps > 1 and self.task and learns_rl:
-            batch = batch._replace(n_step=buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env))
+            n_step = buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env)
+            batch = batch._replace(n_step=n_step._replace(next_observations=sense(n_step.next_observations)))
         goes_on = self._has_curious_agent and learns_rl and not self.curiosity_episodic
         if goes_on and isinstance(buffer, FrameStackReplayBuffer):
-            batch = batch._replace(restarts=buffer.restarts(self._vec_normalize_env))
+            batch = batch._replace(restarts=sense(buffer.restarts(self._vec_normalize_env)))
         return batch
 
     def _plan(self) -> tuple[bool, bool, int]:
@@ -180,6 +182,11 @@ class CuRe(CuReBase):
         """Whether a step that is made once per ``interval`` updates is due now; in the burst it always is."""
         return self._in_burst or n_before % interval == 0
 
+    def _is_agents_step_due(self, name: str, interval: int) -> bool:
+        """Whether a step that an agent makes once per ``interval`` of its own updates is due now."""
+        own_interval = self.curious_interval if name == "curious" else 1
+        return self._is_due(self._n_rl_batches // own_interval, interval)
+
     def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
         """UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1 on one batch."""
         policy, encoder = self.policy, self.policy.encoder_update
@@ -188,7 +195,7 @@ class CuRe(CuReBase):
             for each in (policy.encoder, policy.encoder_target):
                 each.update_statistics(batch.views)
         self._metrics = {}
-        learners = self._learners() if learns_rl else {}
+        learners = self._learners() if learns_rl else []
         srl = self._srl_loss(batch) if learns_srl else None
         rewarded = "task" if self.curiosity == "bonus" else "curious"
         # Computed before the steps of head and encoder
@@ -196,12 +203,12 @@ class CuRe(CuReBase):
         if srl is not None:
             reward: Any = policy.intrinsic
             if rewards is not None and reward.trains_encoder and self.update == "sequential":
-                srl = self._srl_loss(batch)  # computed anew, as the reward's loss has stepped the encoder
+                srl = self._srl_loss(batch)  # again, as the reward's loss has stepped the encoder
             self._update_srl(srl.loss)
         if "task" in learners:
-            self._update_task(batch, learners["task"], rewards if rewarded == "task" else None)
+            self._update_task(batch, rewards if rewarded == "task" else None)
         if "curious" in learners:
-            self._update_curious(batch, learners["curious"], rewards)
+            self._update_curious(batch, rewards)
         encoder.finish()
         self._update_targets(learners)
         return self._metrics | encoder.metrics
@@ -212,20 +219,16 @@ class CuRe(CuReBase):
         return {
             "observations": lambda: batch.views,
             "next_observations": lambda: policy.augmentation(batch.next_observations),
-            "n_step": lambda: policy.augmentation(policy.sense(n_step.next_observations)),  # type: ignore[union-attr]
-            "restarts": lambda: policy.augmentation(policy.sense(batch.restarts)),
+            "n_step": lambda: policy.augmentation(n_step.next_observations),  # type: ignore[union-attr]
+            "restarts": lambda: policy.augmentation(batch.restarts),
             "centred observations": lambda: policy.center(batch.observations),
             "centred next_observations": lambda: policy.center(batch.next_observations),
         }
 
-    def _learners(self) -> dict[str, int]:
-        """Agents that learn from this batch, and how many batches each of them has learned from before."""
-        learners = {}
-        if self.task:
-            learners["task"] = self._n_rl_batches
-        if self._has_curious_agent and self._is_due(self._n_rl_batches, self.curious_interval):
-            learners["curious"] = self._n_rl_batches // self.curious_interval
-        return learners
+    def _learners(self) -> list[str]:
+        """Names of the agents that learn from this batch."""
+        curious = self._has_curious_agent and self._is_due(self._n_rl_batches, self.curious_interval)
+        return ["task"] * self.task + ["curious"] * curious
 
     def _srl_loss(self, batch: Samples, learns: bool = True) -> SRLOutput:
         """Loss of the head, and the error of each sample, [B]."""
@@ -250,7 +253,7 @@ class CuRe(CuReBase):
         if self.curiosity_target == "observation" or srl.needs_next_latents or srl.models_transitions:
             return (srl_output or self._srl_loss(batch, learns=False)).error
         views = self.policy.augmentation(batch.next_observations)
-        # All other fields are None, so that no head takes (s', a, s') for a transition.
+        # All other fields are None: heads must not read (s', a, s') as a transition.
         alone = Samples(batch.next_observations, None, None, None, None, views=views)  # type: ignore[arg-type]
         with th.no_grad():
             return srl.loss(alone, self.policy.encoder(views)).error.float()  # type: ignore[no-any-return]
@@ -292,15 +295,15 @@ class CuRe(CuReBase):
         )
         return scaled
 
-    def _update_task(self, batch: Samples, n_before: int, bonus: th.Tensor | None) -> None:
+    def _update_task(self, batch: Samples, bonus: th.Tensor | None) -> None:
         """UpdateTaskAC, with returns of one step or of several."""
         returns = batch.n_step or batch
         rewards = returns.rewards if bonus is None else returns.rewards + bonus
         discounts = (1 - returns.dones) * (self.gamma if returns.discounts is None else returns.discounts)
         next_view = "next_observations" if batch.n_step is None else "n_step"
-        self._update_actor_critic("task", n_before, batch.actions, rewards, discounts, next_view)
+        self._update_actor_critic("task", batch.actions, rewards, discounts, next_view)
 
-    def _update_curious(self, batch: Samples, n_before: int, rewards: Any) -> None:
+    def _update_curious(self, batch: Samples, rewards: Any) -> None:
         """UpdateCuriousAC: unless ``curiosity_episodic``, returns go on in the next episode where one terminates.
 
         As in RND (Burda et al., 2019): a terminal observation is never acted on, so that no loss corrects its value.
@@ -308,21 +311,14 @@ class CuRe(CuReBase):
         continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
         discounts = continues * self.curiosity_gamma
         next_view = "next_observations" if batch.restarts is None else "restarts"
-        self._update_actor_critic("curious", n_before, batch.actions, rewards, discounts, next_view)
+        self._update_actor_critic("curious", batch.actions, rewards, discounts, next_view)
 
     def _update_actor_critic(
-        self,
-        name: str,
-        n_before: int,
-        actions: th.Tensor,
-        rewards: th.Tensor,
-        discounts: th.Tensor,
-        next_view: str,
+        self, name: str, actions: th.Tensor, rewards: th.Tensor, discounts: th.Tensor, next_view: str
     ) -> None:
         """Soft actor-critic on the latents; the critics' loss also trains the encoder.
 
         :param name: ``"task"`` or ``"curious"``
-        :param n_before: Number of batches that this agent has learned from before
         :param actions: The batch's, in [-1, 1], [B, action_dim]
         :param rewards: The agent's rewards, [B, 1]
         :param discounts: Discount factor where the return continues, else 0, [B, 1]
@@ -336,7 +332,7 @@ class CuRe(CuReBase):
         critic_loss = agent.critic.loss(encoder.latents(name), actions, target)
         self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
         self._note({f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()})
-        if self._is_due(n_before, self.actor_update_interval):
+        if self._is_agents_step_due(name, self.actor_update_interval):
             self._update_actor(name, agent)
 
     def _update_actor(self, name: str, agent: ActorCritic) -> None:
@@ -352,17 +348,17 @@ class CuRe(CuReBase):
             self._optimize(f"{name} temperature", ent_coef_loss, agent.ent_coef_optimizer)
             self._note({f"{prefix}ent_coef_loss": ent_coef_loss})
 
-    def _update_targets(self, learners: dict[str, int]) -> None:
+    def _update_targets(self, learners: list[str]) -> None:
         """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
         policy = self.policy
         if self._is_due(self._n_batches, self.target_update_interval):
             _polyak_step(policy.encoder, policy.encoder_target, self.encoder_tau)
-        for name, n_before in learners.items():
-            if self._is_due(n_before, self.target_update_interval):
+        for name in learners:
+            if self._is_agents_step_due(name, self.target_update_interval):
                 _polyak_step(policy.agents[name].critic, policy.agents[name].critic_target, self.tau)
 
     def _note(self, metrics: Metrics) -> None:
-        """Keep what this update logs."""
+        """Add to this update's metrics."""
         self._metrics |= {name: value.detach() for name, value in metrics.items()}
 
     def _learn(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:

@@ -88,7 +88,7 @@ class EncoderUpdate:
         self._reset(views)
         self._check = check
         self._n_updates += 1
-        # What was measured at the parameters is logged until it is measured again.
+        # Repeat the last shares until the next measurement.
         self.metrics = {name: value for name, value in self.metrics.items() if not name.startswith("latent_")}
 
     def features(self, name: str = "observations") -> Any:
@@ -212,7 +212,7 @@ class EncoderUpdate:
         self._gradients: dict[str, dict[str, th.Tensor]] = {}
 
     def _reset(self, views: Mapping[str, Callable[[], Any]]) -> None:
-        """Set the views of an update; between updates there are none, as a model that holds graphs cannot be copied."""
+        """Set the views of an update, and none after it: tensors with a graph cannot be deep-copied."""
         self._views = {name: cache(make) for name, make in views.items()}
         self._target_latents: dict[str, th.Tensor] = {}
         self._forget()

@@ -137,7 +137,7 @@ class CuRePolicy(BasePolicy):
         self._build_encoder(srl_class, srl_kwargs or {})
         self.task = self._make_actor_critic()
         self.curious = self.intrinsic = None
-        # Always there, as the same buffers are then in every archive; it costs two numbers.
+        # Also without curiosity, so that all archives have the same buffers
         self.scale = RewardScale()
         if intrinsic_class is not None:
             self._build_intrinsic(intrinsic_class, intrinsic_kwargs or {})
@@ -292,7 +292,7 @@ class CuRePolicy(BasePolicy):
 
     @property
     def encoder_optimizer(self) -> EncoderUpdate:
-        """``encoder_update`` by the name that it is saved under: SB3 takes what has no "optim" in it for a module."""
+        """``encoder_update`` by the name that it is saved under: SB3 treats names without "optim" as modules."""
         return self.encoder_update
 
     def _with_optimizer(self) -> dict[str, Any]:

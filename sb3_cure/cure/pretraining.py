@@ -33,7 +33,7 @@ class Pretraining(CuRe):
         self._before_pretraining: dict[str, Any] | None = None
         #: Whether the running pretraining leaves its transitions in the replay buffer
         self._keeps_replay_buffer = False
-        #: Whether the next ``learn`` begins with the random streams that it has without a pretraining before it
+        #: Whether the next ``learn`` resets all RNGs to their state after construction
         self._is_pretrained = False
         #: Whether encoder and head are kept as they are
         self.representation_frozen = False
@@ -42,7 +42,7 @@ class Pretraining(CuRe):
     def _setup_model(self) -> None:
         before, self._before_pretraining = self._before_pretraining, None
         collector = "curious" if self._has_curious_agent else "random"
-        if before is not None:  # of an archive that was saved while pretraining: first the networks of before
+        if before is not None:  # saved during pretraining: build the original networks first
             self.task, self.curiosity = before["task"], before["curiosity"]
         super()._setup_model()
         self._initial_rng_state = th.get_rng_state()

@@ -41,7 +41,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
     :param optimize_memory_usage: Ignored: frames are kept once in any case
     :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
         as an infinite horizon task
-    :param frame_stack: Frames per observation, which the number of channels does not tell: by key (1 for images
+    :param frame_stack: Frames per observation, which cannot be inferred from the channels: by key (1 for images
         that are not named), or one number for all (in dictionaries 1 for images whose channels it does not divide)
     :param info_shapes: What to keep of each step's ``info``, for rewards and heads of your own: shapes by key, such as
         ``{"contacts": (4,)}``; ``rows["infos/contacts"]`` has it as float32
@@ -101,9 +101,12 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.rows |= {name: zeros() for name in ("rewards", "dones", "timeouts")}
         self.rows |= {f"infos/{key}": zeros(*shape) for key, shape in self.info_shapes.items()}
         self.rows["starts"] = zeros(dtype=bool)
-        # SB3's names; `observations` and `next_observations` of single vectors, too
-        names = {name.removesuffix("/"): array for name, array in self.rows.items()}
-        vars(self).update({name: array for name, array in names.items() if "/" not in name})
+        names = ("actions", "rewards", "dones", "timeouts", "starts")
+        self.actions, self.rewards, self.dones, self.timeouts, self.starts = (self.rows[name] for name in names)
+        # SB3's names of single vectors; None for images, which are in the rings, and for dictionaries
+        self.observations, self.next_observations = (  # type: ignore[assignment]
+            self.rows.get(f"{name}/") for name in ("observations", "next_observations")
+        )
         if frames_dir is None and psutil is not None and self.nbytes > (free := psutil.virtual_memory().available):
             warnings.warn(
                 f"The full replay buffer needs {self.nbytes / 1e9:.2f} GB of memory, but {free / 1e9:.2f} GB are "

@@ -40,7 +40,7 @@ def make_reward(
     if isinstance(observation_space, spaces.Dict) and reward_class.is_per_image(**kwargs):
         return DictReward(reward_class, observation_space, action_space, features_dim, settings=settings, **kwargs)
     named = inspect.signature(reward_class).parameters
-    offered = {**settings, "settings": settings}  # rewards that build others pass them on
+    offered = {**settings, "settings": settings}  # for rewards that wrap another
     own = {name: value for name, value in offered.items() if name in named}
     return reward_class(observation_space, action_space, features_dim, **{**own, **kwargs})
 

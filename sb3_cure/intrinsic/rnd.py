@@ -50,7 +50,7 @@ class RND(IntrinsicReward):
         shape = scaled(th.as_tensor(self.space.sample())[None], self.space).shape[1:]
         self.register_buffer("mean", th.zeros(shape))
         self.register_buffer("variance", th.zeros(shape))
-        # Whether the statistics are final; and the same as a Python bool, which waits for no device (None: read it)
+        # Whether the statistics are final; and cached as a bool, to avoid a GPU synchronisation (None: not read yet)
         self.register_buffer("measured", th.tensor(False))
         self._is_measured: bool | None = None
         self.register_load_state_dict_post_hook(self._read_anew)

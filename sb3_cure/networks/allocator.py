@@ -13,8 +13,8 @@ def tune_allocator() -> bool:
     """Keep freed blocks of up to 32 MiB in the process instead of returning each to the system.
 
     By default glibc maps every large block anew and unmaps it when it is freed, so that each batch of images and each
-    layer's activations cost page faults. The process's memory then stays at its peak. Each model calls it; whoever sets
-    ``MALLOC_MMAP_THRESHOLD_`` or ``MALLOC_TRIM_THRESHOLD_`` in the environment has chosen otherwise.
+    layer's activations cost page faults. The process's memory then stays at its peak. Each model calls it; with
+    ``MALLOC_MMAP_THRESHOLD_`` or ``MALLOC_TRIM_THRESHOLD_`` in the environment it changes nothing.
 
     :return: Whether it worked; it does nothing where the C library is not glibc
     """

@@ -284,7 +284,7 @@ class ExtractorTrunk(nn.Module):
 
 
 def _as_sb3(views: th.Tensor, space: spaces.Space) -> th.Tensor:
-    # A user's `view` works on no other memory order.
+    # User code may call `view`, which needs contiguous memory.
     views = views.contiguous()
     return scale_images(views) if is_image_space(space) else preprocess_obs(views, space)  # type: ignore[return-value]
 

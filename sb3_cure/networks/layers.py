@@ -44,7 +44,7 @@ def init_weights(module: ModuleT) -> ModuleT:
 
 
 def set_mode(module: nn.Module, training: bool) -> None:
-    """Do ``module.train(training)`` in an eighth of the time, as SB3 calls it several times per step.
+    """Do ``module.train(training)``, faster, as SB3 calls it several times per step.
 
     :param module: Any module
     :param training: Whether layers behave as in training

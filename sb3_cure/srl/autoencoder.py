@@ -70,7 +70,8 @@ class RAE(SRLHead):
             return self.encoder.flatten(views)
         # NHWC, as the decoder writes: reading two memory orders at once is far slower than one copy of bytes.
         images = views.contiguous(memory_format=th.channels_last)
-        # In units of 1/256 of a quantisation step, centred: half the bits of 16 are for the steps, half for the noise.
+        # SAC-AE's floor(x / 2^(8 - bits)) / 2^bits + U(0, 1) / 2^bits - 0.5, for speed in int16 until the last line:
+        # in units of 1/256 of a quantisation step.
         levels = th.bitwise_right_shift(images, 8 - self.bits).to(th.int16).sub_(2 ** (self.bits - 1)).mul_(256)
         middle = 128.0
         if dither:

@@ -35,7 +35,7 @@ class SRLHead(nn.Module):
     #: Gradient steps in one burst after the random warm-up, unless ``warmup_updates`` says otherwise
     warmup_updates: ClassVar[int] = 0
     #: Whether the error is high where observations are new, so that ``intrinsic="auto"`` rewards it, as the paper does:
-    #: true of heads that draw, false of InfoNCE, which is high where others of the batch look alike
+    #: true of heads that reconstruct, false of InfoNCE, which is high where others of the batch look alike
     error_tells_novelty: ClassVar[bool] = True
     #: Whether ``loss`` gets the latents of the next observations, with their gradient, as a third argument
     needs_next_latents: ClassVar[bool] = False
