@@ -492,7 +492,9 @@ def _kinds(space: spaces.Space) -> Any:
 
 
 def _prepared(observations: Any) -> Any:
-    """Images in NHWC memory order, vectors in float32."""
+    """Images in NHWC memory order, vectors in float32; None as it is."""
+    if observations is None:
+        return None
     if isinstance(observations, dict):
         return {key: _prepared(part) for key, part in observations.items()}
     is_image = observations.dim() == 4
