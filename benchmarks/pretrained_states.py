@@ -65,6 +65,8 @@ def main() -> None:
     for cell in grid.cells:
         if cell.is_done(arguments.out) and (arguments.out / cell.folder / "pretrained.zip").exists():
             seeds[cell.task, cell.seed].append(cell)
+    if not seeds:
+        parser.error(f"no finished cell of {arguments.grid} in {arguments.out} has kept its pretrained.zip")
     rows = [row for cells in seeds.values() for row in probe_seed(cells, arguments.out)]
     write_csv(arguments.out / grid.experiment / "probe.csv", COLUMNS, rows)
 

@@ -163,7 +163,7 @@ class CuRe(CuReBase):
             n_step = buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env)
             batch = batch._replace(n_step=n_step._replace(next_observations=sense(n_step.next_observations)))
         goes_on = self._has_curious_agent and learns_rl and not self.curiosity_episodic
-        if goes_on and isinstance(buffer, FrameStackReplayBuffer):
+        if goes_on and type(buffer) is FrameStackReplayBuffer:  # a subclass may sample otherwise
             batch = batch._replace(restarts=sense(buffer.restarts(self._vec_normalize_env)))
         return batch
 
