@@ -12,8 +12,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sb3_cure.cli.zoo_files import ALGORITHMS
-from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.evaluation.result_files import Row, write_csv
 from sb3_cure.evaluation.rollouts import Episode, run_episodes, state_probe
@@ -32,21 +30,16 @@ def probe_seed(cells: Sequence[Cell], results: Path) -> Iterator[Row]:
     :param results: Folder of all results, with the ``pretrained.zip`` and ``model.zip`` of each cell
     :return: Rows of ``probe.csv``: R² of each coordinate of the true state
     """
-
-    def load(cell: Cell, name: str) -> CuReSAC:
-        objects = {**cell.custom_objects(), "buffer_size": 1}
-        return ALGORITHMS[cell.algo].load(results / cell.folder / name, custom_objects=objects)
-
     with contextlib.closing(cells[0].make_eval_env()) as env:
 
         def roll_out(cell: Cell, actor: str) -> list[Episode]:
-            model = load(cell, "model.zip")
+            model = cell.load_model(results / cell.folder / "model.zip")
             return list(run_episodes(model, env, EPISODES, actor, deterministic=False, seed=EVAL_SEED, states=True))
 
         seen = {"random": roll_out(cells[0], "random"), "task": [e for c in cells for e in roll_out(c, "task")]}
         names, units = physics_state_names(env), physics_state_units(env)
     for cell in cells:
-        model = load(cell, "pretrained.zip")
+        model = cell.load_model(results / cell.folder / "pretrained.zip")
         for kind, episodes in seen.items():
             for name, r2 in state_probe(model, episodes, names, units).items():
                 values = (cell.task, cell.seed, cell.method, kind, name, r2)
@@ -54,7 +47,7 @@ def probe_seed(cells: Sequence[Cell], results: Path) -> Iterator[Row]:
 
 
 def main() -> None:
-    """Probe all seeds of a grid whose cells are finished and have kept their models."""
+    """Probe the seeds of a grid of which all pretrained arms are finished and have kept their models."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("grid", help="grid file, or its name in zoo_configs/experiments")
     parser.add_argument("--methods", nargs="+", help="arms that are probed (default: all that were pretrained)")
@@ -63,11 +56,16 @@ def main() -> None:
     grid = load_grid(arguments.grid, methods=arguments.methods)
     seeds: dict[tuple[str, int], list[Cell]] = defaultdict(list)
     for cell in grid.cells:
-        if cell.is_done(arguments.out) and (arguments.out / cell.folder / "pretrained.zip").exists():
+        if cell.pretrain is not None:
             seeds[cell.task, cell.seed].append(cell)
-    if not seeds:
-        parser.error(f"no finished cell of {arguments.grid} in {arguments.out} has kept its pretrained.zip")
-    rows = [row for cells in seeds.values() for row in probe_seed(cells, arguments.out)]
+
+    def is_ready(cell: Cell) -> bool:
+        return cell.is_done(arguments.out) and (arguments.out / cell.folder / "pretrained.zip").exists()
+
+    ready = [cells for cells in seeds.values() if all(map(is_ready, cells))]
+    if not ready:
+        parser.error(f"no seed of {arguments.grid} in {arguments.out} has all its arms with their pretrained.zip")
+    rows = [row for cells in ready for row in probe_seed(cells, arguments.out)]
     write_csv(arguments.out / grid.experiment / "probe.csv", COLUMNS, rows)
 
 

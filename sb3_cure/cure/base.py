@@ -75,7 +75,7 @@ class CuReBase(OffPolicyAlgorithm):
     :param curiosity_ent_coef: Temperature of the curious agent, as ``ent_coef``; None: like ``ent_coef``
     :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it goes on with
         the first observation of the next episode: a reward of mean zero would otherwise make dying attractive wherever
-        the error is low. (Replay buffers of SB3: with the terminal observation)
+        the error is low. (Replay buffers of SB3, and subclasses of ours: with the terminal observation)
     :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
     :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)

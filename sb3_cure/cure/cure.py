@@ -157,14 +157,14 @@ class CuRe(CuReBase):
     def _sample_batch(self, batch_size: int, learns_rl: bool) -> Samples:
         """Draw transitions and the views of them that the encoder sees."""
         buffer: Any = self.replay_buffer
-        sense = self.policy.sense
+        prepare = self.policy.prepare
         batch = self.policy.samples(buffer.sample(batch_size, env=self._vec_normalize_env))
         if self.n_steps > 1 and self.task and learns_rl:
             n_step = buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env)
-            batch = batch._replace(n_step=n_step._replace(next_observations=sense(n_step.next_observations)))
-        goes_on = self._has_curious_agent and learns_rl and not self.curiosity_episodic
+            batch = batch._replace(n_step=n_step._replace(next_observations=prepare(n_step.next_observations)))
+        goes_on = learns_rl and "curious" in self._learners() and not self.curiosity_episodic
         if goes_on and type(buffer) is FrameStackReplayBuffer:  # a subclass may sample otherwise
-            batch = batch._replace(restarts=sense(buffer.restarts(self._vec_normalize_env)))
+            batch = batch._replace(restarts=prepare(buffer.restarts(self._vec_normalize_env)))
         return batch
 
     def _plan(self) -> tuple[bool, bool, int]:

@@ -341,6 +341,14 @@ class CuRePolicy(BasePolicy):
             return observations
         return flatten_vectors(observations, self.observation_space)
 
+    def prepare(self, observations: Any) -> Any:
+        """Convert observations of the replay buffer to those of ``Samples``: vectors in float32, images in NHWC order.
+
+        :param observations: As stored, [B, *shape], a dictionary of such, or None
+        :return: As ``sense`` gives them; None as it is
+        """
+        return _prepared(self.sense(observations))
+
     def samples(self, sampled: Any, random: bool = True) -> Samples:
         """Convert a batch to the ``Samples`` that heads and rewards get.
 
@@ -350,7 +358,7 @@ class CuRePolicy(BasePolicy):
         """
         fields = sampled._asdict()
         for name in ("observations", "next_observations"):
-            fields[name] = _prepared(self.sense(fields[name]))
+            fields[name] = self.prepare(fields[name])
         view = self.augmentation if random else self.augmentation.center
         return Samples(**{**fields, "views": _prepared(view(fields["observations"]))})
 

@@ -186,8 +186,8 @@ class Pretraining(CuRe):
         self._check_that_srl_learns("pretrain")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector must be 'curious' or 'random', but is {collector!r}.")
-        self._keeps_replay_buffer = keep_replay_buffer
         self._begin_pretraining(collector)
+        self._keeps_replay_buffer = keep_replay_buffer
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
         finally:

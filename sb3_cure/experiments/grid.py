@@ -267,6 +267,14 @@ class Cell:
         """
         return ALGORITHMS[self.algo](env=env, seed=self.seed, **{**self.build_arguments(), **changes})
 
+    def load_model(self, path: Path) -> CuReSAC:
+        """Load one of its models, to act and to measure: its replay buffer has room for one transition.
+
+        :param path: The model's archive
+        :return: The model
+        """
+        return ALGORITHMS[self.algo].load(path, custom_objects={**self.custom_objects(), "buffer_size": 1})
+
     def is_done(self, results: Path) -> bool:
         """Whether it has been run.
 

@@ -134,8 +134,7 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
 
 def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator[tuple[str, list[Episode]]]:
     """Roll out the episodes of ``measure_visits`` again, by policy; policies in ``known`` are left out."""
-    path = results / cell.folder / "model.zip"
-    model = ALGORITHMS[cell.algo].load(path, custom_objects={**cell.custom_objects(), "buffer_size": 1})
+    model = cell.load_model(results / cell.folder / "model.zip")
     with contextlib.closing(cell.make_eval_env()) as env:
         for actor in visiting_actors(model, cell):
             if actor not in known:

@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from agents_for_tests import q_values
 from envs_for_tests import Cliff, VectorBox, tiny_model
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_cure import CuReSAC
 from sb3_cure.srl import SRLHead, SRLOutput
@@ -73,6 +74,18 @@ def test_dying_is_worth_what_follows(head: type[SRLHead], is_episodic: bool, pay
     gain = gain_of_dying(model)
     assert gain > 0.1 if pays else gain < -0.1
     assert pays or deaths(model) < 0.2
+
+
+def test_restarts_are_normalised_as_successors_are() -> None:
+    env = VecNormalize(DummyVecEnv([Cliff]), norm_reward=False)
+    model = tiny_model("MlpPolicy", env, learning_starts=200, batch_size=64).learn(200)
+    batch = model._sample_batch(64, learns_rl=True)
+    ended = batch.dones[:, 0] > 0
+    assert 0 < ended.sum() < 64
+    assert th.equal(batch.restarts[~ended], batch.next_observations[~ended])
+    # Of three numbers the last is 1 after a fall alone, and the one before it at a reset alone
+    first = env.normalize_obs(np.array([[0.0, 1, 0]], np.float32))
+    np.testing.assert_allclose(batch.restarts[ended][:, 1:], first[:, 1:].repeat(int(ended.sum()), 0), rtol=1e-5)
 
 
 def test_transition_model_must_say_what_it_is() -> None:

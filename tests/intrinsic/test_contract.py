@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
-from envs_for_tests import PixelBox, VectorBox, tiny_model
+from envs_for_tests import Cliff, PixelBox, VectorBox, tiny_model
 from stable_baselines3.common.env_util import make_vec_env
 from torch import nn
 from updates_for_tests import equal, filled_model, groups, moved, train_once
@@ -158,11 +158,13 @@ def test_reward_is_one_number_per_sample(shape: tuple[int, ...]) -> None:
 
 def test_heads_get_vectors_in_float32() -> None:
     """Gymnasium's MuJoCo observes float64."""
-    env = VectorBox()
-    env.observation_space = gym.spaces.Box(-1, 1, env.observation_space.shape, np.float64)
-    model = tiny_model("MlpPolicy", env, srl=None, intrinsic=LatentStep, learning_starts=10).learn(12)
+    env = Cliff()
+    env.observation_space = gym.spaces.Box(-2, 2, env.observation_space.shape, np.float64)
+    settings: dict[str, Any] = dict(srl=None, intrinsic=LatentStep, learning_starts=100, batch_size=64, n_steps=2)
+    model = tiny_model("MlpPolicy", env, **settings).learn(102)
     batch = model.policy.intrinsic.given[-1].batch
-    assert {each.dtype for each in (batch.observations, batch.next_observations, batch.views)} == {th.float32}
+    seen = (batch.observations, batch.next_observations, batch.views, batch.n_step.next_observations, batch.restarts)
+    assert {each.dtype for each in seen} == {th.float32}
 
 
 @UPDATES
