@@ -5,6 +5,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -359,6 +360,11 @@ class CuReBase(OffPolicyAlgorithm):
             )
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
+        if self._action_repeat > 1 and isinstance(self.replay_buffer, HerReplayBuffer):
+            raise ValueError(
+                f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
+                "the single rewards that it computes for other goals: use action_repeat=1."
+            )
         return total, callback
 
     def _store_transition(

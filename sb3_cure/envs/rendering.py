@@ -1,9 +1,13 @@
-"""The OpenGL that dm_control renders with: which backend is used, and whether it works."""
+"""The OpenGL that MuJoCo renders with: which backend is used, whether it works, and whose context is current."""
 
 import importlib
 import os
 import sys
+import threading
 import warnings
+from typing import Any
+
+import gymnasium as gym
 
 
 class GLUnavailableError(RuntimeError):
@@ -101,3 +105,42 @@ def check_gl() -> str:
             physics.free()
     except Exception as error:
         raise _gl_error(error) from error
+
+
+def mujoco_renderer_of(env: gym.Env) -> Any:
+    """Look for what draws Gymnasium's MuJoCo environments.
+
+    :param env: Any environment
+    :return: Its ``MujocoRenderer``, or None. Of the mazes of Gymnasium-Robotics it belongs to an environment inside
+    """
+    base: Any = env.unwrapped
+    inner = getattr(base, "point_env", None) or getattr(base, "ant_env", base)
+    return getattr(inner.unwrapped, "mujoco_renderer", None)
+
+
+def free_mujoco_contexts(renderer: Any) -> None:
+    """Free what a ``MujocoRenderer`` draws with; its next frame makes it anew.
+
+    MuJoCo frees textures and meshes by number, in whichever OpenGL context is current: Gymnasium, which frees the
+    context first, would destroy those of another environment, whose frames are black from then on.
+
+    :param renderer: The ``MujocoRenderer`` of an environment
+    """
+    for viewer in renderer._viewers.values():
+        make_context_current(viewer)
+        viewer.con.free()
+        viewer.close()
+    renderer._viewers.clear()
+    renderer.viewer = None
+
+
+def make_context_current(viewer: Any) -> None:
+    """Let a viewer of a ``MujocoRenderer`` draw in its own OpenGL context, whoever drew last.
+
+    :param viewer: The viewer
+    """
+    viewer.make_context_current()
+    # dm_control remembers which of its contexts is current, and would not notice.
+    if (dm_control := sys.modules.get("dm_control._render.base")) is not None:
+        last = dm_control._CURRENT_CONTEXT_FOR_THREAD.pop(threading.current_thread(), None)
+        dm_control._CURRENT_THREAD_FOR_CONTEXT.pop(last, None)

@@ -12,8 +12,8 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
     """Refuse spaces that would be read as something else than meant.
 
     An image is a ``Box`` of dtype uint8 with three dimensions and bounds 0 and 255. All other boxes are vectors.
-    Refused are nested dictionaries, texts, boxes that look like images but would be read as vectors, and
-    ``"MultiInputPolicy"`` for one image.
+    Refused are nested dictionaries, texts, boxes that look like images but would be read as vectors, boxes without
+    dimensions or entries, and ``"MultiInputPolicy"`` for one image.
 
     :param space: Space of observations
     :param policy: Name or class of the policy; None: do not check that it fits
@@ -30,15 +30,21 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
 
 
 def check_action_space(space: spaces.Space) -> None:
-    """Refuse actions that are integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1.
+    """Refuse integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1, and equal bounds.
 
     :param space: Space of actions
-    :raises ValueError: If it is no box of floats
+    :raises ValueError: If it is no box of floats, or a lower bound equals the upper one, between which SB3's policies
+        would scale to numbers that are not finite
     """
     if not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
         raise ValueError(
             f"actions are {space}, but policies give real numbers: let an ActionWrapper, whose action_space is a Box "
             "of floats, make the environment's of them."
+        )
+    if (space.low == space.high).any():
+        raise ValueError(
+            f"actions are {space}, where a lower bound equals the upper one: wrap the environment in NormalizeActions "
+            "of sb3_cure.envs, which leaves them as they must be."
         )
 
 
@@ -51,6 +57,11 @@ def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
     if space.shape is None:
         raise ValueError(
             f"{name} is a {type(space).__name__}, which is no array: leave it out, as by "
+            "gymnasium.wrappers.FilterObservation with the other keys."
+        )
+    if isinstance(space, spaces.Box) and (space.shape == () or 0 in space.shape):
+        raise ValueError(
+            f"{name} has the shape {space.shape}: return a number as [1], and leave out what is empty, as by "
             "gymnasium.wrappers.FilterObservation with the other keys."
         )
     if not isinstance(space, spaces.Box) or len(space.shape) < 2 or sorted(space.shape)[-2] < MIN_SIDE:

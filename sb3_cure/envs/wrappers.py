@@ -1,6 +1,7 @@
 """Wrappers from an environment that can render itself, or returns images, to one that an agent sees through pixels."""
 
 import copy
+import weakref
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +14,12 @@ from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
 from sb3_cure.data.observations import image_spaces
-from sb3_cure.envs.rendering import choose_backend
+from sb3_cure.envs.rendering import (
+    choose_backend,
+    free_mujoco_contexts,
+    make_context_current,
+    mujoco_renderer_of,
+)
 from sb3_cure.envs.spaces_check import check_observation_space
 
 # MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
@@ -70,19 +76,19 @@ def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
 def draw_fast(env: gym.Env, image_size: int) -> None:
     """Let an environment draw frames of ``OVERSAMPLING`` times the observed size, without shadows and reflections.
 
-    :param env: A MuJoCo environment of Gymnasium or Gymnasium-Robotics that has not rendered yet
+    :param env: A MuJoCo environment of Gymnasium or Gymnasium-Robotics
     :param image_size: Height and width of the observation in pixels
     :raises ValueError: If it is another environment
     """
-    base: Any = env.unwrapped
-    if not hasattr(base, "mujoco_renderer"):
+    renderer = mujoco_renderer_of(env)
+    if renderer is None:
         raise ValueError(f"renderer='fast' is for Gymnasium's MuJoCo environments, which {env} is not: use 'env'.")
     choose_backend()
-    # All of this takes effect because the rendering context is made with the first frame.
-    visual, size = base.model.vis, OVERSAMPLING * image_size
+    free_mujoco_contexts(renderer)  # All of this takes effect when the next frame makes a new one.
+    visual, size = renderer.model.vis, OVERSAMPLING * image_size
     visual.quality.shadowsize = visual.quality.offsamples = 0
-    base.model.mat_reflectance[:] = 0
-    base.mujoco_renderer.width = base.mujoco_renderer.height = size
+    renderer.model.mat_reflectance[:] = 0
+    renderer.width = renderer.height = size
     visual.global_.offwidth = max(visual.global_.offwidth, size)
     visual.global_.offheight = max(visual.global_.offheight, size)
 
@@ -178,6 +184,9 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
             raise ValueError(f"renderer must be 'env' or 'fast', not {renderer!r}.")
         if renderer == "fast":
             draw_fast(env, self.image_size)
+        self._renderer = mujoco_renderer_of(env)
+        if self._renderer is not None:  # also where it is never closed
+            weakref.finalize(self, free_mujoco_contexts, self._renderer).atexit = False
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
@@ -189,7 +198,7 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
         :return: uint8 [channels, image_size, image_size]
         :raises ValueError: If the environment renders something else than uint8 RGB frames
         """
-        frame: Any = self.env.render()  # some of PyBullet's have an alpha channel, which is left out
+        frame: Any = self.render()  # some of PyBullet's have an alpha channel, which is left out
         is_image = isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3
         if not (is_image and frame.shape[-1] in (3, 4)):
             given = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else f"a {type(frame).__name__}"
@@ -199,6 +208,21 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
                 "return such frames."
             )
         return to_image(frame[..., :3], self.image_size, self.grayscale)
+
+    def render(self) -> Any:
+        """Render a frame.
+
+        :return: A frame, uint8 [height, width, 3]
+        """
+        if self._renderer is not None and self._renderer.viewer is not None:
+            make_context_current(self._renderer.viewer)
+        return super().render()
+
+    def close(self) -> None:
+        """Close the environment, and free what MuJoCo draws with."""
+        if self._renderer is not None:
+            free_mujoco_contexts(self._renderer)
+        super().close()
 
 
 class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):

@@ -17,6 +17,7 @@ from stable_baselines3.sac.policies import CnnPolicy, MultiInputPolicy
 
 from sb3_cure import CuReSAC
 from sb3_cure.cure.base import CuReBase
+from sb3_cure.envs.wrappers import ActionRepeat
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 BAD: dict[str, list[Any]] = {
@@ -123,6 +124,13 @@ def test_hindsight_with_restarting_workers_is_refused() -> None:
             tiny_model("MultiInputPolicy", venv, **her).learn(10)
     finally:
         venv.close()
+
+
+def test_hindsight_with_repeated_actions_is_refused() -> None:
+    """Rewards of the goals that were reached are computed for one step, those that are stored are sums."""
+    env = ActionRepeat(Goal(), 2)
+    with pytest.raises(ValueError, match="use action_repeat=1"):
+        tiny_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=20).learn(10)
 
 
 def test_images_of_floats_are_refused() -> None:

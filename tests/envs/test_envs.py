@@ -1,6 +1,7 @@
 """The environments: what the agent sees, gets and may do, compared with dm_control itself."""
 
 import copy
+import gc
 import os
 import subprocess
 import sys
@@ -352,6 +353,40 @@ def test_gymnasium_is_drawn_fast():
     between = np.abs(frames["fast"] - frames["env"]).mean(axis=(1, 2, 3))
     since_the_first = np.abs(frames["env"][1:] - frames["env"][0]).mean(axis=(1, 2, 3))
     assert between.max() < since_the_first.min() / 2
+
+
+def test_environments_are_drawn_as_if_each_were_alone(make):
+    """MuJoCo draws and frees in whichever OpenGL context is current, which Gymnasium leaves to chance."""
+    makers = [partial(make_pixel_env, name, image_size=36) for name in ("HalfCheetah-v5", "InvertedPendulum-v5")]
+    makers += [partial(makers[0], renderer="fast"), partial(make, "cheetah", "run")]
+
+    def steps(env):
+        env.reset(seed=0)
+        return env.step(np.full(env.action_space.shape, 0.5, np.float32))[0]
+
+    envs, alone = [], []
+    for maker in makers:
+        envs.append(maker())
+        alone.append(steps(envs[-1]))
+    for env, expected in zip(envs, alone, strict=True):
+        np.testing.assert_array_equal(steps(env), expected)
+    dropped, closed, *others = envs
+    closed.close()
+    del envs, env, dropped
+    gc.collect()
+    for env, expected in zip(others, alone[2:], strict=True):
+        np.testing.assert_array_equal(steps(env), expected)
+
+
+def test_renderer_is_fast_after_a_frame_of_the_environment():
+    """A user may look at a frame before wrapping."""
+    env = gym.make("InvertedPendulum-v5", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (480, 480, 3)
+    env = make_pixel_env(env, image_size=36, renderer="fast")
+    env.reset(seed=0)
+    assert env.render().shape == (72, 72, 3)
+    env.close()
 
 
 @pytest.mark.parametrize(

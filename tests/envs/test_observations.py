@@ -9,7 +9,14 @@ from envs_for_tests import PixelBox, VectorBox, tiny_model
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_cure.envs import CopyObservations, ResizeImages, StackFrames, check_observation_space, make_pixel_env
+from sb3_cure.envs import (
+    CopyObservations,
+    NormalizeActions,
+    ResizeImages,
+    StackFrames,
+    check_observation_space,
+    make_pixel_env,
+)
 from sb3_cure.persistence import ResumableEnv
 
 
@@ -94,6 +101,8 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
         (spaces.Dict(top=image(48, 48, 3)), "is a Dict, which .* flatten it"),
         (spaces.Tuple([image(48, 48, 3)]), "is a Tuple, which"),
         (spaces.Text(16), "is a Text, .*FilterObservation"),
+        (spaces.Box(-1, 1, ()), r"return a number as \[1\]"),
+        (spaces.Box(-1, 1, (0,)), "leave out what is empty"),
         (image(84, 84), r"return it as \[H, W, 1\]"),
         (image(1, 84, 84, 3), "StackFrames"),
         (image(84, 84, 3, high=1, dtype=np.float32), "return it as uint8 from 0 to 255, else flatten it"),
@@ -103,7 +112,7 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
         (image(64, 64, 1, high=65535, dtype=np.uint16), "return it as uint8"),  # and in millimetres
     ],
 )
-def test_image_that_would_be_a_vector_is_refused(part: spaces.Space, advice: str) -> None:
+def test_part_that_would_be_read_otherwise_is_refused(part: spaces.Space, advice: str) -> None:
     with pytest.raises(ValueError, match=rf"the observation 'front' .*{advice}"):
         check_observation_space(spaces.Dict(joints=spaces.Box(-1, 1, (4,)), front=part), "MultiInputPolicy")
 
@@ -162,6 +171,16 @@ def test_integer_actions_are_refused() -> None:
     env.action_space = spaces.Box(0, 10, (2,), np.int32)
     with pytest.raises(ValueError, match=r"actions are .*int32"):
         tiny_model("MlpPolicy", env)
+
+
+def test_action_without_a_choice_is_refused() -> None:
+    """A locked joint, which the policy's scaling would divide by zero; wrapped it stays where it must be."""
+    env = Returns(spaces.Box(-1, 1, (2,)), np.zeros(2, np.float32))
+    env.action_space = spaces.Box(np.array([-1, 0.5], np.float32), np.array([1, 0.5], np.float32))
+    with pytest.raises(ValueError, match="NormalizeActions"):
+        tiny_model("MlpPolicy", env)
+    tiny_model("MlpPolicy", NormalizeActions(env))
+    assert NormalizeActions(env).action(np.array([1, -1], np.float32)).tolist() == [1, 0.5]
 
 
 # ------------------------------------------------------------------------------------------------------------- resize
