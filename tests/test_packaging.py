@@ -18,6 +18,7 @@ from stable_baselines3.common.envs import FakeImageEnv
 
 from sb3_cure import CuReSAC, __version__, recipe
 from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
+from sb3_cure.srl import VAE
 
 ROOT = Path(__file__).parent.parent
 
@@ -94,6 +95,9 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     own.write_text(yaml.safe_dump({"default": {**entry, "gamma": 0.9}, "dmc_pixels": {**entry, "gamma": 0.8}}))
     assert recipe(own) == {"srl": None, "gamma": 0.9}
     assert recipe(own, "dmc_pixels/walker-walk-v0") == {"srl": None, "gamma": 0.8}
+    zoo = {"srl": "sb3_cure.srl.VAE", "train_freq": [1, "episode"], "frame_stack": 3, "normalize": True}
+    own.write_text(yaml.safe_dump({"default": zoo}))
+    assert recipe(own) == {"srl": VAE, "train_freq": (1, "episode")}
     env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
     model = CuReSAC("CnnPolicy", env, buffer_size=10, **recipe("fast/drq_single_view"))
     assert (model.srl, model.curiosity, model.gamma) == (None, None, 0.98)

@@ -98,15 +98,18 @@ def zoo_entry(path: Path, task: str, modules: Sequence[str] = ()) -> dict[str, A
     raise UsageError(f"{path} has neither a mapping {task!r} nor 'default'.")
 
 
-#: Settings of a zoo file that are not arguments of the model
-_NOT_OF_MODEL = ("n_timesteps", "policy", "n_envs", "env_kwargs", "env_wrapper")
+#: Settings of a zoo file that are not arguments of the model: of training and, as in rl-zoo3, of environments
+_NOT_OF_MODEL = (
+    *("n_timesteps", "policy", "callback"),
+    *("n_envs", "env_kwargs", "env_wrapper", "vec_env_wrapper", "monitor_kwargs", "frame_stack", "normalize"),
+)
 
 
 def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
     """Read the arguments of a model from a zoo file: ``CuReSAC("CnnPolicy", env, **recipe("fast/best"))``.
 
-    The settings of the environment (``env_kwargs``, ``env_wrapper``, ``n_envs``), ``policy`` and ``n_timesteps`` are
-    left out.
+    The settings of the environment (``env_kwargs``, ``env_wrapper``, ``frame_stack``, ``normalize`` ...), ``policy``,
+    ``n_timesteps`` and ``callback`` are left out. Classes of your own, ``srl: my_heads.MyHead``, are imported.
 
     :param name: A file of the package, such as ``"fast/best"``, or the path of your own with suffix
     :param task: Gymnasium id whose entry is read; by default that for any environment
@@ -114,7 +117,10 @@ def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
     :raises UsageError: if there is no such file or entry
     """
     entry = zoo_entry(zoo_file(name), task)
-    return {key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}
+    arguments = {key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}
+    if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
+        arguments["train_freq"] = tuple(arguments["train_freq"])
+    return arguments | named_classes(arguments)
 
 
 def check_environment(task: str) -> None:

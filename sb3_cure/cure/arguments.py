@@ -14,7 +14,7 @@ from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.intrinsic import IntrinsicReward, get_intrinsic_class
 from sb3_cure.intrinsic.srl_error import SRLError
-from sb3_cure.srl import SRLHead, get_srl_class
+from sb3_cure.srl import get_srl_class
 
 Rate = Annotated[float, Field(ge=0, le=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -28,12 +28,10 @@ class CuReArguments(BaseModel):
 
     model_config = ConfigDict(from_attributes=True, arbitrary_types_allowed=True)
 
-    srl: str | type[SRLHead] | None
     srl_kwargs: dict[str, Any]
     srl_schedule: Literal["simultaneous", "alternating"]
     srl_period: Count
     srl_interval: Count
-    intrinsic: str | type[IntrinsicReward]
     intrinsic_kwargs: dict[str, Any]
     curiosity: Literal["separate", "bonus", "random"] | None
     curiosity_prob: Rate | Schedule
@@ -64,6 +62,7 @@ def check_arguments(model: Any) -> None:
     :param model: A CuRe model, its arguments set
     :raises ValueError: for the first that cannot work, in one sentence
     """
+    choose_intrinsic(model)  # refuses names and classes that are neither heads nor rewards
     try:
         checked = CuReArguments.model_validate(model)
     except ValidationError as error:

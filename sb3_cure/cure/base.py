@@ -227,10 +227,10 @@ class CuReBase(OffPolicyAlgorithm):
         check_observation_space(self.observation_space, self.policy_class)
         self._guard = FiniteGuard(deferred=self.device.type != "cpu")
         self._mixer = CuriousMixer(self.seed)
-        if self.replay_buffer_class in (None, FrameStackReplayBuffer):
+        if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
-            self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
+            self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
             # Else SB3's `learn` marks the newest row as done.
             self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()

@@ -44,7 +44,7 @@ class CuRePolicy(BasePolicy):
     :param features_extractor_class: ``PixelEncoder``, ``VectorEncoder``, ``DictEncoder`` or any SB3
         ``BaseFeaturesExtractor``
     :param features_extractor_kwargs: Its arguments
-    :param optimizer_class: Optimiser of everything, ``th.optim.Adam`` by default
+    :param optimizer_class: Optimiser of all networks, ``th.optim.Adam`` by default; temperatures always use Adam
     :param optimizer_kwargs: Its arguments but for the learning rate
     :param n_critics: Number of critics
     :param n_quantiles: Quantiles of each critic (TQC; 25 by default)

@@ -187,6 +187,7 @@ def fit_head(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator
         policy.set_training_mode(True)
         batch = observation_batch(observations[random.integers(len(observations), size=128)], model.device)
         views = policy.augmentation(batch.observations)
+        policy.encoder.update_statistics(views)
         loss = head.loss(batch._replace(views=views), policy.encoder(views)).loss
         optimizer.zero_grad()
         loss.backward()

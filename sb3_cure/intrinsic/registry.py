@@ -43,4 +43,9 @@ def get_intrinsic_class(
     if isinstance(intrinsic, type) and issubclass(intrinsic, IntrinsicReward):
         return intrinsic
     names = ", ".join(map(repr, ["auto", *INTRINSIC_REWARDS]))
-    raise ValueError(f"intrinsic is {intrinsic!r}: choose one of {names}, or a subclass of IntrinsicReward.")
+    # A module's own repr takes many lines.
+    given = f"an instance of {type(intrinsic).__name__}" if isinstance(intrinsic, IntrinsicReward) else repr(intrinsic)
+    raise ValueError(
+        f"intrinsic is {given}: choose one of {names}, or a subclass of sb3_cure.intrinsic.IntrinsicReward (the class "
+        "itself, not an instance)."
+    )

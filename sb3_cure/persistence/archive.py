@@ -238,7 +238,8 @@ class SavesModels(OffPolicyAlgorithm):
         model = cls(settings["policy_class"], env, device=device, _init_setup_model=False)  # type: ignore[arg-type, call-arg]
         for key in settings:
             # A callback, say, may have set further attributes; none may hide a method or a part of the model.
-            if hasattr(cls, key) or key in model._excluded_save_params():
+            of_class = getattr(cls, key, None)
+            if callable(of_class) or isinstance(of_class, property) or key in model._excluded_save_params():
                 raise ArchiveError(f"{name} has {key:.50}, which is no setting: it is damaged, or of another version.")
         vars(model).update(settings)
         if unknown := kwargs.keys() - vars(model).keys() - archive.content["settings"].keys():

@@ -17,6 +17,7 @@ from stable_baselines3.sac.policies import CnnPolicy, MultiInputPolicy
 
 from sb3_cure import CuReSAC
 from sb3_cure.cure.base import CuReBase
+from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.envs.wrappers import ActionRepeat
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
@@ -98,6 +99,22 @@ def test_combination_that_learns_something_else_is_refused(arguments: dict[str, 
 def test_rewards_of_the_next_observation_need_no_future(reward: dict[str, Any]) -> None:
     """Unlike the error of the observation itself."""
     tiny_model("CnnPolicy", PixelBox(), curiosity_gamma=0, **reward)
+
+
+def test_instances_of_heads_and_rewards_are_refused() -> None:
+    """In one sentence: the text of a module takes many lines."""
+    policy: Any = tiny_model("CnnPolicy", PixelBox(), intrinsic="rnd").policy
+    for argument, given in (("srl", policy.srl), ("intrinsic", policy.intrinsic)):
+        with pytest.raises(ValueError, match=rf"^{argument} is an instance of {type(given).__name__}.*class itself"):
+            tiny_model("CnnPolicy", PixelBox(), **{argument: given})
+
+
+def test_subclass_of_the_replay_buffer_is_told_the_frames() -> None:
+    class Own(FrameStackReplayBuffer):
+        pass
+
+    model = tiny_model("CnnPolicy", PixelBox(frame_stack=3), replay_buffer_class=Own).learn(12)
+    assert model.replay_buffer.frame_stack == 3
 
 
 @pytest.mark.parametrize("policy, env", [(CnnPolicy, PixelBox), (MultiInputPolicy, Goal)])

@@ -201,6 +201,15 @@ def test_reconstructions_are_of_the_same_observations_over_training(tmp_path: Pa
     assert picture.shape[0] > height and picture.std() > 5
 
 
+def test_reconstructions_show_all_channels_of_frames_that_the_buffer_is_told(tmp_path: Path) -> None:
+    """Where the environment stacks frames, and does not say so."""
+    env = PixelBox(frame_stack=2, tells_frame_stack=False)
+    model = tiny_model("CnnPolicy", env, replay_buffer_kwargs=dict(frame_stack=2))
+    callback = ReconstructionCallback(tmp_path, every=15, columns=2)
+    model.learn(20, callback=callback)
+    assert callback.rows[0][1][""].shape[1] == 3
+
+
 def test_picture_has_no_more_rows_than_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It stays as high as ``MAX_ROWS`` rows, the first and the last among them."""
     monkeypatch.setattr(callbacks, "MAX_ROWS", 3)

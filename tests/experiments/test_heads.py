@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
+from envs_for_tests import VectorBox, tiny_model
 from grids_for_tests import DMC_TASK, TINY, method, write_grid
 
 from sb3_cure import CuReSAC, CuReTQC
@@ -60,6 +62,15 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(heads, "fit_head", fit_but_one)
     return seeds
+
+
+def test_head_learns_from_vectors_that_are_standardised() -> None:
+    """As in training: an encoder that has seen nothing clips numbers beyond 10."""
+    model = tiny_model("MlpPolicy", VectorBox(), curiosity=None)
+    observations = np.random.default_rng(0).normal(1000, 5, (200, 2)).astype(np.float32)
+    assert list(heads.fit_head(model, observations, 3)) == [1, 2, 3]
+    latents = model.policy.encode(th.as_tensor(observations))
+    assert latents.std(dim=0).max() > 0.1
 
 
 def test_heads_are_made_once_and_again_of_others(visits: Path, fitted: list[int]) -> None:

@@ -111,7 +111,9 @@ class Unknown(VectorEncoder):
 
 
 class OwnModel(CuReSAC):
-    """A user's algorithm with an argument of its own."""
+    """A user's algorithm with an argument of its own, and a counter."""
+
+    n_calls = 0
 
     def __init__(self, *args: Any, spam: float = 1.0, **kwargs: Any):
         self.spam = spam
@@ -135,8 +137,9 @@ def test_attributes_of_subclasses_and_users_come_back() -> None:
     """A subclass's argument, and what a callback has set, say; but nothing that hides a method."""
     model: Any = OwnModel("MlpPolicy", VectorBox(), spam=0.5, policy_kwargs=dict(net_arch=[4]), device="cpu")
     model.names = [np.str_("spam")]
+    model.n_calls += 1
     loaded: Any = OwnModel.load(saved(model))
-    assert (loaded.spam, loaded.names) == (0.5, ["spam"])
+    assert (loaded.spam, loaded.names, loaded.n_calls) == (0.5, ["spam"], 1)
     assert OwnModel.load(saved(model), spam=2.0).spam == 2.0
     model.learn = "spam"
     with pytest.raises(ArchiveError, match="has learn, which is no setting"):
