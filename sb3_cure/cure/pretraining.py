@@ -119,13 +119,14 @@ class Pretraining(CuRe):
             parts += ["curious.", "intrinsic.", "scale."]
 
         def transferred(tensors: dict[str, Any]) -> dict[str, Any]:
-            kept = (name for name in tensors if name.startswith(tuple(parts)) and "_extra_state" not in name)
-            return {name: tensors[name] for name in kept}
+            # The extra state of a reward, such as places in the replay buffer, belongs to its model.
+            kept = (name for name in tensors if name.startswith("srl.") or "_extra_state" not in name)
+            return {name: tensors[name] for name in kept if name.startswith(tuple(parts))}
 
         own = self.policy.state_dict()
         here, there = transferred(own), transferred(networks)
         for name in here | there or dict.fromkeys(parts):
-            ours, theirs = (tuple(each[name].shape) if name in each else None for each in (here, there))
+            ours, theirs = (tuple(getattr(each[name], "shape", ())) if name in each else None for each in (here, there))
             if ours is None or ours != theirs:
                 raise ValueError(
                     f"{path} has {name} of shape {theirs}, and this model of shape {ours}: transfer needs equal "

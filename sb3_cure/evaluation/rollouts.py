@@ -169,8 +169,10 @@ def run_episodes(
     agent: Any = model
     predict = agent.predict_curious if actor == "curious" else agent.predict
     state_of = physics_state if states is True else states
-    if seed is not None:
-        env.action_space.seed(seed)
+    space = env.action_space
+    if seed is not None:  # of a copy: as an attribute of the class, the space is that of the training environment, too
+        space = copy.deepcopy(space)
+        space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
         # Copies: environments may reuse their arrays for observations, and change actions
@@ -180,7 +182,7 @@ def run_episodes(
         finished, memory = False, None  # memory of recurrent policies
         while not finished:
             if actor == "random":
-                action = env.action_space.sample()
+                action = space.sample()
             else:
                 action, memory = predict(
                     as_trained(model, observations[-1]), memory, np.array([not actions]), deterministic

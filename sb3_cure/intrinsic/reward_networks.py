@@ -23,7 +23,7 @@ def scaled(observations: th.Tensor, space: spaces.Space) -> th.Tensor:
     :param space: Their space
     :return: Images in [-0.5, 0.5] in NHWC memory order, [B, C, H, W]; anything else as a vector, [B, n]
     """
-    if is_image_space(space, check_channels=False):
+    if is_image_space(space):
         return observations.contiguous(memory_format=th.channels_last).float().div_(255).sub_(0.5)
     return flatten_vectors(observations, space)
 
@@ -56,7 +56,7 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16)
     :param n_filters: Channels of the convolutions
     :return: The network
     """
-    if not is_image_space(space, check_channels=False):
+    if not is_image_space(space):
         return MLP([get_flattened_obs_dim(space), *sizes])
     channels, *size = space.shape  # type: ignore[misc]
     layers: list[nn.Module] = []

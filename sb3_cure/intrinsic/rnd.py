@@ -42,7 +42,7 @@ class RND(IntrinsicReward):
     ):
         super().__init__(*args)
         self.space = self.observation_space
-        if is_image_space(self.space, check_channels=False):
+        if is_image_space(self.space):
             channels, height, width = self.space.shape  # type: ignore[misc]
             self.space = spaces.Box(0, 255, (channels // frame_stack, height, width), np.uint8)
         self.target = make_network(self.space, [hidden_dim, n_outputs], n_filters).requires_grad_(False)

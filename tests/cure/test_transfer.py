@@ -22,6 +22,22 @@ class Doubtful(RAE):
     """An autoencoder of one's own."""
 
 
+class Counted(RAE):
+    """With a state of its own."""
+
+    n_losses = 0
+
+    def loss(self, *args: Any) -> Any:
+        self.n_losses += 1
+        return super().loss(*args)
+
+    def get_extra_state(self) -> Any:
+        return {"n_losses": th.tensor(self.n_losses)}
+
+    def set_extra_state(self, state: Any) -> None:
+        self.n_losses = int(state["n_losses"])
+
+
 class Norms(RAE):
     """With layers that follow their inputs while they train."""
 
@@ -81,6 +97,12 @@ def test_parts_are_taken_and_the_task_begins_anew(algorithm: str, curiosity: str
     assert differences(encoder, tensors(model, ("encoder.",))) != [], "it is trained on"
 
 
+def test_state_of_a_head_is_taken(tmp_path: Path) -> None:
+    source = saved(tmp_path / "model.zip", srl=Counted)
+    model = untrained(srl=Counted).transfer_from(tmp_path / "model")
+    assert model.policy.srl.n_losses == source.policy.srl.n_losses > 0
+
+
 FROZEN: dict[str, Any] = {
     "rae, joint": dict(),
     "rae, sequential": dict(update="sequential"),
@@ -107,6 +129,10 @@ def test_frozen_representation_stays(name: str, tmp_path: Path) -> None:
     loaded.learn(12, reset_num_timesteps=False)
     for each in (model, loaded):
         assert each._n_updates > 0 and differences(kept, tensors(each, REPRESENTATION)) == []
+    thawed = type(model).load(
+        tmp_path / "frozen", env=model.get_env(), custom_objects=objects, representation_frozen=False
+    )
+    assert differences(kept, tensors(thawed.learn(12, reset_num_timesteps=False), REPRESENTATION)) != []
     moved = {name.split(".")[1] for name in agents if not th.equal(agents[name], tensors(model, (name,))[name])}
     assert {"actor", "critic", "critic_target"} <= moved
     for call in (model.pretrain, model.fit_representation):

@@ -104,16 +104,18 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
     models = []
     for watched in (False, True):
         callbacks: list[BaseCallback] = []
+        training, watching = PixelBox(), PixelBox()
+        watching.action_space = training.action_space  # as where it is an attribute of the class
         if watched:
-            env = Careless(PixelBox())
+            env = Careless(watching)
             callbacks = [
-                EvalBothCallback(env, 15, n_episodes=1),
+                EvalBothCallback(env, 5, n_episodes=1, actors=["task", "curious", "random"], seed=1),
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
                 ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
                 StateProbeCallback(env, 15, n_episodes=2, **MAP),
             ]
-        model = tiny_model("CnnPolicy", PixelBox(), srl="curl", srl_kwargs=dict(bank_size=12))
+        model = tiny_model("CnnPolicy", training, srl="curl", srl_kwargs=dict(bank_size=12))
         models.append(model.learn(40, callback=callbacks))
     assert names(tmp_path) == sorted(
         [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
