@@ -67,7 +67,7 @@ def links_into_the_site(app: Sphinx, docname: str, source: list[str]) -> None:
             source[0] = f"# {Path(docname).parent.name}\n\n{source[0]}"
         if docname.count("/") > 1:  # tables of one experiment, which pages link to
             source[0] = f"---\norphan: true\n---\n\n{source[0]}"
-    else:
+    elif not docname.startswith("notebooks/"):  # which lie beside `results` on the site, too
         source[0] = re.sub(r"(\]\((?:\.\./)*)\.\./" + copied, r"\1", source[0])
 
 

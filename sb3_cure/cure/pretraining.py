@@ -130,7 +130,8 @@ class Pretraining(CuRe):
             if ours is None or ours != theirs:
                 raise ValueError(
                     f"{path} has {name} of shape {theirs}, and this model of shape {ours}: transfer needs equal "
-                    "images, encoders and heads, and for a curious agent equal actions and rewards."
+                    "images, encoders and heads, and for a curious agent (not with curiosity=None) equal algorithms, "
+                    "actions and rewards."
                 )
         ignored = ({"srl"} if self.srl is None else set()) | (
             set() if transfers_curious else {"intrinsic", "activation"}
