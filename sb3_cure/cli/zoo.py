@@ -24,6 +24,7 @@ from rl_zoo3 import ALGOS, create_test_env, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import EnvironmentName, SimpleLinearSchedule, StoreDict, get_model_path
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
@@ -41,7 +42,6 @@ from sb3_cure.cli.zoo_files import (
     zoo_entry,
     zoo_file,
 )
-from sb3_cure.data.buffers import FrameStackReplayBuffer
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.rendering import is_headless
 
@@ -412,7 +412,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
     objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in CLASS_ARGUMENTS if vars(args)[name]}
-    objects["replay_buffer_class"] = _NoReplayBuffer
+    objects |= {"replay_buffer_class": _NoReplayBuffer, "n_steps": 1, "optimize_memory_usage": False}
     load: Any = ALGORITHMS[args.algo].load
     with _refusals_in_one_sentence(make_dmc_env):
         env = create_test_env(
@@ -422,7 +422,7 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
     return model, model.get_env(), path
 
 
-class _NoReplayBuffer(FrameStackReplayBuffer):
+class _NoReplayBuffer(ReplayBuffer):
     """Stand-in for the run's replay buffer: nothing is stored, and the archive may not hold the buffer's class."""
 
     def __init__(self, *args: Any, **kwargs: Any):

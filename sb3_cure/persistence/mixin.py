@@ -66,7 +66,8 @@ class Persistence(SavesModels, SavesReplayBuffers):
             arguments are not
         :param device: Device of the networks
         :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
-        :param kwargs: Settings to change; training then no longer equals the one before
+        :param kwargs: Settings to change; training then no longer equals the one before. (``buffer_size``, which the
+            replay buffer has kept, stays)
         :return: The model
         :raises ArchiveError: if there is no whole checkpoint, or another number of environments
         :raises ValueError: if the environments have other layers, or another id

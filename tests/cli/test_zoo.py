@@ -322,6 +322,7 @@ def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.Captur
         {"replay_buffer_kwargs": {"frame_stack": 1}},
         {"replay_buffer_class": "heads_of_mine.Buffer"},
         {"n_steps": 3},
+        {"optimize_memory_usage": True},
     ],
 )
 def test_agent_plays_whatever_buffer_it_had(changes: dict[str, Any], folder: Path) -> None:
