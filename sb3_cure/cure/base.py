@@ -1,5 +1,6 @@
 """Everything of CuRe but its algorithm: arguments, set-up, environments and saving."""
 
+import inspect
 import warnings
 from typing import Any, ClassVar, TypeVar
 
@@ -21,6 +22,7 @@ from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.spaces_check import check_action_space, check_observation_space
+from sb3_cure.envs.wrappers import ActionRepeat
 from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
@@ -230,7 +232,8 @@ class CuReBase(OffPolicyAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
-            self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
+            if "frame_stack" in inspect.signature(self.replay_buffer_class).parameters:
+                self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
             # Else SB3's `learn` marks the newest row as done.
             self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
@@ -360,7 +363,8 @@ class CuReBase(OffPolicyAlgorithm):
             )
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
-        if self._action_repeat > 1 and isinstance(self.replay_buffer, HerReplayBuffer):
+        sums_rewards = self._action_repeat > 1 and any(env.env_is_wrapped(ActionRepeat))
+        if sums_rewards and isinstance(self.replay_buffer, HerReplayBuffer):
             raise ValueError(
                 f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."

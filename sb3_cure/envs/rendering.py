@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 import warnings
+import weakref
 from typing import Any
 
 import gymnasium as gym
@@ -118,29 +119,63 @@ def mujoco_renderer_of(env: gym.Env) -> Any:
     return getattr(inner.unwrapped, "mujoco_renderer", None)
 
 
+#: Renderers of environments that were dropped without being closed, which is also done in the middle of a frame
+_dropped: list[Any] = []
+#: Viewers that only another thread could free
+_lost: list[Any] = []
+
+
+def free_when_dropped(env: gym.Env) -> None:
+    """Let what an environment's ``MujocoRenderer`` draws with be freed before the next frame after it is dropped.
+
+    :param env: Any environment
+    """
+    if (renderer := mujoco_renderer_of(env)) is not None:
+        weakref.finalize(env, _dropped.append, renderer).atexit = False
+
+
 def free_mujoco_contexts(renderer: Any) -> None:
     """Free what a ``MujocoRenderer`` draws with; its next frame makes it anew.
 
     MuJoCo frees textures and meshes by number, in whichever OpenGL context is current: Gymnasium, which frees the
-    context first, would destroy those of another environment, whose frames are black from then on.
+    context first, would destroy those of another environment, whose frames are black from then on. It also ends GLFW
+    for all.
 
     :param renderer: The ``MujocoRenderer`` of an environment
     """
     for viewer in renderer._viewers.values():
-        make_context_current(viewer)
+        try:
+            viewer.make_context_current()
+        except Exception:  # each backend has its own
+            _lost.append(viewer)
+            continue
         viewer.con.free()
-        viewer.close()
+        viewer.free()
     renderer._viewers.clear()
     renderer.viewer = None
+    _forget_context_of_dm_control()
 
 
-def make_context_current(viewer: Any) -> None:
-    """Let a viewer of a ``MujocoRenderer`` draw in its own OpenGL context, whoever drew last.
+def render_in_own_context(env: gym.Env) -> Any:
+    """Render an environment, in its own OpenGL context if it is one of Gymnasium's MuJoCo environments.
 
-    :param viewer: The viewer
+    :param env: Any environment
+    :return: What ``env.render()`` returns
     """
-    viewer.make_context_current()
-    # dm_control remembers which of its contexts is current, and would not notice.
+    while _dropped:
+        free_mujoco_contexts(_dropped.pop())
+    if (renderer := mujoco_renderer_of(env)) is None:
+        return env.render()
+    if renderer.viewer is not None:
+        renderer.viewer.make_context_current()
+    try:
+        return env.render()
+    finally:
+        _forget_context_of_dm_control()
+
+
+def _forget_context_of_dm_control() -> None:
+    """Let dm_control make its own current again: it remembers which one is, and does not notice other libraries."""
     if (dm_control := sys.modules.get("dm_control._render.base")) is not None:
         last = dm_control._CURRENT_CONTEXT_FOR_THREAD.pop(threading.current_thread(), None)
         dm_control._CURRENT_THREAD_FOR_CONTEXT.pop(last, None)

@@ -1,7 +1,6 @@
 """Wrappers from an environment that can render itself, or returns images, to one that an agent sees through pixels."""
 
 import copy
-import weakref
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -17,8 +16,9 @@ from sb3_cure.data.observations import image_spaces
 from sb3_cure.envs.rendering import (
     choose_backend,
     free_mujoco_contexts,
-    make_context_current,
+    free_when_dropped,
     mujoco_renderer_of,
+    render_in_own_context,
 )
 from sb3_cure.envs.spaces_check import check_observation_space
 
@@ -184,9 +184,7 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
             raise ValueError(f"renderer must be 'env' or 'fast', not {renderer!r}.")
         if renderer == "fast":
             draw_fast(env, self.image_size)
-        self._renderer = mujoco_renderer_of(env)
-        if self._renderer is not None:  # also where it is never closed
-            weakref.finalize(self, free_mujoco_contexts, self._renderer).atexit = False
+        free_when_dropped(self)
         self.grayscale = grayscale
         shape = (1 if grayscale else 3, self.image_size, self.image_size)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
@@ -214,14 +212,12 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
 
         :return: A frame, uint8 [height, width, 3]
         """
-        if self._renderer is not None and self._renderer.viewer is not None:
-            make_context_current(self._renderer.viewer)
-        return super().render()
+        return render_in_own_context(self.env)
 
     def close(self) -> None:
         """Close the environment, and free what MuJoCo draws with."""
-        if self._renderer is not None:
-            free_mujoco_contexts(self._renderer)
+        if (renderer := mujoco_renderer_of(self.env)) is not None:
+            free_mujoco_contexts(renderer)
         super().close()
 
 

@@ -169,10 +169,8 @@ def run_episodes(
     agent: Any = model
     predict = agent.predict_curious if actor == "curious" else agent.predict
     state_of = physics_state if states is True else states
-    space = env.action_space
-    if seed is not None:  # of a copy: as an attribute of the class, the space is that of the training environment, too
-        space = copy.deepcopy(space)
-        space.seed(seed)
+    space = copy.deepcopy(env.action_space)  # as an attribute of the class, it is that of the training environment, too
+    space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
         # Copies: environments may reuse their arrays for observations, and change actions

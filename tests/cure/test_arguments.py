@@ -113,8 +113,13 @@ def test_subclass_of_the_replay_buffer_is_told_the_frames() -> None:
     class Own(FrameStackReplayBuffer):
         pass
 
-    model = tiny_model("CnnPolicy", PixelBox(frame_stack=3), replay_buffer_class=Own).learn(12)
-    assert model.replay_buffer.frame_stack == 3
+    class Knows(FrameStackReplayBuffer):
+        def __init__(self, buffer_size: int, *args: Any, **kwargs: Any):
+            super().__init__(buffer_size, *args, frame_stack=3, **kwargs)
+
+    for buffer in (Own, Knows):
+        model = tiny_model("CnnPolicy", PixelBox(frame_stack=3), replay_buffer_class=buffer).learn(12)
+        assert model.replay_buffer.frame_stack == 3
 
 
 @pytest.mark.parametrize("policy, env", [(CnnPolicy, PixelBox), (MultiInputPolicy, Goal)])

@@ -355,27 +355,71 @@ def test_gymnasium_is_drawn_fast():
     assert between.max() < since_the_first.min() / 2
 
 
+def step_of(env):
+    env.reset(seed=0)
+    return env.step(np.full(env.action_space.shape, 0.5, np.float32))[0]
+
+
 def test_environments_are_drawn_as_if_each_were_alone(make):
-    """MuJoCo draws and frees in whichever OpenGL context is current, which Gymnasium leaves to chance."""
-    makers = [partial(make_pixel_env, name, image_size=36) for name in ("HalfCheetah-v5", "InvertedPendulum-v5")]
-    makers += [partial(makers[0], renderer="fast"), partial(make, "cheetah", "run")]
-
-    def steps(env):
-        env.reset(seed=0)
-        return env.step(np.full(env.action_space.shape, 0.5, np.float32))[0]
-
+    """MuJoCo draws in whichever OpenGL context is current, which Gymnasium and dm_control leave to chance."""
+    makers = [partial(make, "cheetah", "run")]
+    makers += [partial(make_pixel_env, name, image_size=36) for name in ("HalfCheetah-v5", "InvertedPendulum-v5")]
+    makers += [partial(makers[1], renderer="fast")]
     envs, alone = [], []
     for maker in makers:
         envs.append(maker())
-        alone.append(steps(envs[-1]))
+        alone.append(step_of(envs[-1]))
+        np.testing.assert_array_equal(step_of(envs[0]), alone[0])  # after the first frame of another one
     for env, expected in zip(envs, alone, strict=True):
-        np.testing.assert_array_equal(steps(env), expected)
-    dropped, closed, *others = envs
-    closed.close()
-    del envs, env, dropped
+        np.testing.assert_array_equal(step_of(env), expected)
+
+
+@pytest.mark.parametrize("ends", ["closed", "dropped", "dropped while another one draws"])
+def test_end_of_one_environment_leaves_the_others_their_pictures(ends):
+    """MuJoCo frees textures and meshes by number, in whichever OpenGL context is current."""
+    other, env = (make_pixel_env("HalfCheetah-v5", image_size=36, renderer="fast") for _ in range(2))
+    step_of(other)
+    expected = step_of(env)
+    if ends == "closed":
+        other.close()
+    if ends == "dropped while another one draws":
+        frame, held = env.unwrapped.mujoco_renderer.render, [other]
+
+        def render(mode):
+            held.clear()
+            gc.collect()
+            return frame(mode)
+
+        env.unwrapped.mujoco_renderer.render = render
+    del other
     gc.collect()
-    for env, expected in zip(others, alone[2:], strict=True):
-        np.testing.assert_array_equal(steps(env), expected)
+    for _ in range(2):
+        np.testing.assert_array_equal(step_of(env), expected)
+
+
+def test_drawn_environment_can_be_copied_and_drawn_after_it_was_closed():
+    env = make_pixel_env("InvertedPendulum-v5", image_size=36, renderer="fast")
+    expected = step_of(env)
+    assert copy.deepcopy(env).observation_space == env.observation_space
+    env.close()
+    np.testing.assert_array_equal(step_of(env), expected)
+
+
+def test_mazes_are_drawn_fast():
+    """Those of Gymnasium-Robotics have the environment that draws inside."""
+
+    class Maze(gym.Wrapper):
+        @property
+        def unwrapped(self):
+            return self
+
+        @property
+        def point_env(self):
+            return self.env
+
+    env = make_pixel_env(Maze(gym.make("InvertedPendulum-v5", render_mode="rgb_array")), image_size=36, renderer="fast")
+    env.reset(seed=0)
+    assert env.render().shape == (72, 72, 3)
 
 
 def test_renderer_is_fast_after_a_frame_of_the_environment():

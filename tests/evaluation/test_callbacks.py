@@ -109,7 +109,7 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
         if watched:
             env = Careless(watching)
             callbacks = [
-                EvalBothCallback(env, 5, n_episodes=1, actors=["task", "curious", "random"], seed=1),
+                *(EvalBothCallback(env, 5, 1, actors=["task", "curious", "random"], seed=seed) for seed in (1, None)),
                 PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
                 ReconstructionCallback(tmp_path, 15, decoder_updates=2),
                 CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
