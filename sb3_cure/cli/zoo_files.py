@@ -117,10 +117,20 @@ def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
     :raises UsageError: if there is no such file or entry
     """
     entry = zoo_entry(zoo_file(name), task)
-    arguments = {key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}
-    if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
+    return model_arguments({key: value for key, value in entry.items() if key not in _NOT_OF_MODEL})
+
+
+def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert arguments of a model that YAML cannot write: pairs to tuples, and names to the user's classes.
+
+    :param read: Arguments as read from a file
+    :return: Arguments as the model takes them
+    :raises UsageError: as ``find_class``
+    """
+    arguments = {**read, **named_classes(read)}
+    if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does
         arguments["train_freq"] = tuple(arguments["train_freq"])
-    return arguments | named_classes(arguments)
+    return arguments
 
 
 def check_environment(task: str) -> None:

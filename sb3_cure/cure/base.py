@@ -363,8 +363,8 @@ class CuReBase(OffPolicyAlgorithm):
             )
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
-        sums_rewards = self._action_repeat > 1 and any(env.env_is_wrapped(ActionRepeat))
-        if sums_rewards and isinstance(self.replay_buffer, HerReplayBuffer):
+        has_hindsight = isinstance(self.replay_buffer, HerReplayBuffer)
+        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(ActionRepeat)):
             raise ValueError(
                 f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."

@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from numpy import ndarray
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer, psutil
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
 
@@ -418,6 +419,16 @@ def stacks_by_key(space: spaces.Space, frame_stack: int | Mapping[str, int]) -> 
     if isinstance(frame_stack, Mapping):
         return {key: frame_stack.get(key, 1) for key in images}
     return {key: 1 if key and image.shape[0] % frame_stack else frame_stack for key, image in images.items()}
+
+
+def frame_stacks(model: OffPolicyAlgorithm) -> dict[str, int]:
+    """Frames per observation of each image: what the replay buffer is told or, without that, what environments say.
+
+    :param model: A model
+    :return: Frames by the keys of ``image_spaces``
+    """
+    told = model.replay_buffer_kwargs.get("frame_stack")
+    return stacks_by_key(model.observation_space, told or infer_frame_stack(model.env))
 
 
 def infer_frame_stack(env: VecEnv | None) -> int:

@@ -22,7 +22,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tens
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
-from sb3_cure.data.buffers import infer_frame_stack, stacks_by_key, stored_places, transitions
+from sb3_cure.data.buffers import frame_stacks, stored_places, transitions
 from sb3_cure.data.observations import by_key, image_spaces
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
 from sb3_cure.envs.physics import check_coordinates, telling_coordinates
@@ -305,9 +305,7 @@ class ReconstructionCallback(PeriodicCallback):
         if drawn is None:
             return
         title, *pair = drawn
-        model: Any = self.model
-        frame_stack = model.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(self.training_env)
-        stacks = stacks_by_key(model.observation_space, frame_stack)
+        stacks = frame_stacks(self.model)  # type: ignore[arg-type]
         seen, row = (
             {key: np.array(as_arrays(newest_frames(each[key], stacks[key]))) for key in pair[1]} for each in pair
         )

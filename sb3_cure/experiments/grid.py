@@ -20,6 +20,7 @@ from sb3_cure.cli.zoo_files import (
     GRIDS,
     ZOO,
     check_environment,
+    model_arguments,
     named_classes,
     named_wrappers,
     read_yaml,
@@ -224,9 +225,7 @@ class Cell:
         """Copy ``arguments``, as SB3 writes into some, and import the classes that they name."""
         arguments = copy.deepcopy(self.arguments)
         arguments.pop("env_wrapper", None)
-        if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does: YAML knows no pairs
-            arguments["train_freq"] = tuple(arguments["train_freq"])
-        return {**arguments, **self.custom_objects()}
+        return model_arguments(arguments)
 
     def make_env(self) -> gym.Env:
         """Make an environment to train in, with the wrappers of ``env_wrapper``, as in rl-zoo's files.

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.cure.algorithms import CuReSAC
-from sb3_cure.data.buffers import infer_frame_stack
+from sb3_cure.data.buffers import frame_stacks
 from sb3_cure.envs import physics_state_names, physics_state_units
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import plots
@@ -97,5 +97,4 @@ def _draw_replay_buffer(model: CuReSAC, cell: Cell, folder: Path) -> None:
     if pair is not None:
         seen, drawn = (images.cpu().numpy() for images in pair)
         found = found._replace(observations=seen)  # what was to be drawn, such as a crop
-    n_frames = infer_frame_stack(model.env)  # type: ignore[arg-type]
-    plots.highest_error_frames(folder / "uncomfortable.png", found, n_frames, title, drawn)
+    plots.highest_error_frames(folder / "uncomfortable.png", found, frame_stacks(model)[""], title, drawn)
