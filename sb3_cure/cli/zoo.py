@@ -242,36 +242,34 @@ def train(arguments: Sequence[str]) -> None:
         ``--env`` may be ``my_module:My-v0``, with the module that registers it
     """
     register()
-    _check_values(arguments)
-    parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
-    parser.add_argument("--env")
-    parser.add_argument("--gym-packages", nargs="+", default=[])
-    parser.add_argument("--algo", default=DEFAULT_ALGORITHM)
-    given, rest = parser.parse_known_args(arguments)
+    given = _parse_train(arguments)
     for package in given.gym_packages:
         import_module(package)
-    if given.env is None and not {"-h", "--help"} & {*rest}:
+    # Of repeated flags argparse takes the last.
+    before = ["--algo", given.algo, *(["--conf-file", DEFAULT_SETTINGS] if given.algo in ALGORITHMS else [])]
+    after = []
+    if given.env is None and not given.help:
         raise UsageError("--env must name an environment, such as dmc_pixels/cartpole-swingup-v0.")
     if given.env is not None:
         check_environment(given.env)
         module, _, task = given.env.rpartition(":")
-        rest += ["--env", task]
-        given.gym_packages += [module] if module else []
-    if given.gym_packages:
-        rest += ["--gym-packages", *given.gym_packages]
+        packages = [*given.gym_packages, *([module] if module else [])]
+        after = ["--env", task, *(["--gym-packages", *packages] if packages else [])]
     own_arguments = sys.argv
-    settings = ["--conf-file", DEFAULT_SETTINGS] if given.algo in ALGORITHMS else []  # else rl-zoo3's own
-    # Of repeated flags argparse takes the last.
-    sys.argv = ["sb3-cure train", "--algo", given.algo, *settings, *rest]
+    sys.argv = ["sb3-cure train", *before, *arguments, *after]
     try:
         rl_zoo3.train.train()
     finally:
         sys.argv = own_arguments
 
 
-def _check_values(arguments: Sequence[str]) -> None:
-    """Refuse values that would make rl-zoo3 end in a traceback."""
+def _parse_train(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read the flags that are changed or checked here; refuse values that would make rl-zoo3 end in a traceback."""
     parser = argparse.ArgumentParser("sb3-cure train", add_help=False, allow_abbrev=False)
+    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("--env")
+    parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("--algo", default=DEFAULT_ALGORITHM)
     for flags in (("-params", "--hyperparams"), ("--env-kwargs",), ("--eval-env-kwargs",)):
         parser.add_argument(*flags, nargs="+", action=StoreDict)
     parser.add_argument("-i", "--trained-agent", type=Path)
@@ -279,6 +277,7 @@ def _check_values(arguments: Sequence[str]) -> None:
     agent = given.trained_agent
     if agent is not None and not (agent.suffix == ".zip" and agent.is_file()):
         raise UsageError(missing_file(agent) if agent.suffix == ".zip" else f"-i {agent} must be a model, a .zip file.")
+    return given
 
 
 def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:

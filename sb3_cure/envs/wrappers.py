@@ -139,8 +139,7 @@ class ActionRepeat(RepeatAction):
     def __init__(self, env: gym.Env, num_repeats: int) -> None:
         num_repeats = at_least_one("action_repeat", num_repeats)
         super().__init__(env, num_repeats)
-        # The environment may repeat actions, too.
-        self.action_repeat = num_repeats * action_repeat_of(env)
+        self.action_repeat = action_repeat_of(self)  # the environment may repeat actions, too
         if "render_fps" in env.metadata:
             self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / num_repeats}
 
@@ -160,8 +159,13 @@ def action_repeat_of(env: gym.Env) -> int:
     """Look for the action repeat of an environment.
 
     :param env: Any environment
-    :return: Environment steps per agent step: its attribute, else 1
+    :return: Environment steps per agent step: those of Gymnasium's ``RepeatAction``, ours included, times the attribute
+        ``action_repeat`` of the rest, else 1
     """
+    if isinstance(env, RepeatAction):
+        return int(env.num_repeats) * action_repeat_of(env.env)
+    if isinstance(env, gym.Wrapper) and not hasattr(env, "action_repeat"):
+        return action_repeat_of(env.env)
     return positive_attribute(env, "action_repeat")
 
 

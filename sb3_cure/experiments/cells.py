@@ -104,8 +104,8 @@ def _run(cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool) ->
         write_json(folder / "config.json", {**asdict(cell), "action_repeat": record.action_repeat})
         checkpoints = _TimedCheckpoint(folder / "checkpoint", checkpoint_minutes)
         if ExactCheckpoint.exists(checkpoints.path):  # the newest complete one
-            objects = cell.custom_objects()
-            model = ALGORITHMS[cell.algo].resume(checkpoints.path, env, custom_objects=objects)
+            objects, device = cell.custom_objects(), cell.arguments.get("device", "auto")  # archives have no device
+            model = ALGORITHMS[cell.algo].resume(checkpoints.path, env, device, custom_objects=objects)
             pretrain = cell.pretrain if model.is_pretraining else None
         else:
             model, pretrain = cell.make_model(env), cell.pretrain
@@ -211,14 +211,11 @@ class _Record(BaseCallback):
     def agent_steps(self, environment_steps: int) -> int:
         return -(-environment_steps // self.action_repeat)
 
-    def _begin_attempt(self, model: CuReSAC) -> None:
-        """Note machine and versions once, after the records of earlier attempts were restored."""
-        if not self._has_begun:
-            self._has_begun = True
-            self.attempts.append({"started": _now(), **_describe(model), "cpu_seconds": 0.0})
-
     def _on_training_start(self) -> None:
-        self._begin_attempt(self.model)  # type: ignore[arg-type]
+        if not self._has_begun:  # by pretraining; the records of earlier attempts are restored by now
+            self._has_begun = True
+            model: Any = self.model
+            self.attempts.append({"started": _now(), **_describe(model), "cpu_seconds": 0.0})
 
     def _on_step(self) -> bool:
         self._tick()
@@ -243,8 +240,7 @@ class _Record(BaseCallback):
     def _tick(self) -> None:
         now, cpu_now = time.monotonic(), time.process_time()
         self.seconds += now - self._now
-        if self.attempts:
-            self.attempts[-1]["cpu_seconds"] += cpu_now - self._cpu_now
+        self.attempts[-1]["cpu_seconds"] += cpu_now - self._cpu_now
         self._now, self._cpu_now = now, cpu_now
 
     @property
@@ -309,7 +305,6 @@ class _Record(BaseCallback):
         :param model: The cell's model
         :return: Versions, machine, times, attempts
         """
-        self._begin_attempt(model)
         return {
             **_describe(model),
             "started": self.attempts[0]["started"],

@@ -150,6 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = time.monotonic() - start
     if not progress.rows or progress.rows[-1]["agent_steps"] < model.num_timesteps:
         progress.evaluate()
+    if not rows.rows or rows.rows[-1][0] < model.num_timesteps:
         rows.draw(model)
     save(model, out)
     (out / "reconstructions.png").replace(out / "sees_and_holds.png")

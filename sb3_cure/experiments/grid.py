@@ -284,9 +284,7 @@ class Cell:
 
 
 #: Fields of a cell that must be equal before results are mixed
-SETTINGS = tuple(
-    each.name for each in fields(Cell) if each.name not in ("experiment", "method", "seed", "eval_curious")
-)
+SETTINGS = tuple(each.name for each in fields(Cell) if each.name not in ("experiment", "method", "seed"))
 
 
 def first_difference(before: Mapping[str, Any], now: Mapping[str, Any], keys: Iterable[str]) -> str | None:
@@ -509,6 +507,12 @@ def check_arms(cells: Iterable[Cell]) -> None:
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
         try:
             with contextlib.closing(cell.make_env()) as env, untouched_randomness(th.device("cpu")):
+                wrappers = [wrap for wrap, _ in named_wrappers(cell.arguments.get("env_wrapper"))]
+                if gym.wrappers.NormalizeObservation in wrappers:
+                    raise ValueError(
+                        "evaluations would not share NormalizeObservation's statistics: leave it out, as encoders "
+                        "standardise vectors themselves."
+                    )
                 if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
                     raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
                 cell.make_model(env, device="cpu", buffer_size=1)

@@ -20,10 +20,10 @@ from sb3_cure.experiments.grid import ERROR, Grid, check_arms, load_grid, read_j
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 
 ENGINES = ("local", "ray")
-#: Runs a unit in a folder of results, and tells whether it is done
-RunUnit: TypeAlias = Callable[[Unit, Path], bool]
-#: Runs units in a folder of results, and returns those that failed
-RunAll: TypeAlias = Callable[[Sequence[Unit], Path], list[Unit]]
+#: Runs a unit, and tells whether it is done
+RunUnit: TypeAlias = Callable[[Unit], bool]
+#: Runs units, and returns those that failed
+RunAll: TypeAlias = Callable[[Sequence[Unit]], list[Unit]]
 
 
 def run_grid(
@@ -59,18 +59,17 @@ def run_grid(
         raise UsageError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
-    run_unit = partial(_run_unit, checkpoint_minutes=checkpoint_minutes, pictures=pictures)
+    run_unit = partial(_run_unit, results=results, checkpoint_minutes=checkpoint_minutes, pictures=pictures)
     resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-    with (
-        _ray(address, resources, run_unit) if engine == "ray" else nullcontext(partial(_run_here, run_unit)) as run_all
-    ):
+    here = nullcontext(partial(_run_here, run_unit))
+    with _ray(address, resources, run_unit, results) if engine == "ray" else here as run_all:
         _write_grid(grid, results / grid.experiment)
         for cell in grid.cells:
             if cell.is_done(results):  # and was killed before it removed this
                 shutil.rmtree(results / cell.folder / "checkpoint", ignore_errors=True)
-        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)], results)
+        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)])
         heads = common_heads(grid, results)
-        failed += run_all([each for each in heads if not each.is_done(results)], results)
+        failed += run_all([each for each in heads if not each.is_done(results)])
     lacking = {cell.task for cell in grid.cells if grid.kind == "visitation"} - {each.task for each in heads}
     for task in sorted(lacking):
         print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
@@ -109,10 +108,10 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 # ---------------------------------------------------------------- engines
 
 
-def _run_here(run_unit: RunUnit, units: Sequence[Unit], results: Path) -> list[Unit]:
+def _run_here(run_unit: RunUnit, units: Sequence[Unit]) -> list[Unit]:
     failed, start = [], time.monotonic()
     for number, unit in enumerate(units, 1):
-        if not run_unit(unit, results):
+        if not run_unit(unit):
             failed.append(unit)
         left = (time.monotonic() - start) * (len(units) / number - 1)
         print(f"{number} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""), flush=True)
@@ -139,11 +138,11 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
     return True
 
 
-def _run_on_worker(run_unit: RunUnit, has_gpu: bool, unit: Unit, results: Path) -> bool:
+def _run_on_worker(run_unit: RunUnit, has_gpu: bool, unit: Unit) -> bool:
     """Run a unit in a Ray worker, and hide the GPUs from it if it needs none, which Ray does not do."""
     if not has_gpu:
         os.environ["CUDA_VISIBLE_DEVICES"] = ""
-    return run_unit(unit, results)
+    return run_unit(unit)
 
 
 def _write_error(unit: Unit, results: Path, text: str) -> None:
@@ -154,7 +153,7 @@ def _write_error(unit: Unit, results: Path, text: str) -> None:
 
 
 @contextmanager
-def _ray(address: str | None, resources: dict[str, Any], run_unit: RunUnit) -> Iterator[RunAll]:
+def _ray(address: str | None, resources: dict[str, Any], run_unit: RunUnit, results: Path) -> Iterator[RunAll]:
     """Connect to a cluster with the resources that a cell needs."""
     try:
         import ray
@@ -166,15 +165,15 @@ def _ray(address: str | None, resources: dict[str, Any], run_unit: RunUnit) -> I
     try:
         # One process per unit, so that nothing of a unit burdens the next.
         remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
-        yield partial(_run_remotely, partial(remote.remote, run_unit, bool(resources["num_gpus"])))
+        yield partial(_run_remotely, partial(remote.remote, run_unit, bool(resources["num_gpus"])), results)
     finally:
         ray.shutdown()
 
 
-def _run_remotely(start: Callable[[Unit, Path], Any], units: Sequence[Unit], results: Path) -> list[Unit]:
+def _run_remotely(start: Callable[[Unit], Any], results: Path, units: Sequence[Unit]) -> list[Unit]:
     import ray
 
-    failed, pending = [], {start(unit, results): unit for unit in units}
+    failed, pending = [], {start(unit): unit for unit in units}
     while pending:
         for reference in ray.wait(list(pending), timeout=5)[0]:
             unit = pending.pop(reference)

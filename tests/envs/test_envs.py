@@ -33,6 +33,7 @@ from sb3_cure.envs import (
 )
 from sb3_cure.envs.physics import telling_coordinates
 from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
+from sb3_cure.envs.wrappers import ActionRepeat, action_repeat_of
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
 
 load_gl()  # before any test imports dm_control
@@ -287,6 +288,14 @@ def test_repeats_of_the_environment_are_counted():
     twice = make_pixel_env(painting, image_size=40, action_repeat=2)
     assert twice.get_wrapper_attr("action_repeat") == 8
     assert twice.metadata["render_fps"] == 15
+
+
+def test_repeats_of_gymnasiums_wrapper_are_counted():
+    """Inside ours, outside of it, and around an environment with a repeat of its own."""
+    inside = ActionRepeat(gym.wrappers.RepeatAction(Painting(), 4), 2)
+    assert (inside.action_repeat, action_repeat_of(inside)) == (8, 8)
+    assert action_repeat_of(gym.wrappers.RepeatAction(inside, 3)) == 24
+    assert action_repeat_of(gym.wrappers.TimeLimit(gym.wrappers.RepeatAction(Painting(), 4), 10)) == 4
 
 
 def test_rendered_environment_is_seen_through_pixels():

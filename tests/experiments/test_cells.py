@@ -359,6 +359,24 @@ def test_no_moment_of_the_end_loses_the_cell(tmp_path: Path, monkeypatch: pytest
     assert read_rows(folder / "episodes.csv") == before and steps_of(folder) == [0, 160]
 
 
+def test_resumed_cell_computes_where_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the device of its settings, which archives do not keep."""
+    cell = only_cell(tmp_path, budget=40, methods={"a": method(device="cpu")})
+    with monkeypatch.context() as full:
+        full.setattr(cells, "write_text", lambda path, text: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run_cell(cell, tmp_path, 0, pictures=False)
+    resume, devices = CuReSAC.resume, []
+
+    def note(path: Path, env: Any, device: str, **kwargs: Any) -> CuReSAC:
+        devices.append(device)
+        return resume(path, env, device, **kwargs)
+
+    monkeypatch.setattr(CuReSAC, "resume", note)
+    run_cell(cell, tmp_path, 0, pictures=False)
+    assert devices == ["cpu"]
+
+
 def test_two_processes_do_not_run_one_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second one is refused while the first runs."""
     cell = only_cell(tmp_path, budget=40)

@@ -70,6 +70,18 @@ def test_demo_draws_the_agent_beside_what_it_sees(written: Path) -> None:
     assert len(np.unique(seen, axis=0)) <= 36 and seen.std() > 5 and (written / "agent.gif").stat().st_size < 1e6
 
 
+def test_time_limit_in_the_first_evaluation_leaves_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a slow machine, whose time is over before the first row of reconstructions; here a step takes a second."""
+    monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=itertools.count().__next__))
+    for name, result in (("EVALUATIONS", 2), ("ROWS", 1)):
+        monkeypatch.setattr(demo, name, result)
+    for name, result in (("_returns", np.ones(1)), ("_draw_curiosity", {}), ("_film", None)):
+        monkeypatch.setattr(demo, name, lambda *_, result=result: result)
+    assert demo.main(["--out", str(tmp_path), "--steps", "40", "--minutes", "0.388"]) == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["agent_steps"] == 20
+    assert np.asarray(Image.open(tmp_path / "sees_and_holds.png").convert("L")).std() > 5
+
+
 def test_demo_ends_at_the_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Training and schedules stop when its share of the minutes is over; here a step takes a second."""
     monkeypatch.setattr(demo, "time", SimpleNamespace(monotonic=itertools.count().__next__))

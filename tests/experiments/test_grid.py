@@ -149,6 +149,14 @@ def test_settings_that_cannot_work_are_refused(
     assert not (tmp_path / "out").exists()
 
 
+def test_statistics_that_evaluations_lack_are_refused(tmp_path: Path) -> None:
+    """Each environment would standardise observations by what it has seen itself."""
+    wrapped = method(policy="MlpPolicy", env_wrapper="gymnasium.wrappers.NormalizeObservation")
+    grid = load_grid(write_grid(tmp_path, methods={"a": wrapped}, tasks=["Pendulum-v1"]))
+    with pytest.raises(UsageError, match="evaluations would not share NormalizeObservation's statistics"):
+        check_arms(grid.cells)
+
+
 def test_wrong_command_line_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The options of ``sb3-cure experiment``, before anything is written."""
     path = str(write_grid(tmp_path))

@@ -277,5 +277,5 @@ def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.M
         return True
 
     for has_gpu in (True, False):
-        run._run_on_worker(run_unit, has_gpu, cell, tmp_path)
+        run._run_on_worker(run_unit, has_gpu, cell)
     assert seen == ["0", ""]
