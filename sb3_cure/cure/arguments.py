@@ -3,7 +3,7 @@
 SB3's own arguments are SB3's to check.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
@@ -73,9 +73,8 @@ def check_arguments(model: Any) -> None:
     for name, value in checked:
         if isinstance(value, int | float):  # YAML may give 1e3 or "0.1" as strings
             setattr(model, name, value)
-    for is_wrong, sentence in _conflicts(model):
-        if is_wrong:
-            raise ValueError(sentence)
+    for sentence in _conflicts(model):
+        raise ValueError(sentence)
 
 
 def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
@@ -93,54 +92,50 @@ def _depends_on_observation_alone(model: Any) -> bool:
     return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
 
 
-def _conflicts(model: Any) -> list[tuple[bool, str]]:
-    """Conditions that must not hold, each with what to do instead."""
+def _conflicts(model: Any) -> Iterator[str]:
+    """Combinations that must not be, each with what to do instead."""
     buffer: type = model.replay_buffer_class or FrameStackReplayBuffer
     ours = issubclass(buffer, FrameStackReplayBuffer)
     separate = model.curiosity == "separate"
-    return [
-        (
-            model.srl is None and bool(model.srl_kwargs),
-            f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head.",
-        ),
-        (
-            not model.task and not separate and (model.curiosity != "random" or model.srl is None),
+    if model.srl is None and model.srl_kwargs:
+        yield f"srl_kwargs is {model.srl_kwargs!r}, but srl=None has no arguments: choose a head."
+    if not model.task and not separate and (model.curiosity != "random" or model.srl is None):
+        yield (
             f"task=False leaves nothing to learn with curiosity={model.curiosity!r} and srl={model.srl!r}: use "
-            "curiosity='separate'.",
-        ),
-        (
-            separate and model.curiosity_gamma == 0 and _depends_on_observation_alone(model),
+            "curiosity='separate'."
+        )
+    if separate and model.curiosity_gamma == 0 and _depends_on_observation_alone(model):
+        yield (
             "with curiosity_gamma=0 the curious agent learns nothing from the error of the observation itself, which "
-            "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0.",
-        ),
-        (
-            model.n_steps > 1 and model.curiosity == "bonus",
+            "does not depend on the action: set curiosity_target='next_observation', or a curiosity_gamma > 0."
+        )
+    if model.n_steps > 1 and model.curiosity == "bonus":
+        yield (
             f"n_steps={model.n_steps} sums the task's rewards over steps, but curiosity='bonus' rewards single steps: "
-            "set n_steps=1, or curiosity='separate'.",
-        ),
-        (
-            issubclass(buffer, NStepReplayBuffer) or (model.n_steps > 1 and not ours),
+            "set n_steps=1, or curiosity='separate'."
+        )
+    if issubclass(buffer, NStepReplayBuffer) or (model.n_steps > 1 and not ours):
+        yield (
             f"{buffer.__name__} has no n-step returns that keep the next observation of one step, which heads and "
-            "rewards need: leave replay_buffer_class out, and set n_steps.",
-        ),
-        (
-            model.overlap and issubclass(buffer, HerReplayBuffer),
+            "rewards need: leave replay_buffer_class out, and set n_steps."
+        )
+    if model.overlap and issubclass(buffer, HerReplayBuffer):
+        yield (
             "overlap=True updates while the environments step, when HerReplayBuffer cannot ask them for rewards: use "
-            "overlap=False.",
-        ),
-        (
-            model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer),
+            "overlap=False."
+        )
+    if model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer):
+        yield (
             f"optimize_memory_usage=True makes {buffer.__name__} return the next episode's first observation at the "
-            "end of an episode: leave replay_buffer_class out, which keeps each frame once anyway.",
-        ),
-        (
-            not issubclass(model.policy_class, CuRePolicy),
+            "end of an episode: leave replay_buffer_class out, which keeps each frame once anyway."
+        )
+    if not issubclass(model.policy_class, CuRePolicy):
+        yield (
             f"the policy is {model.policy_class.__name__}, which has no shared encoder: use 'CnnPolicy', 'MlpPolicy' "
-            "or 'MultiInputPolicy'.",
-        ),
-        (
-            model.use_sde,
+            "or 'MultiInputPolicy'."
+        )
+    if model.use_sde:
+        yield (
             "use_sde=True explores by noise on the features of one actor, which the shared encoder changes: leave it "
-            "out.",
-        ),
-    ]
+            "out."
+        )

@@ -88,8 +88,8 @@ class CuReBase(OffPolicyAlgorithm):
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
     :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: what the head wants (RAE:
-        1000), or 0 where there is no warm-up. In each of them actors, temperatures and targets are updated, as in
-        SAC-AE's code
+        1000), or 0 where there is no warm-up or the head is frozen. In each of them actors, temperatures and targets
+        are updated, as in SAC-AE's code
     :param actor_update_interval: Updates of the critics per update of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
@@ -214,6 +214,8 @@ class CuReBase(OffPolicyAlgorithm):
         #: While ``learn`` runs with ``overlap=True``: the environments, which make updates as they step
         self._overlapped: OverlappedVecEnv | None = None
         self._action_repeat = 1
+        #: Frames per observation, for buffers and rewards; kept in archives, as models are loaded without environments
+        self._frame_stack: int | dict[str, int] | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -231,9 +233,11 @@ class CuReBase(OffPolicyAlgorithm):
         self._mixer = CuriousMixer(self.seed)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
+        if self._frame_stack is None:
+            self._frame_stack = self.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(self.env)
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             if "frame_stack" in inspect.signature(self.replay_buffer_class).parameters:
-                self.replay_buffer_kwargs.setdefault("frame_stack", infer_frame_stack(self.env))
+                self.replay_buffer_kwargs.setdefault("frame_stack", self._frame_stack)
             # Else SB3's `learn` marks the newest row as done.
             self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
@@ -263,10 +267,7 @@ class CuReBase(OffPolicyAlgorithm):
             augmentation_kwargs=self.augmentation_kwargs,
             intrinsic_class=choose_intrinsic(self) if rewarded else None,
             intrinsic_kwargs=self.intrinsic_kwargs,
-            reward_settings={
-                "frame_stack": self.replay_buffer_kwargs.get("frame_stack", 1),
-                "curiosity_target": self.curiosity_target,
-            },
+            reward_settings={"frame_stack": self._frame_stack, "curiosity_target": self.curiosity_target},
             task=self.task,
             curious=self._has_curious_agent,
             curiosity_encoder_grad=self.curiosity_encoder_grad,

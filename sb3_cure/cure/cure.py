@@ -102,7 +102,8 @@ class CuRe(CuReBase):
         """Make the burst of updates after the random steps, as SAC-AE does."""
         updates = self.warmup_updates
         if updates is None:
-            updates = 0 if self.srl is None or self.learning_starts == 0 else get_srl_class(self.srl).warmup_updates
+            wanted = self._learns_srl and self.learning_starts > 0
+            updates = get_srl_class(self.srl).warmup_updates if wanted else 0  # type: ignore[arg-type]
         if updates > 0 and self.gradient_steps != 0:
             if self.verbose >= 1:
                 print(f"Making {updates} updates before the next step (warmup_updates).")
@@ -169,7 +170,7 @@ class CuRe(CuReBase):
 
     def _plan(self) -> tuple[bool, bool, int]:
         """Whether the next update trains the representation, whether actors and critics, and its number of batches."""
-        learns_srl = self.srl is not None and not self.policy.representation_frozen
+        learns_srl = self._learns_srl
         learns_rl = self.task or self._has_curious_agent
         if not (learns_srl and learns_rl):
             return learns_srl, learns_rl, 1
@@ -177,6 +178,10 @@ class CuRe(CuReBase):
             return self._is_due(self._n_updates, self.srl_interval), True, 1
         srl_phase = self._n_updates // self.srl_period % 2 == 0
         return srl_phase, not srl_phase, 2
+
+    @property
+    def _learns_srl(self) -> bool:
+        return self.srl is not None and not self.policy.representation_frozen
 
     def _is_due(self, n_before: int, interval: int) -> bool:
         """Whether a step that is made once per ``interval`` updates is due now; in the burst it always is."""

@@ -41,8 +41,7 @@ def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: in
     keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
     if keeps and (model._n_updates - 1) % RECONSTRUCTION_INTERVAL < n_updates:
         # Not asked of the environments: overlapped updates are made while these make a step.
-        frame_stack = model.replay_buffer_kwargs.get("frame_stack", 1)
-        strips = reconstruction_strips(model.policy, batch, frame_stack)  # type: ignore[arg-type]
+        strips = reconstruction_strips(model.policy, batch, model._frame_stack)  # type: ignore[arg-type, attr-defined]
         for key, strip in strips.items():
             name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"
             model.logger.record(name, Image(strip, "CHW"), exclude=("stdout", "log", "json", "csv"))

@@ -207,6 +207,13 @@ def test_each_update_of_the_burst_updates_actors(update: str) -> None:
             assert {name: steps(model)[f"{agent} {name}"] for name in expected} == expected
 
 
+def test_frozen_head_wants_no_burst() -> None:
+    """The autoencoder's 1000 updates would train actors and critics alone, on what the warm-up has collected."""
+    model = tiny_model("MlpPolicy", VectorBox(), warmup_updates=None)
+    model.policy.freeze_representation()
+    assert model.learn(12)._n_updates == 2
+
+
 @pytest.mark.parametrize("schedule", ["simultaneous", "alternating"])
 def test_each_update_of_the_burst_moves_targets(schedule: str) -> None:
     """Of a distance of 1 from what stands still, each leaves a half; later ones leave it as it is."""

@@ -173,6 +173,14 @@ def test_rnd_is_the_error_on_the_whitened_newest_frame(pixels: bool) -> None:
     assert th.equal(reward.mean, mean)
 
 
+def test_rnd_reads_the_newest_frame_of_any_buffer(tmp_path: Path) -> None:
+    """SB3's own knows nothing of frames; an archive is loaded without environments."""
+    model = tiny_model("CnnPolicy", PixelBox(), srl="curl", intrinsic="rnd", replay_buffer_class=ReplayBuffer)
+    assert reward_of(model).space.shape == (3, 36, 36)
+    model.save(tmp_path / "model")
+    assert reward_of(CuReSAC.load(tmp_path / "model")).space.shape == (3, 36, 36)
+
+
 def test_rnd_without_warm_up_measures_until_it_has_seen_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a single transition everything else would be clipped."""
     monkeypatch.setattr(rnd, "ENOUGH", 20)
