@@ -60,7 +60,7 @@ from sb3_cure.evaluation.result_files import (
     write_csv,
     write_json,
 )
-from sb3_cure.experiments.cells import EVAL_SEED, check_settings
+from sb3_cure.experiments.cells import EVAL_SEED, check_settings, is_evaluation_due
 from sb3_cure.experiments.grid import Cell, GridFile, Method, arm_cell, load_grid, short_name
 from sb3_cure.networks.allocator import tune_allocator
 
@@ -183,13 +183,14 @@ class Record:
         :param act: Deterministic policy, from an observation to an action
         :param finished: Whether training has ended, by either limit
         """
-        if not finished and step % self.cell.eval_every:
-            return
         limit = "" if not finished else "steps" if step == self.total else "minutes"
-        if self.rows and self.rows[-1]["agent_steps"] == step:
+        every = self.cell.eval_every * self.action_repeat
+        if is_evaluation_due(self.rows, step * self.action_repeat, every, finished):
+            self._evaluate(step, act, limit)
+        elif finished:
             self.rows[-1]["limit"] = limit
         else:
-            self._evaluate(step, act, limit)
+            return
         write_csv(self.path, COLUMNS, self.rows)
 
     def _evaluate(self, step: int, act: Callable[[np.ndarray], np.ndarray], limit: str) -> None:

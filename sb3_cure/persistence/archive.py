@@ -127,11 +127,10 @@ class SavesModels(OffPolicyAlgorithm):
 
     def _stateful_parts(self) -> dict[str, Any]:
         """Objects with ``state_dict`` and ``load_state_dict``, such as a generator, by name: saved and resumed."""
-        return getattr(super(), "_stateful_parts", dict)()  # type: ignore[no-any-return]
+        return {}
 
     def _before_save(self) -> None:
         """Finish what is under way, and refuse to save what is broken."""
-        getattr(super(), "_before_save", lambda: None)()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "lr_schedule"]  # which set-up makes of learning_rate

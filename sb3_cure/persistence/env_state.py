@@ -221,12 +221,13 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
-    values = {}
+    values, arguments = {}, vars(layer).get("_saved_kwargs", ())  # of which the new environment's hold
     for key, value in attributes.items():
         is_built = isinstance(value, EnvSpec | gym.Space | np.dtype | np.ufunc) or _keeps_nothing(value)
         if key not in no_state and not is_built and not any(value is other for other in layers):
             encode(value, f"{name}.{key}", {})
-            values[key] = value
+            if key.removeprefix("_") not in arguments:
+                values[key] = value
     encode(own, f"{name}.state_dict()", {})
     drawn = {key: [part._np_random for part in _parts(space)] for key, space in _spaces(layer).items()}
     # A copy, as the environment may write into its own

@@ -35,7 +35,12 @@ class Persistence(SavesModels, SavesReplayBuffers):
         return [*super()._excluded_save_params(), "_run"]
 
     def __deepcopy__(self: Self, memo: dict[int, Any]) -> Self:
-        """Copy the model with its environments and replay buffer, for population-based training."""
+        """Copy the model with its environments and replay buffer, for population-based training.
+
+        The logger is shared until the copy's next ``learn``: what it has opened cannot be copied.
+        """
+        if "_logger" in vars(self):
+            memo[id(self._logger)] = self._logger
         wrappers, env = [], self.env
         while isinstance(env, VecEnvWrapper):
             wrappers.append(env)

@@ -10,7 +10,7 @@ import traceback
 import warnings
 from collections.abc import Callable
 from functools import partialmethod
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.util import Finalize
 from typing import Any
 
@@ -120,6 +120,10 @@ class _Worker:
         self.connection.close()
         with contextlib.suppress(ValueError):  # it even survived SIGKILL
             self.process.close()
+
+    @property
+    def owes_answer(self) -> bool:
+        return self._n_unread > 0
 
     def send(self, request: tuple[str, Any]) -> None:
         """Send a request.
@@ -349,10 +353,14 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
             return
         self.closed = True
         deadline = time.monotonic() + min(CLOSE_SECONDS, self.timeout)
+        owing = {worker.connection: worker for worker in self.remotes if worker.fault is None and worker.owes_answer}
         for worker in self.remotes:
-            if worker.fault is None:
-                with contextlib.suppress(OSError):  # it is dead
-                    worker.connection.send(("close", None))
+            if worker.connection not in owing:
+                worker.send(("close", None))
+        # The others, in a step that Ctrl-C has left, are heard once they have answered
+        while owing and (answering := wait(list(owing), max(0.0, deadline - time.monotonic()))):
+            for connection in answering:
+                owing.pop(connection).send(("close", None))  # type: ignore[call-overload]
         for worker in self.remotes:
             fault = EnvFaultError(f"Environment {worker.index} has been closed: make the environments again.")
             worker.stop(fault, max(0.0, deadline - time.monotonic()))

@@ -489,6 +489,14 @@ def test_copy_learns_as_its_original(settings: dict[str, Any]) -> None:
     assert differences(state_of(model), state_of(twin)) == []
 
 
+def test_copy_shares_open_logs(tmp_path: Path) -> None:
+    """Neither a terminal nor TensorBoard's files can be copied."""
+    model = tiny_model("MlpPolicy", VectorBox(), verbose=1, tensorboard_log=str(tmp_path)).learn(12)
+    twin = copy.deepcopy(model)
+    assert twin.logger is model.logger
+    assert twin.learn(5, reset_num_timesteps=False).num_timesteps == 17 and model.num_timesteps == 12
+
+
 @both_updates
 def test_agent_without_task(update: str) -> None:
     """The curious actor always acts, also in ``predict``; the task networks stay as they were made."""

@@ -1,6 +1,7 @@
 """Episodes on disk: written, read into replay buffers, and learned from without an environment's step."""
 
 import copy
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -376,6 +377,18 @@ def test_resumed_run_records_each_episode_once(tmp_path: Path) -> None:
     assert resumed.num_timesteps == 80 and n_written > 1
     resumed.env.close()  # type: ignore[union-attr]
     assert recorded("parts") == recorded("whole")
+
+
+def test_resumed_run_records_into_its_own_folder(tmp_path: Path) -> None:
+    """That of the new environment: the old one may be on another machine."""
+    checkpoint = ExactCheckpoint(15, tmp_path / "checkpoints")
+    model = tiny_model("MlpPolicy", RecordEpisodes(VectorBox(), tmp_path / "old"), learning_starts=10**6)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(80, callback=[checkpoint, Interrupt(44)])
+    shutil.rmtree(tmp_path / "old")
+    env = RecordEpisodes(VectorBox(), tmp_path / "new")
+    CuReSAC.resume(tmp_path / "checkpoints", env, device="cpu").learn(80)
+    assert list((tmp_path / "new").glob("*.npz")) and not (tmp_path / "old").exists()
 
 
 def test_unknown_statistics_are_refused(tmp_path: Path) -> None:

@@ -257,6 +257,15 @@ def test_clock_stands_still_during_evaluation(tmp_path: Path, clock: Clock) -> N
     assert [row["limit"] for row in rows] == ["", "", "", "steps"]
 
 
+def test_odd_interval_with_an_update_every_second_step(tmp_path: Path, clock: Clock) -> None:
+    """The recipe is asked at even steps alone, and evaluated as often as the others."""
+    record = make_record(tmp_path, 1, clock)
+    record.cell = replace(record.cell, eval_every=5)
+    for step in range(0, 32, 2):
+        record.visit(step, np.zeros_like)
+    assert [row["agent_steps"] for row in read_rows(tmp_path / "seed0.csv")] == [0, 6, 10, 16, 20, 26, 30]
+
+
 def test_minutes_end_a_run_and_are_named(tmp_path: Path, clock: Clock) -> None:
     """The last evaluation may be one that was due; it is not made twice."""
     record = make_record(tmp_path, 2, clock)

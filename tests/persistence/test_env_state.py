@@ -336,6 +336,16 @@ def test_own_dm_control_task_is_reported() -> None:
     assert saved_error(vec_env_state(venv)) == "the task OwnTask is not one of dm_control.suite"
 
 
+def test_arguments_of_new_wrappers_hold() -> None:
+    """A longer time limit, in an episode that goes on."""
+    before, after = (DummyVecEnv([lambda limit=limit: wrappers.TimeLimit(Dot(), limit)]) for limit in (3, 5))
+    before.reset()
+    before.step(np.zeros((1, *before.action_space.shape), np.float32))
+    assert load_vec_env_state(after, vec_env_state(before)) is None
+    ends = [after.step(np.zeros((1, *after.action_space.shape), np.float32))[2][0] for _ in range(4)]
+    assert ends == [False, False, False, True]
+
+
 def test_state_of_other_environments_is_refused() -> None:
     makers: list[Callable[[], VecEnv]] = [
         lambda: DummyVecEnv([Dot]),

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_cure import make_dmc_env
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
-from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv
+from sb3_cure.vec_env import EnvFaultError, FaultTolerantSubprocVecEnv, workers
 
 #: What the sentence says of each kind of fault
 SAID = {
@@ -413,6 +413,34 @@ def test_closed_environments_are_not_started_again() -> None:
         with pytest.raises(EnvFaultError, match="Environment 0 has been closed"):
             call()
     assert env.restarts == [0]
+
+
+class Landing(gym.Wrapper):
+    """Notes in a file that it was closed.
+
+    :param env: The environment
+    :param note: The file
+    """
+
+    def __init__(self, env: gym.Env, note: Path):
+        super().__init__(env)
+        self.note = note
+
+    def close(self) -> None:
+        self.note.touch()
+        super().close()
+
+
+def test_environments_in_a_step_are_closed(tmp_path: Path) -> None:
+    """As after Ctrl-C, with an observation that waits to be read, as it is larger than what a connection takes."""
+    notes = [tmp_path / "waiting", tmp_path / "idle"]
+    env = make([partial(Landing, PixelBox(size=300), note) for note in notes])
+    env.reset()
+    env.remotes[0].send(("step", np.zeros(2, np.float32)))
+    start = time.monotonic()
+    env.close()
+    assert time.monotonic() - start < workers.CLOSE_SECONDS
+    assert all(note.exists() for note in notes)
 
 
 def cannot_be_made() -> gym.Env:
