@@ -253,8 +253,7 @@ def train(arguments: Sequence[str]) -> None:
     if given.env is not None:
         check_environment(given.env)
         module, _, task = given.env.rpartition(":")
-        packages = [*given.gym_packages, *([module] if module else [])]
-        after = ["--env", task, *(["--gym-packages", *packages] if packages else [])]
+        after = ["--env", task, *(["--gym-packages", *given.gym_packages, module] if module else [])]
     own_arguments = sys.argv
     sys.argv = ["sb3-cure train", *before, *arguments, *after]
     try:

@@ -427,8 +427,17 @@ def frame_stacks(model: OffPolicyAlgorithm) -> dict[str, int]:
     :param model: A model
     :return: Frames by the keys of ``image_spaces``
     """
-    told = model.replay_buffer_kwargs.get("frame_stack")
-    return stacks_by_key(model.observation_space, told or infer_frame_stack(model.env))
+    known = getattr(model, "_frame_stack", None)  # of our models, also without environments
+    return stacks_by_key(model.observation_space, known or choose_frame_stack(model))
+
+
+def choose_frame_stack(model: OffPolicyAlgorithm) -> Any:
+    """Frames per observation, as ``FrameStackReplayBuffer`` takes them.
+
+    :param model: A model
+    :return: What the replay buffer is told or, without that, what environments say
+    """
+    return model.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(model.env)
 
 
 def infer_frame_stack(env: VecEnv | None) -> int:
