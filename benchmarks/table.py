@@ -5,15 +5,15 @@
     python -m benchmarks.table
 
 Reads the cells of ``zoo_configs/experiments/fast/benchmark.yml`` in ``results/fast_benchmark/``, and where one of them
-is missing that of ``time_to_return.py`` in ``results/by_the_clock_amx/``, if it has an evaluation at the same step. The
-random policy is played once and kept in ``results/fast_benchmark/random.csv``, with machine and versions beside it.
+is missing that of ``time_to_return.py`` in ``results/by_the_clock_amx/``, if it has an evaluation at the same step. Of
+an arm without any of these, the cells of ``zoo_configs/experiments/fast/dense.yml`` in ``results/fast_dense/`` count.
+The random policy is played once and kept in ``results/fast_benchmark/random.csv``, with machine and versions beside it.
 """
 
 import argparse
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -44,6 +44,8 @@ TUNED = {
     "cartpole-swingup": ("sac_ae", "curl", "drq", "best", "best_cure"),
     "ball_in_cup-catch": ("best", "best_cure"),
 }
+#: Arms that are in ``fast/dense`` under other names, with other seeds
+DENSE = {"best": "plain", "best_cure": "cure"}
 MARK = "\N{DAGGER}"
 #: Environment steps [n] and returns [seeds, n]
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
@@ -53,21 +55,37 @@ Curves: TypeAlias = dict[str, dict[str, Curve]]
 Texts: TypeAlias = dict[str, list[str]]
 
 
-def read_cell(results: Path, cell: Cell) -> pd.DataFrame | None:
+def read_cell(paths: Sequence[Path], budget: int) -> pd.DataFrame | None:
     """Read a cell's evaluations.
 
-    :param results: Folder of all results
-    :param cell: Cell of the grid
-    :return: Rows up to the grid's budget; None if it has not come so far
+    :param paths: CSV files that may hold them
+    :param budget: Environment steps of the grid
+    :return: Rows of the first file that comes so far, up to the budget; None if none does
     """
-    clock = results / "by_the_clock_amx" / short_name(cell.task) / cell.method / f"seed{cell.seed}.csv"
-    for path in (results / cell.folder / "eval.csv", clock):
+    for path in paths:
         if path.exists():
             rows = pd.read_csv(path)
-            rows = rows[rows.environment_steps <= cell.budget]
-            if rows.environment_steps.max() == cell.budget:
+            rows = rows[rows.environment_steps <= budget]
+            if rows.environment_steps.max() == budget:
                 return rows
     return None
+
+
+def read_arm(results: Path, cells: Sequence[Cell]) -> list[pd.DataFrame]:
+    """Read an arm's evaluations on a task.
+
+    :param results: Folder of all results
+    :param cells: The grid's cells of this arm and task
+    :return: From ``read_cell``, of the seeds that have run
+    """
+    task, arm, budget = short_name(cells[0].task), cells[0].method, cells[0].budget
+    clock, dense = results / "by_the_clock_amx" / task / arm, results / "fast_dense" / task / DENSE.get(arm, arm)
+    own = [(results / cell.folder / "eval.csv", clock / f"seed{cell.seed}.csv") for cell in cells]
+    for files in (own, [(path,) for path in sorted(dense.glob("seed*/eval.csv"))]):
+        read = [rows for paths in files if (rows := read_cell(paths, budget)) is not None]
+        if read:
+            return read
+    return []
 
 
 def read_random(path: Path, grid: Grid) -> pd.DataFrame:
@@ -117,7 +135,7 @@ def pool(means: Sequence[float], stds: Sequence[float]) -> tuple[float, float]:
 def cell_text(evaluations: Sequence[pd.DataFrame], n_seeds: int, ms_per_step: float | None) -> str:
     """Format the last evaluations of an arm on a task.
 
-    :param evaluations: From ``read_cell``, of the seeds that have run
+    :param evaluations: From ``read_arm``
     :param n_seeds: Seeds of the grid
     :param ms_per_step: Milliseconds of an agent step, if measured
     :return: Mean and deviation of all episodes, and minutes of training; or that it has not run
@@ -127,8 +145,8 @@ def cell_text(evaluations: Sequence[pd.DataFrame], n_seeds: int, ms_per_step: fl
     last = pd.DataFrame([rows.iloc[-1] for rows in evaluations])
     mean, std = pool(last.return_mean, last.return_std)
     text = f"{mean:.0f} ± {std:.0f}"
-    if len(last) < n_seeds:
-        text += f" ({len(last)} of {n_seeds} seeds)"
+    if len(last) != n_seeds:
+        text += f" (seeds: {len(last)})"
     if ms_per_step is not None:
         text += f", {last.agent_steps.mean() * ms_per_step / 60_000:.0f} min"
     return text
@@ -137,7 +155,7 @@ def cell_text(evaluations: Sequence[pd.DataFrame], n_seeds: int, ms_per_step: fl
 def stack(evaluations: Sequence[pd.DataFrame]) -> Curve:
     """Interpolate the curves of several seeds to the steps of the first.
 
-    :param evaluations: From ``read_cell``
+    :param evaluations: From ``read_arm``
     :return: Environment steps [n] and returns [seeds, n]
     """
     steps = evaluations[0].environment_steps.to_numpy(float)
@@ -152,22 +170,21 @@ def collect(results: Path, grid: Grid, costs: dict[str, Any]) -> tuple[Texts, Cu
     :param costs: Milliseconds of an agent step, by task and arm (``step_cost.py``)
     :return: Texts of the table, and curves
     """
-    seeds, budget = grid.description["seeds"], grid.description["budget"]
+    budget, n_seeds = grid.description["budget"], len(grid.description["seeds"])
     random = read_random(results / grid.experiment / "random.csv", grid)
     texts: Texts = {arm: [] for arm in ARMS}
     curves: Curves = {}
-    for cell in {cell.task: cell for cell in grid.cells}.values():
-        task = short_name(cell.task)
+    for name in grid.description["tasks"]:
+        task = short_name(name)
         returns = random["return"][random.task == task]
         texts[RANDOM].append(f"{returns.mean():.0f} ± {returns.std(ddof=0):.0f}")
         of_seed = returns.groupby(random.seed).mean().to_numpy()
         curves[task] = {RANDOM: (np.array([0.0, budget]), np.stack([of_seed, of_seed], axis=1))}
         for arm in list(ARMS)[1:]:
-            read = [read_cell(results, replace(cell, method=arm, seed=seed)) for seed in seeds]
-            evaluations = [rows for rows in read if rows is not None]
+            evaluations = read_arm(results, [cell for cell in grid.cells if (cell.task, cell.method) == (name, arm)])
             cost = costs.get(task, {}).get(arm, {}).get("ms_per_step")
             mark = f" {MARK}" if arm in TUNED.get(task, ()) else ""
-            texts[arm].append(cell_text(evaluations, len(seeds), cost) + mark)
+            texts[arm].append(cell_text(evaluations, n_seeds, cost) + mark)
             if evaluations:
                 curves[task][arm] = stack(evaluations)
     return texts, curves
@@ -192,7 +209,8 @@ with deterministic actions. The highest return is 1000. {minutes}
 Lines are means over seeds, bands one standard deviation; the numbers of seeds are those that have run. These pixels are
 not the papers', so that returns compare with each other and not with published ones. The cells are those of
 `zoo_configs/experiments/fast/benchmark.yml`. Their raw data is in `results/fast_benchmark/`; those that have not run
-there are taken from `results/by_the_clock_amx/`.
+there are taken from `results/by_the_clock_amx/`, or, with seeds from 220 on, from the experiment on
+[dense rewards](../results/curiosity.md) in `results/fast_dense/`.
 """
 
 

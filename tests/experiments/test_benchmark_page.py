@@ -41,11 +41,30 @@ def test_only_cells_at_the_budget_count(results: Path, tmp_path: Path) -> None:
     write_cell(clock, [0, 100_000, 200_000], [20, 600, 900])
     table.main(["--results", str(results), "--page", str(tmp_path / "page.md")])
     page = (tmp_path / "page.md").read_text()
-    assert row_of(page, "curl") == [f"500 ± 10 (1 of 3 seeds) {table.MARK}", "not run", "not run"]
+    assert row_of(page, "curl") == [f"500 ± 10 (seeds: 1) {table.MARK}", "not run", "not run"]
     assert row_of(page, "sac_ae") == [f"not run {table.MARK}", "not run", "not run"]
-    assert row_of(page, "best")[0] == f"600 ± 10 (1 of 3 seeds) {table.MARK}"
+    assert row_of(page, "best")[0] == f"600 ± 10 (seeds: 1) {table.MARK}"
     assert row_of(page, "random") == ["7 ± 0"] * 3
     assert (results / "fast_benchmark" / "benchmark.png").exists()
+
+
+def test_cells_about_dense_rewards_count_where_the_grid_has_none(results: Path, tmp_path: Path) -> None:
+    """The recipe has a cell of its own on one task alone; with curiosity it has none."""
+    for task in ("cartpole-swingup", "reacher-easy"):
+        for arm, value in {"plain": 300, "cure": 400}.items():
+            for seed in range(220, 224):
+                cell = results / "fast_dense" / task / arm / f"seed{seed}" / "eval.csv"
+                write_cell(cell, [0, 100_000], [20, value])
+    cell = results / "fast_benchmark" / "reacher-easy" / "best" / "seed21" / "eval.csv"
+    write_cell(cell, [0, 100_000], [20, 900])
+    table.main(["--results", str(results), "--page", str(tmp_path / "page.md")])
+    page = (tmp_path / "page.md").read_text()
+    assert row_of(page, "best") == [
+        f"300 ± 10 (seeds: 4) {table.MARK}",
+        f"not run {table.MARK}",
+        "900 ± 10 (seeds: 1)",
+    ]
+    assert row_of(page, "best_cure")[::2] == [f"400 ± 10 (seeds: 4) {table.MARK}", "400 ± 10 (seeds: 4)"]
 
 
 def test_pooled_deviation_is_that_of_all_episodes() -> None:
