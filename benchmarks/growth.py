@@ -1,4 +1,4 @@
-"""How time grows with the batch, the image and the buffer, and memory with a buffer that fills."""
+"""How time and memory grow with the replay buffer."""
 
 import time
 from functools import partial
@@ -9,38 +9,11 @@ from benchmarks.harness import (
     fill,
     interleaved,
     make_env,
-    make_model,
     memory_mb,
     stream,
     summary,
 )
 from sb3_cure.data.buffers import FrameStackReplayBuffer
-
-
-def by_batch(sizes: tuple[int, ...] = (32, 64, 128, 256), repeats: int = 3) -> dict[str, Any]:
-    """Time updates by batch size.
-
-    :param sizes: Batch sizes
-    :param repeats: Rounds
-    :return: Time of an update by batch size
-    """
-    model = make_model(warmup_updates=0)
-    variants = {str(size): partial(model.train, 1, size) for size in sizes}
-    return {name: summary(values) for name, values in interleaved(variants, repeats).items()}
-
-
-def by_image(sizes: tuple[int, ...] = (36, 48, 64, 84), repeats: int = 3) -> dict[str, Any]:
-    """Time updates by image size.
-
-    :param sizes: Sides of the images, pixels
-    :param repeats: Rounds
-    :return: Time of an update by image size
-    """
-    variants = {}
-    for size in sizes:
-        model = make_model(env_kwargs=dict(image_size=size), warmup_updates=0)
-        variants[str(size)] = partial(model.train, 1, 128)
-    return {name: summary(values) for name, values in interleaved(variants, repeats).items()}
 
 
 def by_buffer(sizes: tuple[int, ...] = (1000, 10_000, 80_000), repeats: int = 7) -> dict[str, Any]:

@@ -27,8 +27,6 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
         "rendering": rendering.measure,
         "end_to_end": collection.measure,
         "checkpoints": checkpoints.measure,
-        "growth_with_batch": growth.by_batch,
-        "growth_with_image": growth.by_image,
         "growth_with_buffer": growth.by_buffer,
         **({"bfloat16_against_float32": numerics.measure} if "bf16" in PRECISIONS else {}),
         **({"buffer_on_disk": partial(growth.on_disk, 1_000_000, disk)} if disk is not None else {}),
