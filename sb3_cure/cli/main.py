@@ -25,8 +25,8 @@ class Command(NamedTuple):
 #: Programs are imported when they run: that takes seconds, and their packages may be missing
 COMMANDS = {
     "train": Command("sb3_cure.cli.zoo:train", "zoo", "train from a YAML file (rl-zoo3's train)"),
-    "enjoy": Command("sb3_cure.cli.zoo:enjoy", "zoo", "watch a trained agent, or only print its returns"),
-    "record": Command("sb3_cure.cli.zoo:record", "zoo", "write a video of a trained agent"),
+    "enjoy": Command("sb3_cure.cli.enjoy:enjoy", "zoo", "watch a trained agent, or only print its returns"),
+    "record": Command("sb3_cure.cli.enjoy:record", "zoo", "write a video of a trained agent"),
     "optimize": Command("sb3_cure.cli.zoo:optimize", "zoo", "search hyper-parameters (rl-zoo3's train -optimize)"),
     "experiment": Command("sb3_cure.experiments.run:main", "experiments", "run a grid of tasks, methods and seeds"),
     "report": Command("sb3_cure.experiments.report:main", "experiments", "show a grid's results as one HTML file"),

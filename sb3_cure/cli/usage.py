@@ -1,11 +1,15 @@
-"""Sentences for those who typed a command: an unknown name, and how to install an extra."""
+"""Sentences for those who typed a command: an unknown name, a setting that is refused, how to install an extra."""
 
+import argparse
+import contextlib
 import difflib
 import inspect
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+import gymnasium as gym
 
 
 class UsageError(ValueError):
@@ -49,6 +53,40 @@ def one_sentence(error: Exception, *functions: Any) -> str:
     classes = [base for each in functions for base in (each.mro() if isinstance(each, type) else [each])]
     known = {name for each in classes for name in inspect.signature(each).parameters}
     return f"there is no argument {wrong[1]!r}{nearest(wrong[1], known - {'self', 'args', 'kwargs'})}"
+
+
+@contextlib.contextmanager
+def refusals_in_one_sentence(*functions: Any) -> Iterator[None]:
+    """Report refused settings and unknown arguments, which are the user's to fix, in one sentence without traceback.
+
+    :param functions: As for ``one_sentence``
+    :raises UsageError: Instead of them
+    """
+    try:
+        yield
+    except UsageError:
+        raise
+    except (TypeError, ValueError, gym.error.Error) as error:
+        if isinstance(error, TypeError) and "unexpected keyword argument" not in str(error):
+            raise
+        raise UsageError(one_sentence(error, *functions)) from error
+
+
+def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Parse a command line with rl-zoo3's ``name:value`` settings, whose values are evaluated.
+
+    :param parser: The parser
+    :param arguments: The command line
+    :return: What it knows, and the rest
+    :raises UsageError: If a value is not Python's
+    """
+    try:
+        return parser.parse_known_args(arguments)
+    except (NameError, SyntaxError) as error:
+        raise UsageError(
+            f"{error.args[0]}: -params and --env-kwargs take name:value with values as in Python, and text in quotes "
+            "for the shell, too ('srl:\"curl\"')."
+        ) from None
 
 
 def install_command(extra: str) -> str:

@@ -14,6 +14,7 @@ from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
 
 #: Algorithms by their name for ``--algo`` and in grids
 ALGORITHMS: dict[str, Any] = {"cure_sac": CuReSAC, "cure_tqc": CuReTQC}
+DEFAULT_ALGORITHM = "cure_sac"
 #: Arguments that may name a class of the user's, as ``my_module.MyClass``, which no saved model holds
 CLASS_ARGUMENTS = ("srl", "intrinsic")
 #: Settings of methods, for ``sb3-cure train --conf-file`` and for grids

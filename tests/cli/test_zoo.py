@@ -22,7 +22,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_cure import CuReSAC
-from sb3_cure.cli import zoo
+from sb3_cure.cli import enjoy, zoo
 from sb3_cure.cli.main import main
 from sb3_cure.srl import RAE
 
@@ -287,13 +287,13 @@ def test_trials_that_are_left_are_told(
 def played(monkeypatch: pytest.MonkeyPatch) -> list[OffPolicyAlgorithm]:
     """The models that are replayed."""
     models = []
-    play = zoo._play
+    play = enjoy._play
 
     def keep(model: OffPolicyAlgorithm, *args: Any) -> Any:
         models.append(model)
         return play(model, *args)
 
-    monkeypatch.setattr(zoo, "_play", keep)
+    monkeypatch.setattr(enjoy, "_play", keep)
     return models
 
 
