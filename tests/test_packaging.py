@@ -95,11 +95,12 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     own.write_text(yaml.safe_dump({"default": {**entry, "gamma": 0.9}, "dmc_pixels": {**entry, "gamma": 0.8}}))
     assert recipe(own) == {"srl": None, "gamma": 0.9}
     assert recipe(own, "dmc_pixels/walker-walk-v0") == {"srl": None, "gamma": 0.8}
+    assert recipe(own, gamma=0.7, task=False) == {"srl": None, "gamma": 0.7, "task": False}
     zoo = {"srl": "sb3_cure.srl.VAE", "train_freq": [1, "episode"], "frame_stack": 3, "normalize": True}
     own.write_text(yaml.safe_dump({"default": zoo}))
     assert recipe(own) == {"srl": VAE, "train_freq": (1, "episode")}
     env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
-    model = CuReSAC("CnnPolicy", env, buffer_size=10, **recipe("fast/drq_single_view"))
+    model = CuReSAC("CnnPolicy", env, **recipe("fast/drq_single_view", buffer_size=10))
     assert (model.srl, model.curiosity, model.gamma) == (None, None, 0.98)
     with pytest.raises(ValueError, match=r"did you mean fast/curl"):
         recipe("fast/crul")

@@ -106,19 +106,20 @@ _NOT_OF_MODEL = (
 )
 
 
-def recipe(name: str | Path, task: str = "default") -> dict[str, Any]:
-    """Read the arguments of a model from a zoo file: ``CuReSAC("CnnPolicy", env, **recipe("fast/best"))``.
+def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict[str, Any]:
+    """Read the arguments of a model from a zoo file: ``CuReSAC("CnnPolicy", env, **recipe("fast/best", gamma=0.99))``.
 
     The settings of the environment (``env_kwargs``, ``env_wrapper``, ``frame_stack``, ``normalize`` ...), ``policy``,
     ``n_timesteps`` and ``callback`` are left out. Classes of your own, ``srl: my_heads.MyHead``, are imported.
 
     :param name: A file of the package, such as ``"fast/best"``, or the path of your own with suffix
-    :param task: Gymnasium id whose entry is read; by default that for any environment
+    :param env_id: Gymnasium id whose entry is read; by default that for any environment
+    :param changes: Arguments that take the place of the file's
     :return: Keyword arguments of ``CuReSAC`` or ``CuReTQC``
     :raises UsageError: if there is no such file or entry
     """
-    entry = zoo_entry(zoo_file(name), task)
-    return model_arguments({key: value for key, value in entry.items() if key not in _NOT_OF_MODEL})
+    entry = zoo_entry(zoo_file(name), env_id)
+    return {**model_arguments({key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}), **changes}
 
 
 def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:

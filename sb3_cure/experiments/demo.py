@@ -52,7 +52,9 @@ DOMAIN, TASK = "cartpole", "swingup"
 ID = f"dmc_pixels/{DOMAIN}-{TASK}-v0"
 ENV_KWARGS: dict[str, Any] = zoo_entry(zoo_file("fast/best"), ID)["env_kwargs"]
 #: The recipe, with a curious agent that costs little
-SETTINGS: dict[str, Any] = recipe("fast/best", ID) | dict(
+SETTINGS: dict[str, Any] = recipe(
+    "fast/best",
+    ID,
     curiosity="separate",
     intrinsic="reconstruction",
     intrinsic_kwargs=dict(n_filters=8, n_layers=2),  # a fifth of an update less than with four layers
