@@ -21,6 +21,14 @@ DMC_TASK = "dmc_pixels/cartpole-swingup-v0"
 DMC = {**TINY, "env_kwargs": {"image_size": 36, "renderer": "fast", "grayscale": True, "action_repeat": 40}}
 
 
+class Shaped(gym.Wrapper[Any, Any, Any, Any]):
+    """Rewards of one's own, in the form that most people write."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, float(reward) + 100, terminated, truncated, info
+
+
 def write_grid(folder: Path, **changes: Any) -> Path:
     """A grid of one cell on the tiny task, unless ``changes`` say otherwise."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium.wrappers import RepeatAction
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -22,7 +23,6 @@ from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import FrameStackReplayBuffer, choose_frame_stack
 from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.spaces_check import check_action_space, check_observation_space
-from sb3_cure.envs.wrappers import ActionRepeat
 from sb3_cure.intrinsic import IntrinsicReward
 from sb3_cure.networks.allocator import tune_allocator
 from sb3_cure.networks.precision import resolve_precision
@@ -209,6 +209,8 @@ class CuReBase(OffPolicyAlgorithm):
         # Batches learned from, and those of them that trained actors and critics (`_n_updates` counts gradient steps)
         self._n_batches = self._n_rl_batches = 0
         self._warmed_up = self._in_burst = False
+        #: Whether encoder and head are kept as they are; it can be set at any time
+        self.representation_frozen = False
         #: What the update that runs logs
         self._metrics: dict[str, th.Tensor] = {}
         #: While ``learn`` runs with ``overlap=True``: the environments, which make updates as they step
@@ -365,7 +367,7 @@ class CuReBase(OffPolicyAlgorithm):
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
         has_hindsight = isinstance(self.replay_buffer, HerReplayBuffer)
-        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(ActionRepeat)):
+        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(RepeatAction)):
             raise ValueError(
                 f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."

@@ -104,6 +104,8 @@ class CuRe(CuReBase):
         if updates is None:
             wanted = self._learns_srl and self.learning_starts > 0
             updates = get_srl_class(self.srl).warmup_updates if wanted else 0  # type: ignore[arg-type]
+        elif self.learning_starts == 0 and self.replay_buffer.size() * self.n_envs < self.batch_size:  # type: ignore[union-attr]
+            updates = 0  # of a step or two; what was loaded is more
         if updates > 0 and self.gradient_steps != 0:
             if self.verbose >= 1:
                 print(f"Making {updates} updates before the next step (warmup_updates).")
@@ -129,6 +131,7 @@ class CuRe(CuReBase):
 
     def _train(self, gradient_steps: int, batch_size: int) -> None:
         """Sample, update, repeat."""
+        self.policy.freeze_representation(self.representation_frozen)
         self.policy.set_training_mode(True)
         task = self.policy.task  # callbacks may have replaced the temperature on the model
         task.log_ent_coef, task.ent_coef_optimizer = self.log_ent_coef, self.ent_coef_optimizer
@@ -181,7 +184,7 @@ class CuRe(CuReBase):
 
     @property
     def _learns_srl(self) -> bool:
-        return self.srl is not None and not self.policy.representation_frozen
+        return self.srl is not None and not self.representation_frozen
 
     def _is_due(self, n_before: int, interval: int) -> bool:
         """Whether a step that is made once per ``interval`` updates is due now; in the burst it always is."""

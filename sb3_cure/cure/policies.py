@@ -466,11 +466,19 @@ class CuRePolicy(BasePolicy):
         for still in filter(None, (*targets, *frozen)):
             set_mode(still, False)
 
-    def freeze_representation(self) -> None:
-        """Keep encoder and head as they are; the target encoder, which would follow, becomes the encoder."""
-        self.representation_frozen = True
-        self.encoder.requires_grad_(False)
-        self.encoder_target.load_state_dict(self.encoder.state_dict())
+    def freeze_representation(self, frozen: bool = True) -> None:
+        """Keep encoder and head as they are; the target encoder, which would follow, becomes the encoder.
+
+        :param frozen: False: let them learn again
+        """
+        if frozen == self.representation_frozen:
+            return
+        self.representation_frozen = frozen
+        if frozen:
+            self._frozen_parameters = [each for each in self.encoder.parameters() if each.requires_grad]
+            self.encoder_target.load_state_dict(self.encoder.state_dict())
+        for parameter in self._frozen_parameters:
+            parameter.requires_grad_(not frozen)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return dict(self._arguments)

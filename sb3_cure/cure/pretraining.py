@@ -35,8 +35,6 @@ class Pretraining(CuRe):
         self._keeps_replay_buffer = False
         #: Whether the next ``learn`` resets all RNGs to their state after construction
         self._is_pretrained = False
-        #: Whether encoder and head are kept as they are
-        self.representation_frozen = False
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -46,8 +44,7 @@ class Pretraining(CuRe):
             self.task, self.curiosity = before["task"], before["curiosity"]
         super()._setup_model()
         self._initial_rng_state = th.get_rng_state()
-        if self.representation_frozen:
-            self.policy.freeze_representation()
+        self.policy.freeze_representation(self.representation_frozen)
         if before is not None:
             self._begin_pretraining(collector)
 
@@ -148,7 +145,7 @@ class Pretraining(CuRe):
             curious.log_ent_coef.data.copy_(temperature)
         self.representation_frozen = self.representation_frozen or freeze
         if self.representation_frozen:
-            self.policy.freeze_representation()
+            self.policy.encoder_target.load_state_dict(self.policy.encoder.state_dict())
         return self
 
     def pretrain(
@@ -183,15 +180,28 @@ class Pretraining(CuRe):
         :param keep_replay_buffer: Let the task learn from what was collected, too: the environment's rewards are stored
             with it
         :return: self
-        :raises ValueError: if there is no SRL head, or no such collector
+        :raises ValueError: if there is no SRL head, no such collector, or something in the replay buffer that would be
+            lost
         """
         self._check_that_srl_learns("pretrain")
         if collector not in ("curious", "random"):
             raise ValueError(f"collector must be 'curious' or 'random', but is {collector!r}.")
+        held = self.replay_buffer.size()  # type: ignore[union-attr]
+        if held and not (keep_replay_buffer or self.is_pretraining):
+            raise ValueError(
+                f"pretrain empties the replay buffer at its end, and {held} transitions are in it: call "
+                "load_transitions after it, or set keep_replay_buffer=True."
+            )
         self._begin_pretraining(collector)
         self._keeps_replay_buffer = keep_replay_buffer
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+            if self._n_updates == 0:
+                warnings.warn(
+                    f"pretrain made no update in {self.num_timesteps} agent steps, of which learning_starts="
+                    f"{self.learning_starts} are the random warm-up: give it more.",
+                    stacklevel=2,
+                )
         finally:
             self._end_pretraining()
         return self
@@ -211,6 +221,12 @@ class Pretraining(CuRe):
         progress_bar: bool = False,
     ) -> Self:
         self._end_pretraining()  # a checkpoint taken while pretraining may have been loaded
+        built = self.policy.curious is not None, self.policy.intrinsic is not None
+        if built != (self._has_curious_agent, self.curiosity in ("separate", "bonus")):
+            raise ValueError(
+                f"curiosity was set to {self.curiosity!r} after the model was made, whose archive could not be loaded: "
+                "make it with this, or set curiosity_prob=0, after which the curious policy learns but does not act."
+            )
         if self._is_pretrained:
             self._restart_random_streams()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -6,6 +6,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_cure.envs.wrappers import action_repeat_of
+
 
 class TransparentWrapper(gym.Wrapper[Any, Any, Any, Any]):
     """Passes attributes that are set on it to the environment: SB3's ``set_attr`` sets them on the outermost layer."""
@@ -29,6 +31,11 @@ class CopyObservations(TransparentWrapper):
 
     :param env: The environment
     """
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps per agent step, also of Gymnasium's ``RepeatAction``; SB3's ``get_attr`` finds it here."""
+        return action_repeat_of(self.env)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, with the arguments that it takes.

@@ -1,4 +1,4 @@
-"""Wrappers that report or reward visits to cells of the true state, and one that reports the task's reward."""
+"""Wrappers that report or reward visits to cells of the true state, and two that report the task's reward."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -40,10 +40,8 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, {**info, "cell": cell}
 
 
-class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Puts the reward into ``info[TASK_REWARD]``, so that callbacks see it below wrappers of rewards.
-
-    Wrappers that repeat actions must be inside of it: outside, they pass on the info of the last repeat alone.
+class SumRewards(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Sums rewards until they are taken; what ``TaskReward`` reads, with any wrappers between them.
 
     :param env: An environment that gives the task's reward
     """
@@ -51,15 +49,50 @@ class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gym.Env) -> None:
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
+        self.sum = 0.0
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment, and add its reward.
+
+        :param action: The action
+        :return: What the environment returns
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.sum += float(reward)
+        return observation, reward, terminated, truncated, info
+
+    def take_sum(self) -> float:
+        """Return the sum and begin anew.
+
+        :return: Sum of all rewards since it was taken last
+        """
+        taken, self.sum = self.sum, 0.0
+        return taken
+
+
+class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Puts the task's reward into ``info[TASK_REWARD]``, whatever wrappers within make of it, or pays it.
+
+    :param env: Wrappers of any kind around ``SumRewards``
+    :param pays: Whether the task's reward is also the one that a step returns
+    """
+
+    def __init__(self, env: gym.Env, pays: bool = False) -> None:
+        RecordConstructorArgs.__init__(self, pays=pays)
+        super().__init__(env)
+        self.pays = pays
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
 
         :param action: The action
-        :return: What the environment returns, with its reward in the info
+        :return: What the environment returns, with the task's reward in the info
         """
+        take_sum = self.get_wrapper_attr("take_sum")
+        take_sum()  # of steps that wrappers make while they reset
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, TASK_REWARD: float(reward)}
+        met = take_sum()
+        return observation, met if self.pays else reward, terminated, truncated, {**info, TASK_REWARD: met}
 
 
 class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):

@@ -139,9 +139,13 @@ class ActionRepeat(RepeatAction):
     def __init__(self, env: gym.Env, num_repeats: int) -> None:
         num_repeats = at_least_one("action_repeat", num_repeats)
         super().__init__(env, num_repeats)
-        self.action_repeat = action_repeat_of(self)  # the environment may repeat actions, too
         if "render_fps" in env.metadata:
             self.metadata = {**env.metadata, "render_fps": env.metadata["render_fps"] / num_repeats}
+
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps per agent step; the environment within may repeat actions, too."""
+        return action_repeat_of(self)
 
 
 def positive_attribute(env: gym.Env, name: str) -> int:

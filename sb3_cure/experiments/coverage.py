@@ -13,8 +13,8 @@ COLUMNS = ("environment_steps", "agent_steps", "cells")
 class CoverageRecorder(BaseCallback):
     """Count the cells that training environments in ``CellInfo`` report, and write ``coverage.csv``.
 
-    All collected transitions count, of both actors and from the first step of the random warm-up on. The counts are
-    plain attributes, which checkpoints keep.
+    All transitions of training count, of both actors and from the first step of the random warm-up on; those of
+    pretraining do not. The counts are plain attributes, which checkpoints keep.
 
     :param at: Environment steps after which a row is written
     :param action_repeat: Environment steps per agent step

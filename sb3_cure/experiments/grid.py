@@ -29,7 +29,7 @@ from sb3_cure.cli.zoo_files import (
 )
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import make_dmc_env
-from sb3_cure.envs.counting import CellInfo, TaskReward
+from sb3_cure.envs.counting import CellInfo, SumRewards, TaskReward
 from sb3_cure.envs.rendering import GLUnavailableError
 from sb3_cure.evaluation.callbacks import untouched_randomness
 
@@ -230,27 +230,23 @@ class Cell:
     def make_env(self) -> gym.Env:
         """Make an environment to train in, with the wrappers of ``env_wrapper``, as in rl-zoo's files.
 
-        The first wrapper of rewards gets a ``TaskReward`` below it.
+        :return: The environment, which also reports the task's reward
         """
-        env = gym.make(self.task, **self.env_kwargs)
-        pays_task = True
-        for wrap, kwargs in named_wrappers(self.arguments.get("env_wrapper")):
-            if pays_task and _changes_rewards(wrap):
-                env, pays_task = TaskReward(env), False
-            env = wrap(env, **kwargs)
+        env = TaskReward(self._wrapped_env())
         return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
-        """Make an environment to measure policies in, which gives the task's reward.
-
-        Wrappers of rewards (``gymnasium.RewardWrapper``, ``NormalizeReward``) are left out.
+        """Make an environment to measure policies in: the same, but it pays the task's reward.
 
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
+        :return: The environment
         """
-        env = gym.make(self.task, **{**self.env_kwargs, **env_kwargs})
+        return TaskReward(self._wrapped_env(**env_kwargs), pays=True)
+
+    def _wrapped_env(self, **env_kwargs: Any) -> gym.Env:
+        env: gym.Env = SumRewards(gym.make(self.task, **{**self.env_kwargs, **env_kwargs}))
         for wrap, kwargs in named_wrappers(self.arguments.get("env_wrapper")):
-            if not _changes_rewards(wrap):
-                env = wrap(env, **kwargs)
+            env = wrap(env, **kwargs)
         return env
 
     def custom_objects(self) -> dict[str, Any]:
@@ -324,10 +320,6 @@ class Grid:
         found = (seed_of(folder) for arm in self.arms for folder in (results / arm.folder.parent).glob("seed*"))
         seeds = {cell.seed for cell in self.cells} | {seed for seed in found if seed is not None}
         return [replace(arm, seed=seed) for seed in sorted(seeds) for arm in self.arms]
-
-
-def _changes_rewards(wrapper: Any) -> bool:
-    return isinstance(wrapper, type) and issubclass(wrapper, gym.RewardWrapper | gym.wrappers.NormalizeReward)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -180,13 +180,13 @@ def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Es
 
 
 def _at_common_end(experiment: Experiment, task: str, method: str, column: str) -> Iterator[dict[int, float]]:
-    """Values of an arm, and of its baseline, by seed: of each pair at the last step at which both were counted."""
+    """Values of an arm, and of its baseline, by seed, at the last step that both of a pair reached (interpolated)."""
     ours, theirs = (
-        {seed: cell.curve(column)[1] for seed, cell in experiment.done(task, arm).items()}
+        {seed: curve for seed, cell in experiment.done(task, arm).items() if len((curve := cell.curve(column))[0])}
         for arm in (method, experiment.baseline_of(method))
     )
-    last = {seed: min(len(ours[seed]), len(theirs[seed])) - 1 for seed in ours if seed in theirs}
-    return ({seed: float(arm[seed][end]) for seed, end in last.items() if end >= 0} for arm in (ours, theirs))
+    last = {seed: min(ours[seed][0][-1], theirs[seed][0][-1]) for seed in ours if seed in theirs}
+    return ({seed: float(np.interp(end, *arm[seed])) for seed, end in last.items()} for arm in (ours, theirs))
 
 
 def final_values(experiment: Experiment, task: str, method: str, column: str) -> dict[int, float]:

@@ -3,6 +3,7 @@
 import inspect
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from dictionaries_for_tests import Goal
@@ -148,9 +149,10 @@ def test_hindsight_with_restarting_workers_is_refused() -> None:
         venv.close()
 
 
-def test_hindsight_with_repeated_actions_is_refused() -> None:
+@pytest.mark.parametrize("wrapper", [ActionRepeat, gym.wrappers.RepeatAction])
+def test_hindsight_with_repeated_actions_is_refused(wrapper: Any) -> None:
     """Rewards of the goals that were reached are computed for one step, those that are stored are sums."""
-    env = ActionRepeat(Goal(), 2)
+    env = wrapper(Goal(), 2)
     with pytest.raises(ValueError, match="use action_repeat=1"):
         tiny_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=20).learn(10)
 

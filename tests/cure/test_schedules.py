@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from updates_for_tests import equal, filled_model, groups, prepare
 
 from sb3_cure import CuReSAC
+from sb3_cure.datasets import RecordedEpisode
 
 UPDATES = pytest.mark.parametrize("update", ["sequential", "joint"])
 PERIOD = 3
@@ -67,7 +68,7 @@ def test_head_alone_makes_single_updates() -> None:
 
 def test_frozen_representation_takes_no_turns() -> None:
     model = model_with_transitions(srl_schedule="alternating")
-    model.policy.freeze_representation()
+    model.representation_frozen = True
     model.train(PERIOD, batch_size=8)
     assert steps(model)["task critic"] == model._n_batches == PERIOD
 
@@ -168,7 +169,7 @@ def test_targets_take_running_statistics() -> None:
 def test_statistics_of_vectors_follow_the_batch(frozen: bool, update: str) -> None:
     """Those of encoder and target alike, once an update, unless the representation is frozen."""
     model = model_with_transitions(update=update, target_update_interval=2)
-    model.policy.representation_frozen = frozen
+    model.representation_frozen = frozen
     model._n_batches = 1  # no Polyak step, which would copy them
     np.random.seed(0)
     observations = model.replay_buffer.sample(8).observations  # type: ignore[union-attr]
@@ -210,8 +211,18 @@ def test_each_update_of_the_burst_updates_actors(update: str) -> None:
 def test_frozen_head_wants_no_burst() -> None:
     """The autoencoder's 1000 updates would train actors and critics alone, on what the warm-up has collected."""
     model = tiny_model("MlpPolicy", VectorBox(), warmup_updates=None)
-    model.policy.freeze_representation()
+    model.representation_frozen = True
     assert model.learn(12)._n_updates == 2
+
+
+def test_burst_without_warm_up_needs_what_was_loaded() -> None:
+    """As of a recipe with ``learning_starts=0``: it would be of one transition."""
+    arguments: dict[str, Any] = dict(learning_starts=0, warmup_updates=9)
+    models = [tiny_model("MlpPolicy", VectorBox(), **arguments) for _ in range(2)]
+    ends = np.arange(8) == 7
+    episode = RecordedEpisode(np.zeros((9, 2), np.float32), np.zeros((8, 2)), np.zeros(8), ends, ~ends & ends)
+    models[1].load_transitions([episode])
+    assert [model.learn(1)._n_updates for model in models] == [1, 10]
 
 
 @pytest.mark.parametrize("schedule", ["simultaneous", "alternating"])

@@ -141,10 +141,10 @@ def test_burst_after_warmup(srl: Any, warmup_updates: int | None, burst: int, mo
     after_warmup = [(step, 1) for step in (11, 12, 13, 14)]
     assert updates == [(11, burst)] * (burst > 0) + after_warmup + after_warmup
     calls.clear()
-    # Without a warm-up the head wants no burst, which would be one on a single transition.
+    # Without a warm-up there is no burst, which would be one on a single transition.
     model = tiny_model("CnnPolicy", PixelBox(), learning_starts=0, **arguments).learn(2)
     updates = [call for call in calls if call[1] > 0]
-    assert updates == [(1, warmup_updates)] * bool(warmup_updates) + [(1, 1), (2, 1)] and model._warmed_up
+    assert updates == [(1, 1), (2, 1)] and model._warmed_up
 
 
 @pytest.mark.parametrize("overlap", [False, True])
@@ -200,7 +200,7 @@ def test_head_without_reader_does_not_run(kind: str, intrinsic: str, per_pixel: 
 
     srl.loss = loss
     if kind == "frozen":
-        model.policy.freeze_representation()
+        model.representation_frozen = True
         model.train(2, batch_size=8)
         assert modes == [False] * (2 if reads_error else 0)
     else:
@@ -215,7 +215,7 @@ def test_frozen_head_runs_once_for_the_error_of_the_next_observation(per_pixel: 
     srl: Any = model.policy.srl
     calls: list[Any] = []
     srl.loss = lambda *given: (calls.append(given), type(srl).loss(srl, *given))[1]
-    model.policy.representation_frozen = True
+    model.representation_frozen = True
     model.train(1, 8)
     assert len(calls) == runs
 
@@ -426,7 +426,7 @@ def test_training_after_pretraining_begins_as_without() -> None:
     for pretrains in (2, 0):
         model = tiny_model("CnnPolicy", PixelBox(), learning_starts=30, seed=0)
         for _ in range(pretrains):
-            model.pretrain(30, "random", callback=Keep())
+            model.pretrain(31, "random", callback=Keep())
         model.learn(30, callback=Keep())
     first, second, pretrained, vanilla = collected
     assert (first != second).any() and th.equal(*states[2:])
@@ -450,12 +450,32 @@ def test_pretraining_that_keeps_its_transitions() -> None:
 
 def test_pretraining_that_cannot_begin_changes_nothing() -> None:
     model = tiny_model("MlpPolicy", VectorBox(), curiosity=None, learning_starts=10, intrinsic_kwargs={"of": "nothing"})
-    model.learn(20)
     with pytest.raises(TypeError, match="of"):
         model.pretrain(10)
     assert (model.task, model.curiosity, model.is_pretraining) == (True, None, False)
+    model.learn(20)
+    with pytest.raises(ValueError, match="20 transitions are in it"):  # such as episodes from disk
+        model.pretrain(10)
     model.learn(10, reset_num_timesteps=False)
     assert (model.num_timesteps, model.replay_buffer.size()) == (30, 30)
+
+
+def test_pretraining_without_an_update_says_so() -> None:
+    """Its transitions are dropped at its end, so that nothing at all is left of it."""
+    with pytest.warns(UserWarning, match="no update in 12 agent steps"):
+        tiny_model("MlpPolicy", VectorBox(), learning_starts=12).pretrain(12)
+
+
+@pytest.mark.parametrize(("before", "after"), [("separate", None), ("bonus", None), (None, "random")])
+def test_curiosity_that_is_set_later_needs_the_same_networks(before: str | None, after: str | None) -> None:
+    """Others could be trained, and saved, but not loaded."""
+    model = tiny_model("MlpPolicy", VectorBox(), curiosity=before)
+    model.curiosity = after
+    if after == "random":  # which has none
+        model.learn(12)
+    else:
+        with pytest.raises(ValueError, match="curiosity was set to None after"):
+            model.learn(12)
 
 
 def test_pretraining_of_a_bonus() -> None:
@@ -589,6 +609,13 @@ def test_metrics() -> None:
         assert isinstance(dumps[-1][key], int | float) and np.isfinite(dumps[-1][key]), key
     assert (dumps[-1]["time/total_timesteps"], dumps[-1]["time/environment_steps"]) == (20, 80)
     assert sum(dumps[-1][f"train/encoder_share_{name}"] for name in ("srl", "task", "curious")) == pytest.approx(1)
+
+
+def test_environment_steps_count_repeats_of_any_wrapper() -> None:
+    model = tiny_model("CnnPolicy", gym.wrappers.RepeatAction(PixelBox(action_repeat=4), 5))
+    dumps = log_to(model)
+    model.learn(8, log_interval=1)
+    assert (dumps[-1]["time/total_timesteps"], dumps[-1]["time/environment_steps"]) == (8, 8 * 20)
 
 
 @pytest.mark.parametrize("srl", SRL_HEADS)

@@ -138,6 +138,11 @@ def test_frozen_representation_stays(name: str, tmp_path: Path) -> None:
     for call in (model.pretrain, model.fit_representation):
         with pytest.raises(ValueError, match="keeps as it is"):
             call(5)
+    model.representation_frozen = False
+    assert differences(kept, tensors(model.learn(12, reset_num_timesteps=False), ("encoder.",))) != []
+    model.representation_frozen = True
+    kept = tensors(model.learn(12, reset_num_timesteps=False), ("encoder.", "srl."))
+    assert differences(kept, tensors(model.learn(12, reset_num_timesteps=False), ("encoder.", "srl."))) == []
 
 
 def test_frozen_representation_of_a_dictionary_stays(tmp_path: Path) -> None:

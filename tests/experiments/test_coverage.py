@@ -4,9 +4,10 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from grids_for_tests import DMC_TASK, method, write_grid
+from grids_for_tests import DMC_TASK, TASK, method, write_grid
 
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.envs import physics_state, physics_state_names, rendering
@@ -65,23 +66,40 @@ def test_oracle_rewards_training_alone(tmp_path: Path) -> None:
     for env in (cell.make_env(), cell.make_eval_env()):
         env.reset(seed=0)
         *_, reward, _, _, info = env.step(np.zeros(1, np.float32))
-        rewards.append((reward, info.get(TASK_REWARD)))
+        rewards.append((reward, info[TASK_REWARD]))
         env.close()
-    (oracle, met), (task, _) = rewards
-    assert oracle == 1 and met == task < 0.1
+    (oracle, met), (paid, task) = rewards
+    assert oracle == 1 and met == task == paid < 0.1
     folder = run_cell(cell, tmp_path / "out", pictures=False)
     last = read_rows(folder / "eval.csv")[-1]
     assert last["rewards_met"] > last["agent_steps"], "the task's: the oracle's are at most 1 a step"
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_any_wrapper_may_change_rewards(order: tuple[int, int], tmp_path: Path) -> None:
+    """In whatever class, and inside or outside of repeated actions, whose rewards are summed."""
+    wrappers = ["grids_for_tests.Shaped", {"sb3_cure.envs.ActionRepeat": {"num_repeats": 3}}]
+    arm = method(env_wrapper=[wrappers[index] for index in order])
+    [cell] = load_grid(write_grid(tmp_path, methods={"shaped": arm})).cells
+    plain, trained, measured = gym.make(TASK), cell.make_env(), cell.make_eval_env()
+    for env in (plain, trained, measured):
+        env.reset(seed=0)
+        env.action_space.seed(0)
+    for _ in range(3):
+        action = trained.action_space.sample()
+        met = sum(plain.step(action)[1] for _ in range(3))
+        for env, shaping in ((trained, 100 * (3 if order == (0, 1) else 1)), (measured, 0)):
+            *_, reward, _, _, info = env.step(action)
+            assert info[TASK_REWARD] == pytest.approx(met) and reward == pytest.approx(met + shaping)
+
+
 def test_policies_are_measured_in_the_wrappers_they_are_trained_in(tmp_path: Path) -> None:
     """Steps are counted as training makes them, of observations that it sees."""
     repeat = {"sb3_cure.envs.ActionRepeat": {"num_repeats": 2}}
-    arm = method(env_wrapper=[repeat, ORACLE, "gymnasium.wrappers.NormalizeReward"], **QUICK)
+    arm = method(env_wrapper=[repeat, ORACLE], **QUICK)
     [cell] = grid(tmp_path, methods={"slow": arm}, coverage=None).cells
     with contextlib.closing(cell.make_env()) as env, contextlib.closing(cell.make_eval_env()) as measured:
         assert action_repeat_of(measured) == action_repeat_of(env) == 2 * 40
-        assert "CountReward" not in str(measured) and "NormalizeReward" not in str(measured)
     folder = run_cell(cell, tmp_path / "out", pictures=False)
     last = read_rows(folder / "eval.csv")[-1]
     assert last["environment_steps"] == 2 * 40 * last["agent_steps"]

@@ -183,6 +183,15 @@ def test_rewards_met_are_compared_at_the_last_common_step(tmp_path: Path) -> Non
     assert found.value == pytest.approx(np.log(10))
 
 
+def test_arms_that_were_evaluated_at_other_steps_are_compared_at_the_same(tmp_path: Path) -> None:
+    """Equal rewards at equal steps differ by nothing, however often one of the arms was evaluated."""
+    write_grid(tmp_path, seeds=[0])
+    write_cell(tmp_path, TASK, "sac_ae", 0, {0: 0, 50_000: 0, 100_000: 0}, rewards_met=[0, 50, 100])
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, {0: 0, 100_000: 0}, rewards_met=[0, 100])
+    found = statistics.rewards_met_difference(read_results(tmp_path)[0], TASK, "cure_sac_ae")
+    assert found.value == 0
+
+
 def test_difference_is_from_own_baseline(tmp_path: Path) -> None:
     """Two is above the experiment's baseline, and below the arm that it is compared with."""
     folder = tmp_path / "curves"

@@ -380,6 +380,6 @@ def test_statistics_follow_updates_alone(policy: str, env: type[gym.Env]) -> Non
         target = statistics(model.policy.encoder_target)
         assert all(th.equal(value, target[name]) for name, value in statistics(model.policy.encoder).items())
     model.predict(model.env.reset())
-    model.policy.freeze_representation()
+    model.representation_frozen = True
     model.train(2, 8)
     assert n_updates() == pytest.approx(5, rel=1e-3)

@@ -165,6 +165,8 @@ def temperature(model: CuReSAC) -> tuple[float, bool]:
         (0.3, dict(ent_coef="auto_0.7"), (0.7, True)),
         ("auto_0.5", dict(ent_coef="auto_0.7"), (0.7, True)),
         (0.3, {}, (0.3, False)),
+        (0.3, dict(custom_objects={"ent_coef": 0.2}), (0.2, False)),
+        ("auto_0.5", dict(custom_objects={"ent_coef": "auto_0.7"}), (0.7, True)),
     ],
 )
 def test_temperature_given_to_load_applies(
