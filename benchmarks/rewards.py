@@ -47,7 +47,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "impact": dict(intrinsic="impact"),
     "disagreement": dict(intrinsic="disagreement"),
     "particle": dict(intrinsic="particle"),
-    "particle, space='latents'": dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents")),
     "shuffled (of rnd)": dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="rnd")),
 }
 

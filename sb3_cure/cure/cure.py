@@ -398,16 +398,12 @@ class CuRe(CuReBase):
         def read(name: str) -> th.Tensor:
             return encoder.latents("intrinsic", name if shared else f"centred {name}", graph)
 
-        @th.no_grad()
-        def encode(observations: Any) -> th.Tensor:
-            return policy.encode(observations).float()
-
         def look_up(rows: np.ndarray, env_inds: np.ndarray) -> Samples:
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]
             return policy.samples(sampled, random=False)
 
         srl_error = partial(self._srl_error, batch, srl) if policy.intrinsic.needs_srl else None  # type: ignore[union-attr]
-        return RewardInputs(batch, srl_error, read, self.replay_buffer, look_up, encode)  # type: ignore[arg-type]
+        return RewardInputs(batch, srl_error, read, self.replay_buffer, look_up)  # type: ignore[arg-type]
 
 
 @th.no_grad()

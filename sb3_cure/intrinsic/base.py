@@ -22,7 +22,6 @@ class RewardInputs:
     :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
     :param replay_buffer: The replay buffer, which has just drawn the batch
     :param look_up: Returns stored transitions by rows and environments, [n] each
-    :param encode: Returns latents without a graph, [n, features_dim], of stored observations, [n, *shape]
     """
 
     def __init__(
@@ -32,10 +31,9 @@ class RewardInputs:
         read: Callable[[str], th.Tensor],
         replay_buffer: ReplayBuffer,
         look_up: Callable[[np.ndarray, np.ndarray], Samples],
-        encode: Callable[[Any], th.Tensor],
     ):
         self.batch = batch
-        self.replay_buffer, self.look_up, self.encode = replay_buffer, look_up, encode
+        self.replay_buffer, self.look_up = replay_buffer, look_up
         self._srl_error, self._read = srl_error, read
 
     @cached_property
@@ -77,7 +75,6 @@ class RewardInputs:
             lambda name: (self.latents if name == "observations" else self.next_latents)[:, where],
             self.replay_buffer,
             lambda rows, env_inds: self.look_up(rows, env_inds).of(key),
-            self.encode,
         )
 
 

@@ -18,34 +18,25 @@ CHUNK = 1000
 class Particle(IntrinsicReward):
     """log(1 + mean distance to the k nearest neighbours) of where the step leads (Liu & Abbeel, 2021, eq. 5).
 
-    Neighbours are searched in the batch and in a memory of the latest samples. States of the same episode, the state
-    itself among them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode
-    also ends where the stored stream breaks, as in another ``learn()``.
+    Distances are those of features of a random network that is never trained (RE3; Seo et al., 2021). Neighbours are
+    searched in the batch and in a memory of the latest samples. States of the same episode, the state itself among
+    them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends where
+    the stored stream breaks, as in another ``learn()``.
 
     :param args: As of ``IntrinsicReward``
-    :param space: Where distances are measured: ``"random"``, features of a random network that is never trained (RE3,
-        Seo et al., 2021), which the memory keeps; or ``"latents"``, the encoder's (APT), for which the memory is
-        encoded anew in each update, as stored latents go stale
     :param n_neighbours: k
     :param memory: Number of transitions to remember, by their places in the replay buffer
     :param n_filters: Channels of the random network
-    :raises ValueError: for another space
     """
 
     features: th.Tensor
 
-    def __init__(
-        self, *args: Any, space: str = "random", n_neighbours: int = 12, memory: int = 512, n_filters: int = 16
-    ):
+    def __init__(self, *args: Any, n_neighbours: int = 12, memory: int = 512, n_filters: int = 16):
         super().__init__(*args)
-        if space not in ("random", "latents"):
-            raise ValueError(f"space is {space!r} in intrinsic_kwargs: choose 'random' or 'latents'.")
         self.n_neighbours = n_neighbours
-        self.encoder: nn.Sequential | None = None
-        if space == "random":
-            self.encoder = make_network(self.observation_space, [self.features_dim], n_filters)
-            self.encoder.append(nn.LayerNorm(self.features_dim, elementwise_affine=False)).requires_grad_(False)
-            self.register_buffer("features", th.zeros(memory, self.features_dim))
+        self.encoder = make_network(self.observation_space, [self.features_dim], n_filters)
+        self.encoder.append(nn.LayerNorm(self.features_dim, elementwise_affine=False)).requires_grad_(False)
+        self.register_buffer("features", th.zeros(memory, self.features_dim))
         # The memory, [memory, 2]: number of the row among all that were ever added (-1: none), and environment
         self.places = np.full((memory, 2), -1)
         self.cursor = 0
@@ -68,15 +59,15 @@ class Particle(IntrinsicReward):
         self._episodes = None
 
     @classmethod
-    def is_per_image(cls, space: str = "random", **kwargs: Any) -> bool:
-        """Return whether the features come from an image."""
-        return space == "random"
+    def is_per_image(cls, **kwargs: Any) -> bool:
+        """Return True: the features come from an image."""
+        return True
 
     @th.no_grad()
     def loss(self, inputs: RewardInputs) -> tuple[None, th.Tensor]:
         """Measure the distances to the nearest neighbours.
 
-        :param inputs: Its next observations or next latents are read, and the replay buffer
+        :param inputs: Its next observations are read, and the replay buffer
         :return: None, and the reward; 0 if there is no state of another episode, [B]
         :raises ValueError: if the replay buffer does not remember which transitions it has drawn
         """
@@ -86,16 +77,9 @@ class Particle(IntrinsicReward):
                 f"intrinsic='particle' needs to know the episodes of a batch, but {type(buffer).__name__} does not "
                 "remember which transitions it has drawn: leave out replay_buffer_class and optimize_memory_usage."
             )
-        if self.encoder is None:
-            features = inputs.next_latents
-        else:
-            features = self.encoder(scaled(inputs.batch.next_observations, self.observation_space))
+        features = self.encoder(scaled(inputs.batch.next_observations, self.observation_space))
         sampled, (known, remembered) = buffer.last_sampled, self._remembered(buffer)
-        candidates = features
-        if self.encoder is not None:
-            candidates = th.cat([features, self.features[th.from_numpy(known).to(features.device)]])
-        elif len(known) > 0:
-            candidates = th.cat([features, inputs.encode(inputs.look_up(*remembered).next_observations)])
+        candidates = th.cat([features, self.features[th.from_numpy(known).to(features.device)]])
         episodes = self._number_episodes(buffer)
         others = np.concatenate([episodes[sampled], episodes[remembered]])
         is_candidate = th.from_numpy(episodes[sampled][:, None] != others).to(features.device)
@@ -132,8 +116,7 @@ class Particle(IntrinsicReward):
         n = min(len(rows), len(self.places))
         where = (self.cursor + np.arange(n)) % len(self.places)
         self.places[where] = np.stack([numbers, env_inds], axis=1)[-n:]
-        if self.encoder is not None:
-            self.features[th.from_numpy(where).to(features.device)] = features[-n:]
+        self.features[th.from_numpy(where).to(features.device)] = features[-n:]
         self.cursor = (self.cursor + n) % len(self.places)
 
     def _number_episodes(self, buffer: Any) -> ndarray:

@@ -27,7 +27,6 @@ ALGORITHMS: dict[str, Any] = {"sac": CuReSAC, "tqc": CuReTQC}
 REWARDS: dict[str, tuple[str, dict[str, Any]]] = {name: (name, {}) for name in INTRINSIC_REWARDS} | {
     "srl_error per pixel": ("srl_error", {"per_pixel": True}),
     "icm, own encoder": ("icm", {"encoder": "own"}),
-    "particle of latents": ("particle", {"space": "latents"}),
 }
 SENSORS = ("image", "vector", "dictionary")
 FACTORS: tuple[tuple[Any, ...], ...] = (tuple(ALGORITHMS), (None, *SRL_HEADS), tuple(REWARDS), SENSORS)

@@ -98,8 +98,8 @@ def test_latents_are_of_centred_views(augmentation: str | None, update: str) -> 
 
 def test_latents_are_computed_once_when_read() -> None:
     read: list[str] = []
-    rest: Any = [None] * 3
-    inputs = RewardInputs(rest, None, lambda name: th.ones(2, 4) * (read.append(name) or len(read)), *rest)
+    rest: Any = [None] * 2
+    inputs = RewardInputs(rest[0], None, lambda name: th.ones(2, 4) * (read.append(name) or len(read)), *rest)
     assert read == []
     with th.no_grad():
         first = inputs.next_latents
@@ -358,7 +358,6 @@ def test_rewards_draw_from_generators_of_their_own() -> None:
         (dict(srl="inverse", intrinsic="srl_error", intrinsic_kwargs=dict(per_pixel=True)), "Inverse does not draw"),
         (dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="novelty")), "choose one of"),
         (dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="mine")), "encoder is 'mine'"),
-        (dict(intrinsic="particle", intrinsic_kwargs=dict(space="pixels")), "space is 'pixels'"),
     ],
 )
 def test_impossible_rewards_are_refused(arguments: dict[str, Any], sentence: str) -> None:

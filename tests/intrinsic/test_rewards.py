@@ -31,7 +31,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "per pixel": dict(intrinsic_kwargs=dict(per_pixel=True)),
     "icm, own encoder": dict(intrinsic="icm", intrinsic_kwargs=dict(encoder="own")),
     "particle": dict(intrinsic="particle", intrinsic_kwargs=dict(memory=20)),
-    "particle, latents": dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents", memory=20)),
     "shuffled rnd": dict(intrinsic="shuffled", intrinsic_kwargs=dict(of="rnd", n_filters=4)),
 }
 every_reward = pytest.mark.parametrize("arm", ARMS)
@@ -41,7 +40,7 @@ def inputs_of(model: CuReSAC, batch: Any, latents: th.Tensor, next_latents: th.T
     """What a reward reads, with given latents."""
     read = {"observations": latents, "next_observations": next_latents}
     of_model = model._reward_inputs(batch, None)
-    return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, of_model.look_up, of_model.encode)  # type: ignore[arg-type]
+    return RewardInputs(batch, None, read.__getitem__, model.replay_buffer, of_model.look_up)  # type: ignore[arg-type]
 
 
 def reward_of(model: CuReSAC) -> Any:
@@ -313,16 +312,15 @@ def nearest_mean(own: th.Tensor, others: list[th.Tensor], k: int) -> float:
     return math.log(1 + sum(distances) / len(distances)) if distances else 0.0
 
 
-@pytest.mark.parametrize("space", ["random", "latents"])
 @pytest.mark.parametrize("n_envs, size", [(1, 20), (2, 20), (2, 5)], ids=str)
-def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_envs: int, size: int) -> None:
+def test_particle_is_the_distance_to_neighbours_of_other_episodes(n_envs: int, size: int) -> None:
     """Over batch and memory, also one smaller than a batch.
 
     The replay buffer overwrites its oldest rows, once all of them between two updates, and its stream breaks without an
     end, as in another ``learn()``.
     """
     env = DummyVecEnv([lambda: VectorBox(episode_length=4)] * n_envs)
-    kwargs = dict(space=space, n_neighbours=3, memory=size)
+    kwargs = dict(n_neighbours=3, memory=size)
     arguments: dict[str, Any] = dict(intrinsic="particle", intrinsic_kwargs=kwargs, buffer_size=24 * n_envs)
     model = tiny_model("MlpPolicy", env, srl=None, task=False, learning_starts=24 * n_envs, **arguments)
     model.learn(24 * n_envs)
@@ -336,7 +334,7 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
     def encode(row: int, env_ind: int) -> th.Tensor:
         with th.no_grad():
             seen = th.as_tensor(buffer.next_observations[row, env_ind])[None]  # type: ignore[union-attr]
-            return (model.policy.encode(seen) if space == "latents" else layer_by_layer(reward.encoder, seen))[0]
+            return layer_by_layer(reward.encoder, seen)[0]
 
     for update in range(7):
         for _ in range(26 if update == 4 else 3):  # the oldest rows go
@@ -348,8 +346,6 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
             seen = following
             for i, place in enumerate(memory):
                 memory[i] = None if place is None or place[0] == row else place
-        if space == "latents":  # stored ones would be stale
-            memory = deque((p and (*p[:2], encode(*p[:2])) for p in memory), maxlen=size)
         state = np.random.get_state()
         buffer.sample(8)
         np.random.set_state(state)
@@ -367,7 +363,7 @@ def test_particle_is_the_distance_to_neighbours_of_other_episodes(space: str, n_
 
 def test_particle_forgets_rows_whose_frames_were_lost() -> None:
     """Streams that break in every step leave the ring of frames room for few transitions."""
-    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(space="latents", memory=40), buffer_size=24)
+    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(memory=40), buffer_size=24)
     model = tiny_model("CnnPolicy", PixelBox(size=24), srl=None, task=False, **kwargs).learn(24)
     buffer, found = model.replay_buffer, captured(model)
     assert buffer is not None
@@ -378,10 +374,9 @@ def test_particle_forgets_rows_whose_frames_were_lost() -> None:
     assert buffer.size() < 20 and len(found) == 12 and found[-1].min() > 0
 
 
-@pytest.mark.parametrize("space", ["random", "latents"])
-def test_particle_forgets_a_buffer_that_was_not_loaded(space: str, tmp_path: Path) -> None:
+def test_particle_forgets_a_buffer_that_was_not_loaded(tmp_path: Path) -> None:
     """Rows and environments of the former buffer are no neighbours: there is but one episode so far."""
-    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(space=space, memory=20), srl=None, task=False)
+    kwargs = dict(intrinsic="particle", intrinsic_kwargs=dict(memory=20), srl=None, task=False)
     tiny_model("CnnPolicy", DummyVecEnv([PixelBox] * 2), **kwargs).learn(24).save(tmp_path / "model")
     model = CuReSAC.load(tmp_path / "model", PixelBox(episode_length=50))
     found = captured(model)
