@@ -20,7 +20,7 @@ from sb3_cure.cure.crash_report import FiniteGuard
 from sb3_cure.cure.critics import LatentCritic
 from sb3_cure.cure.mixers import CuriousMixer
 from sb3_cure.cure.policies import CuRePolicy
-from sb3_cure.data.buffers import FrameStackReplayBuffer, choose_frame_stack
+from sb3_cure.data.buffers import FrameStackReplayBuffer, infer_frame_stack
 from sb3_cure.envs.sharing import share_environment
 from sb3_cure.envs.spaces_check import check_action_space, check_observation_space
 from sb3_cure.intrinsic import IntrinsicReward
@@ -236,7 +236,7 @@ class CuReBase(OffPolicyAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
         if self._frame_stack is None:
-            self._frame_stack = choose_frame_stack(self)
+            self._frame_stack = self.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(self.env)
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             if "frame_stack" in inspect.signature(self.replay_buffer_class).parameters:
                 self.replay_buffer_kwargs.setdefault("frame_stack", self._frame_stack)

@@ -37,18 +37,6 @@ def reconstruction_strips(
     return strips
 
 
-def reconstruction_strip(policy: CuRePolicy, batch: Samples, frame_stack: int, columns: int = 8) -> np.ndarray | None:
-    """The (first) image of ``reconstruction_strips``, or None if there is none.
-
-    :param policy: The policy
-    :param batch: Samples
-    :param frame_stack: Frames per observation
-    :param columns: How many observations
-    :return: An image uint8 (C, 2 * H, columns * W) with C = 1 or 3, or None
-    """
-    return next(iter(reconstruction_strips(policy, batch, frame_stack, columns).values()), None)
-
-
 def newest_frames(images: th.Tensor, frame_stack: int) -> th.Tensor:
     """Newest frame of each stack.
 

@@ -361,7 +361,7 @@ def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
     :return: Rows, environments and ages (in rows), newest first, [n] each
     """
     size = buffer.size()
-    if buffer.full and buffer.optimize_memory_usage and not isinstance(buffer, FrameStackReplayBuffer):
+    if buffer.full and buffer.optimize_memory_usage:
         size -= 1  # the oldest one's observation is the newest one's successor now
     ages, env_inds = np.divmod(np.arange(size * buffer.n_envs), buffer.n_envs)
     return (buffer.pos - 1 - ages) % buffer.buffer_size, env_inds, ages
@@ -428,16 +428,8 @@ def frame_stacks(model: OffPolicyAlgorithm) -> dict[str, int]:
     :return: Frames by the keys of ``image_spaces``
     """
     known = getattr(model, "_frame_stack", None)  # of our models, also without environments
-    return stacks_by_key(model.observation_space, known or choose_frame_stack(model))
-
-
-def choose_frame_stack(model: OffPolicyAlgorithm) -> Any:
-    """Frames per observation, as ``FrameStackReplayBuffer`` takes them.
-
-    :param model: A model
-    :return: What the replay buffer is told or, without that, what environments say
-    """
-    return model.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(model.env)
+    told = known or model.replay_buffer_kwargs.get("frame_stack")
+    return stacks_by_key(model.observation_space, told or infer_frame_stack(model.env))
 
 
 def infer_frame_stack(env: VecEnv | None) -> int:

@@ -20,8 +20,8 @@ class Particle(IntrinsicReward):
 
     Distances are those of features of a random network that is never trained (RE3; Seo et al., 2021). Neighbours are
     searched in the batch and in a memory of the latest samples. States of the same episode, the state itself among
-    them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends where
-    the stored stream breaks, as in another ``learn()``.
+    them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends
+    where the stored stream breaks, as in another ``learn()``.
 
     :param args: As of ``IntrinsicReward``
     :param n_neighbours: k

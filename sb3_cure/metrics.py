@@ -1,5 +1,0 @@
-"""Public names of :mod:`sb3_cure.cure.reconstructions`."""
-
-from sb3_cure.cure.reconstructions import reconstruction_strip, reconstruction_strips
-
-__all__ = ["reconstruction_strip", "reconstruction_strips"]
