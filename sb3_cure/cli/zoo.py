@@ -2,7 +2,6 @@
 
 import argparse
 import sys
-import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import partial
@@ -20,7 +19,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_cure.cli.progress import TimeLeft, time_text
+from sb3_cure.cli.progress import TimeLeft
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, parse, refusals_in_one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
@@ -121,29 +120,12 @@ class ExperimentManager(exp_manager.ExperimentManager):
             curiosity = self._hyperparams.get("curiosity", "separate")
             sampler = partial(sample_params, curiosity=curiosity, quantiles=self.algo == "cure_tqc")
             HYPERPARAMS_SAMPLER[self.algo] = sampler
-        self._start, self._first = time.monotonic(), 0
         try:
             super().hyperparameters_optimization()
         except ValueError as error:
             if "No trials are completed" not in str(error):  # Optuna's, where there is no best one to show
                 raise
-            print(f"No trial was completed in {time_text(time.monotonic() - self._start)}.")
-
-    def objective(self, trial: optuna.Trial) -> float:
-        self._first = self._first or trial.number + 1
-        try:
-            return super().objective(trial)
-        except KeyboardInterrupt:  # which rl-zoo3 catches further out
-            kept = f"{self.storage} keeps all completed trials, and the same command adds to them"
-            print(f"Stopped: {kept if self.storage else 'without --storage no trial is kept for another call'}.")
-            raise
-        finally:
-            # If several processes share a study, count the trials of all of them since this one began.
-            number, ended = trial.number + 1, trial.number + 2 - self._first
-            last = self.max_total_trials or self._first - 1 + (self.n_trials or 0)
-            left = (time.monotonic() - self._start) / ended * (last - number)
-            if left > 0:
-                print(f"Trial {number} of {last} ended, about {time_text(left)} left", flush=True)
+            print("No trial was completed.")
 
 
 def sample_params(

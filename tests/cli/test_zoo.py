@@ -6,7 +6,6 @@ import re
 import shlex
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -251,33 +250,6 @@ def test_only_what_the_agent_uses_is_tuned(curiosity: str | None, tuned: set[str
     assert {name for name in asked[0] if "curiosity" in name} == tuned
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=curiosity, **{**asked[0], "buffer_size": 20})
     assert {name: getattr(model, name) for name in asked[0]} == asked[0]
-
-
-@pytest.mark.parametrize(
-    ("numbers", "trials", "told"),
-    [
-        (dict(n_trials=3), [0], "Trial 1 of 3 ended, about 2 min left"),
-        (dict(n_trials=3), [4, 5], "Trial 6 of 7 ended, about 30 s left"),  # a study that had four
-        (dict(n_trials=500, max_total_trials=8), [4], "Trial 5 of 8 ended, about 3 min left"),
-        (dict(n_trials=500, max_total_trials=8), [2, 5], "Trial 6 of 8 ended, about 30 s left"),
-    ],
-)
-def test_trials_that_are_left_are_told(
-    numbers: dict[str, int],
-    trials: list[int],
-    told: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """All of them have taken a minute; with ``--max-total-trials`` other processes make some."""
-    manager = zoo.ExperimentManager(
-        type("Arguments", (), {"gym_packages": [], "conf_file": None})(), "cure_sac", TASK, "logs", **numbers
-    )
-    manager._start, manager._first = time.monotonic() - 60, 0
-    monkeypatch.setattr(zoo.exp_manager.ExperimentManager, "objective", lambda manager, trial: 0.0)
-    for number in trials:
-        manager.objective(type("Trial", (), {"number": number})())  # type: ignore[arg-type]
-    assert capsys.readouterr().out.splitlines()[-1] == told
 
 
 # ----------------------------------------------------------------- replaying
