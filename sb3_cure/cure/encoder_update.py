@@ -13,7 +13,7 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_cure.networks.encoders import Encoder
 
-#: Updates between two measurements of each source's share, which costs a backward pass for each source
+#: Joint updates between two measurements of each source's share, which costs a backward pass for each source
 MEASURE_INTERVAL = 100
 
 #: Takes the name of a step and the gradients that it follows; raises if one is not finite
@@ -173,16 +173,11 @@ class EncoderUpdate:
             joint, first = self.mode == "joint", next(iter(self._gradients))  # sequential: the only one
             optimizer = self.optimizers["joint" if joint else first]
             update_learning_rate(optimizer, self.learning_rate * len(self._gradients) ** 0.5)
-            measures = self._n_updates % MEASURE_INTERVAL == 1
-            if measures and joint:
+            if joint and self._n_updates % MEASURE_INTERVAL == 1:
                 self._measure_shares()
-            before = [parameter.detach().clone() for parameter in self._parameters] if measures and not joint else []
             # The last source first, which is the order in which autograd would add up their losses.
             self._check("encoder", self._backward(list(reversed(self._gradients.values()))))
             optimizer.step()
-            if before:
-                steps = [parameter.detach() - old for parameter, old in zip(self._parameters, before, strict=True)]
-                self.metrics[f"encoder_step_norm_{first}"] = _norm(steps)
         self._forget()
 
     def _backward(self, gradients: Sequence[dict[str, th.Tensor]], retain_graph: bool = False) -> list[th.Tensor]:
