@@ -19,7 +19,7 @@ from sb3_cure.srl import SRL_HEADS
         (SRL_HEADS["vae"], dict(beta=1e-6)),
         (INTRINSIC_REWARDS["srl_error"], dict(per_pixel=False, decay=0.99)),
         (INTRINSIC_REWARDS["disagreement"], dict(n_members=5, share=0.5)),
-        (INTRINSIC_REWARDS["particle"], dict(space="random", n_neighbours=12, memory=512)),
+        (INTRINSIC_REWARDS["particle"], dict(n_neighbours=12, memory=512)),
         (RewardScale, dict(decay=0.99, clip=5.0)),
         (RandomShift, dict(pad=4)),  # DrQ
     ],

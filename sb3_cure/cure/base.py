@@ -88,8 +88,8 @@ class CuReBase(OffPolicyAlgorithm):
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
     :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: what the head wants (RAE:
-        1000), or 0 where there is no warm-up or the head is frozen. In each of them actors, temperatures and targets
-        are updated, as in SAC-AE's code
+        1000), or 0 where there is no warm-up or the head is frozen. With ``learning_starts=0`` the burst waits for
+        ``batch_size`` transitions. In each update of it actors, temperatures and targets learn, as in SAC-AE's code
     :param actor_update_interval: Updates of the critics per update of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
@@ -367,9 +367,9 @@ class CuReBase(OffPolicyAlgorithm):
         repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
         has_hindsight = isinstance(self.replay_buffer, HerReplayBuffer)
-        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(RepeatAction)):
+        if has_hindsight and any(env.env_is_wrapped(RepeatAction)) and max(env.get_attr("num_repeats")) > 1:
             raise ValueError(
-                f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
+                "a repeated action sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."
             )
         return total, callback

@@ -105,7 +105,7 @@ class CuRe(CuReBase):
             wanted = self._learns_srl and self.learning_starts > 0
             updates = get_srl_class(self.srl).warmup_updates if wanted else 0  # type: ignore[arg-type]
         elif self.learning_starts == 0 and self.replay_buffer.size() * self.n_envs < self.batch_size:  # type: ignore[union-attr]
-            updates = 0  # of a step or two; what was loaded is more
+            return  # until there is a batch
         if updates > 0 and self.gradient_steps != 0:
             if self.verbose >= 1:
                 print(f"Making {updates} updates before the next step (warmup_updates).")

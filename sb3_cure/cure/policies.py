@@ -474,6 +474,7 @@ class CuRePolicy(BasePolicy):
         if frozen == self.representation_frozen:
             return
         self.representation_frozen = frozen
+        self.encoder_update.metrics = {}
         if frozen:
             self._frozen_parameters = [each for each in self.encoder.parameters() if each.requires_grad]
             self.encoder_target.load_state_dict(self.encoder.state_dict())

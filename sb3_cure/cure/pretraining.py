@@ -44,7 +44,6 @@ class Pretraining(CuRe):
             self.task, self.curiosity = before["task"], before["curiosity"]
         super()._setup_model()
         self._initial_rng_state = th.get_rng_state()
-        self.policy.freeze_representation(self.representation_frozen)
         if before is not None:
             self._begin_pretraining(collector)
 
@@ -196,10 +195,10 @@ class Pretraining(CuRe):
         self._keeps_replay_buffer = keep_replay_buffer
         try:
             super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-            if self._n_updates == 0:
+            if self.num_timesteps <= self.learning_starts:
                 warnings.warn(
-                    f"pretrain made no update in {self.num_timesteps} agent steps, of which learning_starts="
-                    f"{self.learning_starts} are the random warm-up: give it more.",
+                    f"pretrain trained nothing: it ended after {self.num_timesteps} agent steps, and makes no update "
+                    f"before step learning_starts={self.learning_starts}.",
                     stacklevel=2,
                 )
         finally:
@@ -224,8 +223,8 @@ class Pretraining(CuRe):
         built = self.policy.curious is not None, self.policy.intrinsic is not None
         if built != (self._has_curious_agent, self.curiosity in ("separate", "bonus")):
             raise ValueError(
-                f"curiosity was set to {self.curiosity!r} after the model was made, whose archive could not be loaded: "
-                "make it with this, or set curiosity_prob=0, after which the curious policy learns but does not act."
+                f"curiosity was set to {self.curiosity!r} after the model was made, with networks of another kind: "
+                "make a new model. (With curiosity_prob=0 a separate curious policy learns, but does not act.)"
             )
         if self._is_pretrained:
             self._restart_random_streams()

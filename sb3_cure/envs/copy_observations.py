@@ -18,6 +18,11 @@ class TransparentWrapper(gym.Wrapper[Any, Any, Any, Any]):
         else:
             setattr(self.env, name, value)
 
+    @property
+    def action_repeat(self) -> int:
+        """Environment steps per agent step, also of Gymnasium's ``RepeatAction``; SB3's ``get_attr`` finds it here."""
+        return action_repeat_of(self.env)
+
 
 class CopyObservations(TransparentWrapper):
     """Copies observations, and checks their sizes and types against the space.
@@ -31,11 +36,6 @@ class CopyObservations(TransparentWrapper):
 
     :param env: The environment
     """
-
-    @property
-    def action_repeat(self) -> int:
-        """Environment steps per agent step, also of Gymnasium's ``RepeatAction``; SB3's ``get_attr`` finds it here."""
-        return action_repeat_of(self.env)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, with the arguments that it takes.

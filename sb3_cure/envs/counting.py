@@ -41,7 +41,7 @@ class CellInfo(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class SumRewards(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Sums rewards until they are taken; what ``TaskReward`` reads, with any wrappers between them.
+    """Sums rewards until they are taken, by a ``TaskReward`` with any wrappers between them.
 
     :param env: An environment that gives the task's reward
     """
@@ -70,17 +70,17 @@ class SumRewards(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return taken
 
 
-class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class TaskReward(gym.Wrapper[Any, Any, Any, Any]):
     """Puts the task's reward into ``info[TASK_REWARD]``, whatever wrappers within make of it, or pays it.
 
-    :param env: Wrappers of any kind around ``SumRewards``
+    :param env: Wrappers of any kind around ``task``
+    :param task: The environment that gives the task's reward
     :param pays: Whether the task's reward is also the one that a step returns
     """
 
-    def __init__(self, env: gym.Env, pays: bool = False) -> None:
-        RecordConstructorArgs.__init__(self, pays=pays)
+    def __init__(self, env: gym.Env, task: SumRewards, pays: bool = False) -> None:
         super().__init__(env)
-        self.pays = pays
+        self.task, self.pays = task, pays
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment.
@@ -88,10 +88,9 @@ class TaskReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         :param action: The action
         :return: What the environment returns, with the task's reward in the info
         """
-        take_sum = self.get_wrapper_attr("take_sum")
-        take_sum()  # of steps that wrappers make while they reset
+        self.task.take_sum()  # of steps that wrappers make while they reset
         observation, reward, terminated, truncated, info = self.env.step(action)
-        met = take_sum()
+        met = self.task.take_sum()
         return observation, met if self.pays else reward, terminated, truncated, {**info, TASK_REWARD: met}
 
 

@@ -232,7 +232,7 @@ class Cell:
 
         :return: The environment, which also reports the task's reward
         """
-        env = TaskReward(self._wrapped_env())
+        env = self._task_reward(pays=False)
         return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
@@ -241,13 +241,13 @@ class Cell:
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
         :return: The environment
         """
-        return TaskReward(self._wrapped_env(**env_kwargs), pays=True)
+        return self._task_reward(pays=True, **env_kwargs)
 
-    def _wrapped_env(self, **env_kwargs: Any) -> gym.Env:
-        env: gym.Env = SumRewards(gym.make(self.task, **{**self.env_kwargs, **env_kwargs}))
+    def _task_reward(self, pays: bool, **env_kwargs: Any) -> gym.Env:
+        env = task = SumRewards(gym.make(self.task, **{**self.env_kwargs, **env_kwargs}))
         for wrap, kwargs in named_wrappers(self.arguments.get("env_wrapper")):
             env = wrap(env, **kwargs)
-        return env
+        return TaskReward(env, task, pays)
 
     def custom_objects(self) -> dict[str, Any]:
         """Import the user's classes that the arguments name; a model's archive needs them to be loaded."""

@@ -1,5 +1,6 @@
 """CuRe's own arguments: what is out of range, or would train something else than was asked for, is refused."""
 
+import contextlib
 import inspect
 from typing import Any
 
@@ -13,7 +14,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, EveryNTimesteps
 from stable_baselines3.common.torch_layers import NatureCNN
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.sac.policies import CnnPolicy, MultiInputPolicy
 
 from sb3_cure import CuReSAC
@@ -149,11 +150,14 @@ def test_hindsight_with_restarting_workers_is_refused() -> None:
         venv.close()
 
 
+@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
 @pytest.mark.parametrize("wrapper", [ActionRepeat, gym.wrappers.RepeatAction])
-def test_hindsight_with_repeated_actions_is_refused(wrapper: Any) -> None:
+def test_hindsight_with_repeated_actions_is_refused(wrapper: Any, vec_env: Any) -> None:
     """Rewards of the goals that were reached are computed for one step, those that are stored are sums."""
-    env = wrapper(Goal(), 2)
-    with pytest.raises(ValueError, match="use action_repeat=1"):
+    with (
+        contextlib.closing(vec_env([lambda: wrapper(Goal(), 2)])) as env,
+        pytest.raises(ValueError, match="use action_repeat=1"),
+    ):
         tiny_model("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, learning_starts=20).learn(10)
 
 

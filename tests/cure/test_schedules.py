@@ -216,7 +216,7 @@ def test_frozen_head_wants_no_burst() -> None:
 
 
 def test_burst_without_warm_up_needs_what_was_loaded() -> None:
-    """As of a recipe with ``learning_starts=0``: it would be of one transition."""
+    """As of a recipe with ``learning_starts=0``: at once it would be of one transition."""
     arguments: dict[str, Any] = dict(learning_starts=0, warmup_updates=9)
     models = [tiny_model("MlpPolicy", VectorBox(), **arguments) for _ in range(2)]
     ends = np.arange(8) == 7
