@@ -59,7 +59,7 @@ def test_pretraining_moves_no_task_network(collector: str, curiosity: str | None
     model = filled_model(curiosity=curiosity, update=update, learning_starts=10, gradient_steps=0)
     before, names = groups(model), (model._get_torch_save_params(), model.policy.state_dict().keys())
     model.gradient_steps = 1
-    model.pretrain(16, collector=collector)
+    model.pretrain(16, collector=collector, keep_replay_buffer=True)
     after = groups(model)
     assert (model._get_torch_save_params(), model.policy.state_dict().keys()) == names
     curious = {"curious critic"} | CURIOUS_ACTOR if curiosity == "separate" and collector == "curious" else set()
