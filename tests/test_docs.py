@@ -27,7 +27,8 @@ PAGES = [
     *(p for p in sorted(DOCS.rglob("*.md")) if not {"_build", "notebooks", "results"} & set(p.relative_to(DOCS).parts)),
 ]
 #: Modules whose public names users write in their own code; what is not in them is internal
-PUBLIC = "buffers callbacks datasets deployment envs evaluation intrinsic metrics persistence srl vec_env".split()
+PUBLIC = """buffers callbacks datasets deployment envs evaluation intrinsic persistence reconstructions srl vec_env
+""".split()
 
 
 def blocks(page: str | Path) -> list[str]:
