@@ -364,12 +364,14 @@ class CuReBase(OffPolicyAlgorithm):
                 f"a {type(self.replay_buffer).__name__} cannot leave out the steps of workers that died: use "
                 "on_env_fault='raise', or leave replay_buffer_class out."
             )
-        repeat = env.get_attr("action_repeat")[0] if env.has_attr("action_repeat") else 1
+        # SB3's own workers tell what the outermost wrapper has, which may be Gymnasium's `RepeatAction`.
+        known = [name for name in ("action_repeat", "num_repeats") if env.has_attr(name)]
+        repeat = env.get_attr(known[0])[0] if known else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
         has_hindsight = isinstance(self.replay_buffer, HerReplayBuffer)
-        if has_hindsight and any(env.env_is_wrapped(RepeatAction)) and max(env.get_attr("num_repeats")) > 1:
+        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(RepeatAction)):
             raise ValueError(
-                "a repeated action sums rewards, and HerReplayBuffer would mix such sums with "
+                f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."
             )
         return total, callback

@@ -248,8 +248,8 @@ class SavesModels(OffPolicyAlgorithm):
             kwargs["replay_buffer_kwargs"] = {"frame_stack": saved["frame_stack"], **changed}
         vars(model).update(kwargs)
         model._setup_model()
-        replaced, saved = {**(custom_objects or {}), **kwargs}, archive.content["settings"]
-        given = {key for key in _TEMPERATURES if key in replaced and replaced[key] != saved.get(key)}
+        replaced, archived = {**(custom_objects or {}), **kwargs}, archive.content["settings"]
+        given = {key for key in _TEMPERATURES if key in replaced and replaced[key] != archived.get(key)}
         model._load_tensors(archive, given)
         if model.use_sde:
             model.policy.reset_noise()  # type: ignore[operator]  # of the loaded deviation, as SB3's load does

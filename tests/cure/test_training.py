@@ -451,12 +451,12 @@ def test_pretraining_that_keeps_its_transitions() -> None:
 
 def test_pretraining_that_cannot_begin_changes_nothing() -> None:
     model = tiny_model("MlpPolicy", VectorBox(), curiosity=None, learning_starts=10, intrinsic_kwargs={"of": "nothing"})
-    with pytest.raises(TypeError, match="of"):
-        model.pretrain(10)
-    assert (model.task, model.curiosity, model.is_pretraining) == (True, None, False)
     model.learn(20)
+    with pytest.raises(TypeError, match="of"):
+        model.pretrain(10, keep_replay_buffer=True)
     with pytest.raises(ValueError, match="20 transitions are in it"):  # such as episodes from disk
         model.pretrain(10)
+    assert (model.task, model.curiosity, model.is_pretraining) == (True, None, False)
     model.learn(10, reset_num_timesteps=False)
     assert (model.num_timesteps, model.replay_buffer.size()) == (30, 30)
 

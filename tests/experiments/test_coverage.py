@@ -96,7 +96,7 @@ def test_any_wrapper_may_change_rewards(order: tuple[int, int], tmp_path: Path) 
 def test_policies_are_measured_in_the_wrappers_they_are_trained_in(tmp_path: Path) -> None:
     """Steps are counted as training makes them, of observations that it sees."""
     repeat = {"sb3_cure.envs.ActionRepeat": {"num_repeats": 2}}
-    arm = method(env_wrapper=[repeat, ORACLE], **QUICK)
+    arm = method(env_wrapper=[repeat, ORACLE, "gymnasium.wrappers.NormalizeReward"], **QUICK)
     [cell] = grid(tmp_path, methods={"slow": arm}, coverage=None).cells
     with contextlib.closing(cell.make_env()) as env, contextlib.closing(cell.make_eval_env()) as measured:
         assert action_repeat_of(measured) == action_repeat_of(env) == 2 * 40
