@@ -44,6 +44,10 @@ def few(run: Callable[..., Any], model: Any, steps: int, *args: Any, **kwargs: A
     return run(model, min(steps, STEPS), *args, **kwargs)
 
 
+def short_episodes(make: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> gym.Env:
+    return gym.wrappers.TimeLimit(make(*args, **kwargs), 20)
+
+
 def small_env(make: Callable[..., gym.Env], *args: Any, **kwargs: Any) -> gym.Env:
     # 36 px: the smallest images of SB3's own network
     return gym.wrappers.TimeLimit(make(*args, **{**kwargs, "image_size": 36}), 4)
@@ -82,6 +86,13 @@ def run_page(folder: str) -> bool:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
+
+
+def shrink_notebook() -> None:
+    """Steps are parameters of notebooks."""
+    shrink(CuReBase, "__init__", tiny_model)
+    shrink(dmc, "make_dmc_env", short_episodes)
+    sb3_cure.make_dmc_env = envs.make_dmc_env = dmc.make_dmc_env
 
 
 def shrink_everything() -> None:

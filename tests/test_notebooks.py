@@ -7,67 +7,32 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
-#: What replaces the parameter cell of each notebook: it names all parameters, with values that take seconds.
+#: Stands before the first cell: tiny networks, a few updates, short episodes
+SHRINK = f"""
+import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
+import snippets_for_tests; snippets_for_tests.shrink_notebook()
+"""
+#: What replaces the parameter cell of each notebook: it names all parameters that the networks do not, with small values
+SETTINGS = "LEARNING_STARTS, WARMUP_UPDATES, BATCH_SIZE, NETWORKS = 20, 10, 8, {}"
 TINY = {
-    "01_quickstart": """
-STEPS = 100
-# Fifty episodes are evaluated: of 20 steps instead of 125
-import gymnasium, sb3_cure
-make = sb3_cure.make_dmc_env
-sb3_cure.make_dmc_env = lambda *args, **kwargs: gymnasium.wrappers.TimeLimit(make(*args, **kwargs), 20)
-""",
-    "02_srl_error_visitation": """
-STEPS = 100
-EPISODES = 1
-WARMUP_UPDATES = 20
-BATCH_SIZE = 8
-NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
-PAPERS_PIXELS = dict(image_size=36, renderer="fast")
-""",
-    "03_learning_curves": """
-BUDGET = 320
-SEEDS = 2
-EVALUATION = dict(every=320, episodes=1)
-LEARNING_STARTS = 20
-WARMUP_UPDATES = 10
-BATCH_SIZE = 8
-NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
-""",
-    "04_pretraining": """
-BUDGET = 320
-PRETRAINING = 320
-SEEDS = 2
-EVALUATION = dict(every=320, episodes=1)
-LEARNING_STARTS = 20
-WARMUP_UPDATES = 10
-BATCH_SIZE = 8
-NETWORKS = dict(net_arch=[16], features_extractor_kwargs=dict(n_filters=4))
-""",
-    "05_your_own_srl_head": """
-STEPS = 300
-EPISODES = 2
-""",
-    "06_your_own_camera_env": """
-STEPS = 60
-WARMUP = 40
-EPISODES = 1
-""",
-    "07_camera_and_joints": """
-STEPS = 60
-WARMUP = 40
-EVERY = 30
-EPISODES = 1
-""",
+    "01_quickstart": "STEPS = 100",
+    "02_srl_error_visitation": f"STEPS, EPISODES, PAPERS_PIXELS = 100, 1, dict(image_size=36); {SETTINGS}",
+    "03_learning_curves": f"BUDGET, SEEDS, EVALUATION = 320, 2, dict(every=320, episodes=1); {SETTINGS}",
+    "04_pretraining": f"BUDGET, PRETRAINING, SEEDS, EVALUATION = 320, 320, 2, dict(every=320, episodes=1); {SETTINGS}",
+    "05_your_own_srl_head": "STEPS, EPISODES = 300, 2",
+    "06_your_own_camera_env": "STEPS, WARMUP, EPISODES = 60, 40, 1",
+    "07_camera_and_joints": "STEPS, WARMUP, EVERY, EPISODES = 60, 40, 30, 1",
 }
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs_with_a_tiny_budget(path: Path, tmp_path: Path) -> None:
-    """Every cell runs after the parameter cell is replaced by a small one."""
+    """Every cell runs, with tiny networks and few steps."""
     notebook = nbformat.read(path, as_version=4)
     parameters = [cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", [])]
     assert len(parameters) == 1
     parameters[0].source = TINY[path.stem]
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(SHRINK))
     client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}})
     client.execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
