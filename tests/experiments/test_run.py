@@ -225,7 +225,7 @@ def test_killed_ray_worker_costs_nothing(tmp_path: Path, slow_grid: Any, monkeyp
     pytest.importorskip("ray")
     (tmp_path / "seen").mkdir()
     methods = {"cure": method(device="cpu")}  # where the machine has a card of its own
-    path = slow_grid(kind="visitation", seeds=2, budget=600, evaluation=dict(every=200, episodes=1), methods=methods)
+    path = slow_grid(kind="visitation", seeds=2, budget=300, evaluation=dict(every=100, episodes=1), methods=methods)
     grid, out = load_grid(path), tmp_path / "out"
     with monkeypatch.context() as card:
         card.delenv("CUDA_VISIBLE_DEVICES")  # of the tests; Ray sets those of its workers
