@@ -12,7 +12,7 @@ SHRINK = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
 import snippets_for_tests; snippets_for_tests.shrink_notebook()
 """
-#: What replaces the parameter cell of each notebook: it names all parameters that the networks do not, with small values
+#: What replaces the parameter cell of each notebook: it names all parameters, with small values
 SETTINGS = "LEARNING_STARTS, WARMUP_UPDATES, BATCH_SIZE, NETWORKS = 20, 10, 8, {}"
 TINY = {
     "01_quickstart": "STEPS = 100",
