@@ -354,22 +354,27 @@ class CuReBase(OffPolicyAlgorithm):
         *args: Any,
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
+        buffer: Any = self.replay_buffer
+        if isinstance(buffer, HerReplayBuffer):
+            buffer.env = self.env  # SB3 keeps the one before `set_env`
+            if reset_num_timesteps or self._last_obs is None:  # the environments are reset
+                with warnings.catch_warnings(action="ignore"):
+                    buffer.truncate_last_trajectory()
         total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
         # As SB3 does after each step; else the first one sees the previous call's progress.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         env: Any = self.env
         restarts_workers = getattr(env.unwrapped, "on_env_fault", None) == "restart"
-        if restarts_workers and not isinstance(self.replay_buffer, FrameStackReplayBuffer):
+        if restarts_workers and not isinstance(buffer, FrameStackReplayBuffer):
             raise ValueError(
-                f"a {type(self.replay_buffer).__name__} cannot leave out the steps of workers that died: use "
+                f"a {type(buffer).__name__} cannot leave out the steps of workers that died: use "
                 "on_env_fault='raise', or leave replay_buffer_class out."
             )
         # SB3's own workers tell what the outermost wrapper has, which may be Gymnasium's `RepeatAction`.
         known = [name for name in ("action_repeat", "num_repeats") if env.has_attr(name)]
         repeat = env.get_attr(known[0])[0] if known else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
-        has_hindsight = isinstance(self.replay_buffer, HerReplayBuffer)
-        if has_hindsight and self._action_repeat > 1 and any(env.env_is_wrapped(RepeatAction)):
+        if isinstance(buffer, HerReplayBuffer) and self._action_repeat > 1 and any(env.env_is_wrapped(RepeatAction)):
             raise ValueError(
                 f"action_repeat={self._action_repeat} sums rewards, and HerReplayBuffer would mix such sums with "
                 "the single rewards that it computes for other goals: use action_repeat=1."

@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import configure_logger
 
 from sb3_cure.cure.arguments import choose_intrinsic
 from sb3_cure.cure.cure import CuRe
-from sb3_cure.data.datasets import episodes_of, fill
+from sb3_cure.data.datasets import fill
 from sb3_cure.persistence.archive import archived_networks
 
 Self = TypeVar("Self", bound="Pretraining")
@@ -62,7 +62,7 @@ class Pretraining(CuRe):
                 "load_transitions stores what is on disk, but VecNormalize has no statistics of that: load its own "
                 "(VecNormalize.load) and set training=False, or leave it out."
             )
-        return fill(self.replay_buffer, episodes_of(source), self.policy.scale_action)  # type: ignore[arg-type]
+        return fill(self.replay_buffer, source, self.policy.scale_action)  # type: ignore[arg-type]
 
     def fit_representation(self: Self, updates: int, log_interval: int = 1000) -> Self:
         """Train the representation alone, on what the replay buffer holds: ``pretrain`` without collecting.
@@ -83,10 +83,11 @@ class Pretraining(CuRe):
         counted = self._n_updates, self._n_batches
         self._begin_pretraining("random")
         try:
-            for done in range(0, updates, log_interval):
-                self._current_progress_remaining = 1 - done / updates  # progress of schedules
-                self.train(min(log_interval, updates - done), self.batch_size)
-                self.logger.dump(self._n_updates)
+            for update in range(updates):
+                self._current_progress_remaining = 1 - update / updates  # progress of schedules
+                self.train(1, self.batch_size)
+                if (update + 1) % log_interval == 0 or update + 1 == updates:
+                    self.logger.dump(self._n_updates)
         finally:
             self._restore_settings()
             self._n_updates, self._n_batches = counted  # training goes on where it was
@@ -261,9 +262,7 @@ class Pretraining(CuRe):
         if self._before_pretraining is None:
             return
         self._restore_settings()
-        if self._keeps_replay_buffer:
-            _end_episode(self.replay_buffer)  # type: ignore[arg-type]
-        else:
+        if not self._keeps_replay_buffer:
             _empty(self.replay_buffer)  # type: ignore[arg-type]
             if self.policy.intrinsic is not None:
                 self.policy.intrinsic.forget()
@@ -281,12 +280,6 @@ class Pretraining(CuRe):
         if self.seed is not None:
             self.set_random_seed(self.seed)
             th.set_rng_state(self._initial_rng_state)
-
-
-def _end_episode(buffer: ReplayBuffer) -> None:
-    if isinstance(buffer, HerReplayBuffer):  # whose episode would go on with the first one of `learn`
-        with warnings.catch_warnings(action="ignore"):
-            buffer.truncate_last_trajectory()
 
 
 def _empty(buffer: ReplayBuffer) -> None:

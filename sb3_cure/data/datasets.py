@@ -145,24 +145,30 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         self._observations, self._steps = [], []
 
 
-def fill(buffer: ReplayBuffer, episodes: Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]) -> int:
+def fill(
+    buffer: ReplayBuffer, source: str | Path | Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]
+) -> int:
     """Add episodes to a replay buffer as if they had been collected, those of several environments side by side.
 
-    Where no episode is left for an environment, it repeats the transitions of another one.
+    Where no episode is left for an environment, it goes on with the first ones again until the others have ended.
 
     :param buffer: A replay buffer
-    :param episodes: Episodes with the attributes of ``RecordedEpisode``
+    :param source: As of ``episodes_of``
     :param scale_action: Scales actions to [-1, 1], as they are stored
     :return: Number of transitions in the episodes
     :raises ValueError: If episodes do not fit the spaces
     """
-    source, n_added, n_rows = iter(episodes), 0, 0
+    if isinstance(source, Iterator) and buffer.n_envs > 1:
+        source = list(source)
+    left, again = episodes_of(source), itertools.chain.from_iterable(episodes_of(source) for _ in itertools.count())
+    n_added, n_rows = 0, 0
     # Each environment takes the next episode that is left.
-    lanes = [_transitions(source, buffer, scale_action) for _ in range(buffer.n_envs)]
+    lanes = [_transitions(left, buffer, scale_action) for _ in range(buffer.n_envs)]
+    fillers = [_transitions(again, buffer, scale_action) for _ in range(buffer.n_envs)]
     for row in itertools.zip_longest(*lanes):
-        present = [each for each in row if each is not None]
-        n_rows, n_added = n_rows + 1, n_added + len(present)
-        obs, next_obs, actions, rewards, dones, infos = zip(*(each or present[0] for each in row), strict=True)
+        n_rows, n_added = n_rows + 1, n_added + sum(each is not None for each in row)
+        whole = [each or next(filler) for each, filler in zip(row, fillers, strict=True)]
+        obs, next_obs, actions, rewards, dones, infos = zip(*whole, strict=True)
         columns: Any = (stacked(obs), stacked(next_obs), *map(np.array, (actions, rewards, dones)), list(infos))
         buffer.add(*columns)
     if n_rows > buffer.buffer_size:

@@ -429,6 +429,23 @@ def test_hindsight_after_pretraining_that_keeps_its_transitions() -> None:
     assert model.replay_buffer.pos == 65 and model.replay_buffer.ep_length.max() == 10
 
 
+def test_hindsight_stays_within_an_episode() -> None:
+    """Where ``learn`` resets the environments in the middle of one, no goal comes from the next; rewards of other goals
+    are those of the environment that was set."""
+
+    class Scaled(Goal):
+        def compute_reward(self, achieved: np.ndarray, desired: np.ndarray, info: Any) -> np.ndarray:
+            return super().compute_reward(achieved, desired, info) + 7 * (achieved.ndim > 1)  # not in `step`
+
+    model: Any = tiny_model("MultiInputPolicy", Goal(), replay_buffer_class=HerReplayBuffer, buffer_size=100)
+    model.learn(18).learn(50, callback=lambda local, _: local["self"].num_timesteps < 6)
+    model.learn(5, reset_num_timesteps=False)
+    model.set_env(Scaled())
+    model.learn(20, reset_num_timesteps=False)
+    assert model.replay_buffer.ep_length.max() == 10
+    assert (model.replay_buffer.sample(100).rewards > 5).any()
+
+
 # ------------------------------------------------------ parameters and files
 
 

@@ -184,20 +184,34 @@ def test_loaded_transitions_are_those_collected(algorithm: str, policy: str, mak
 
 
 def test_several_environments_share_the_episodes(tmp_path: Path) -> None:
-    """Each transition once, in its order; where none is left for an environment, it repeats the other's."""
+    """Each transition once, in its order; where none is left for an environment, it goes on with the first again."""
     episodes = []
     for number, length in enumerate((30, 10, 10)):
         rewards = 100.0 * number + np.arange(length)
         observations = np.stack([np.append(rewards, rewards[-1] + 0.5)] * 2, axis=1).astype(np.float32)
         ends = np.zeros(length, bool)
         episodes.append(RecordedEpisode(observations, np.zeros((length, 2)), rewards, ends, ends))
-    model = tiny_model("MlpPolicy", make_vec_env(VectorBox, 2), buffer_size=100)
-    assert model.load_transitions(episodes) == 50
-    buffer: Any = model.replay_buffer
     first, second, third = (each.rewards.tolist() for each in episodes)
-    assert buffer.size() == 30 and buffer.rewards[:30, 0].tolist() == first
-    assert buffer.rewards[:30, 1].tolist() == [*second, *third, *first[20:]]
-    assert np.flatnonzero(buffer.starts[:, 1]).tolist() == [0, 10, 20] and buffer.dones[29].all()
+    for source in (episodes, iter(episodes)):
+        model = tiny_model("MlpPolicy", make_vec_env(VectorBox, 2), buffer_size=100)
+        assert model.load_transitions(source) == 50
+        buffer: Any = model.replay_buffer
+        assert buffer.size() == 30 and buffer.rewards[:30, 0].tolist() == first
+        assert buffer.rewards[:30, 1].tolist() == [*second, *third, *first[:10]]
+        model.learn(2)
+        assert np.flatnonzero(buffer.starts[:, 1]).tolist() == [0, 10, 20, 30], "`learn` does not continue an episode"
+
+
+def test_no_episode_gets_most_of_the_samples() -> None:
+    """Of more environments than are left episodes: no transition is there three times."""
+    episodes, ends = [], np.zeros(5, bool)
+    for number in range(10):
+        observations = np.full((6, 2), number / 10, np.float32)
+        episodes.append(RecordedEpisode(observations, np.zeros((5, 2)), np.full(5, number), ends, ends))
+    model = tiny_model("MlpPolicy", make_vec_env(VectorBox, 8), buffer_size=400)
+    assert model.load_transitions(episodes) == 50
+    counts = np.bincount(model.replay_buffer.rewards[:10].astype(int).ravel())
+    assert counts.min() == 5 and counts.max() == 10
 
 
 @pytest.mark.parametrize("make", [VectorBox, PixelBox, lambda: SimpleMultiObsEnv(discrete_actions=False)])
@@ -333,8 +347,10 @@ def test_schedules_follow_the_updates(tmp_path: Path) -> None:
     model.learn(15)
     model.load_transitions(tmp_path)
     seen.clear()
-    model.fit_representation(4, log_interval=1)
-    assert seen[:4] == [1, 0.75, 0.5, 0.25]
+    kept = KeptRows()
+    model.set_logger(Logger(None, [kept]))
+    model.fit_representation(4, log_interval=3)
+    assert seen[:4] == [1, 0.75, 0.5, 0.25] and len(kept.rows) == 2
 
 
 def test_nothing_to_fit_is_refused() -> None:
