@@ -124,7 +124,8 @@ class RolloutCallback(PeriodicCallback):
     :param n_episodes: Episodes per policy
     :param deterministic: Whether policies act by their mean
     :param seed: Seed of the first reset each time: all evaluations then start from the same states
-    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; by default the policies that the model trains
+    :param actors: Of ``"task"``, ``"curious"`` and ``"random"``; by default the policies that the model trains, or
+        ``"random"`` where it trains none
     :param verbose: Verbosity level
     """
 
@@ -156,7 +157,7 @@ class RolloutCallback(PeriodicCallback):
         wrapped = model._wrap_env(self.eval_env, monitor_wrapper=False)
         check_for_correct_spaces(wrapped, model.observation_space, model.action_space)
         trained = trained_actors(model)
-        self.actors = trained if self._chosen is None else list(self._chosen)
+        self.actors = (trained or ["random"]) if self._chosen is None else list(self._chosen)
         if not set(self.actors) <= {*trained, "random"}:
             raise ValueError(f"actors must be of {', '.join([*trained, 'random'])} for this model, not {self.actors}.")
 

@@ -226,8 +226,9 @@ class SavesModels(OffPolicyAlgorithm):
             get_system_info()
             print("".join(char for char in archive.system_info if char.isprintable() or char == "\n"))
         settings = archive.settings(cls, custom_objects or {}, kwargs)
-        if kwargs.get("policy_kwargs", settings.get("policy_kwargs")) != settings.get("policy_kwargs"):
-            raise ValueError(f"the policy kwargs do not equal those that {name} was saved with: leave them out.")
+        for key in ("policy_kwargs", "srl_kwargs"):  # optimisers would keep what they were saved with
+            if kwargs.get(key, settings.get(key)) != settings.get(key):
+                raise ValueError(f"the {key} do not equal those that {name} was saved with: leave them out.")
         if env is not None:
             env = cls._wrap_env(env, settings.get("verbose", 0))
             check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])

@@ -1,8 +1,12 @@
 """Put environments into the checks that every training needs."""
 
+from typing import Any
+
+import numpy as np
 from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
 
+from sb3_cure.data.observations import by_key
 from sb3_cure.envs.copy_observations import CopyObservations
 from sb3_cure.vec_env.finite_check import FiniteCheck
 
@@ -34,3 +38,12 @@ def _check_normalizer(venv: VecEnv) -> None:
             "what VecNormalize gets: put it outside, such as VecNormalize(VecTransposeImage(venv)) for images with the "
             "channels last."
         )
+    if normalizer is not None and normalizer.norm_obs:
+        space: Any = normalizer.observation_space
+        parts = by_key(getattr(space, "spaces", space))
+        normalized = parts if normalizer.norm_obs_keys is None else normalizer.norm_obs_keys
+        if any(np.issubdtype(parts[key].dtype, np.integer) for key in normalized):
+            raise ValueError(
+                "VecNormalize normalizes integers, but SB3 stores terminal observations that it has normalized as "
+                "integers again: declare floats, or use norm_obs=False, as encoders standardise vectors themselves."
+            )

@@ -305,6 +305,12 @@ def test_one_callback_serves_pretraining_and_learning() -> None:
     ]
 
 
+def test_random_actions_are_evaluated_where_no_policy_is_trained() -> None:
+    evaluation = EvalBothCallback(PixelBox(), eval_freq=10, n_episodes=1)
+    tiny_model("CnnPolicy", PixelBox(), curiosity=None).pretrain(14, "random", callback=evaluation)
+    assert evaluation.history[-1]["eval/random_srl_error"] > 0
+
+
 def test_vectors_beside_drawn_images_are_normalised(tmp_path: Path) -> None:
     """As in training, for the decoder that is fitted, and for what is drawn."""
     env = VecNormalize(DummyVecEnv([lambda: SensorBox(("front", "joints"))]), norm_obs_keys=["joints"], clip_obs=0.01)

@@ -96,6 +96,8 @@ def test_schedules_noises_and_classes_come_back(schedule: Any, noise: Any, extra
     ).learn(14)
     loaded: Any = CuReSAC.load(saved(model))
     assert loaded.policy_kwargs == model.policy_kwargs and loaded.policy_class is model.policy_class
+    with pytest.raises(ValueError, match="the srl_kwargs do not equal"):  # of which the optimiser's would be ignored
+        CuReSAC.load(saved(model), srl_kwargs=dict(decoder_weight_decay=0.5))
     assert loaded.train_freq == model.train_freq and loaded.replay_buffer_class is model.replay_buffer_class
     for progress in (1.0, 0.7, 0.1):
         assert loaded.lr_schedule(progress) == model.lr_schedule(progress)

@@ -17,6 +17,17 @@ CHANNELS_LAST = partial(PixelBox, channels_last=True, frame_stack=1)
 SENSORS = partial(SensorBox, ("front", "joints"))
 
 
+class Counters(gym.ObservationWrapper):
+    """A vector of bytes."""
+
+    def __init__(self) -> None:
+        super().__init__(VectorBox())
+        self.observation_space = spaces.Box(0, 255, (2,), np.uint8)
+
+    def observation(self, observation: Any) -> Any:
+        return (100 * np.abs(observation)).astype(np.uint8)
+
+
 @pytest.mark.parametrize(
     ("venv", "sentence"),
     [
@@ -26,6 +37,7 @@ SENSORS = partial(SensorBox, ("front", "joints"))
         ),
         (lambda: VecNormalize(DummyVecEnv([CHANNELS_LAST]), norm_obs=False), r"VecNormalize\(VecTransposeImage\(venv"),
         (lambda: VecNormalize(DummyVecEnv([PixelBox])), "vector of .* norm_obs=False"),
+        (lambda: VecNormalize(DummyVecEnv([Counters])), "normalizes integers.* norm_obs=False"),
         (lambda: VecNormalize(DummyVecEnv([SENSORS]), clip_obs=5), "vector of .* norm_obs=False"),
     ],
 )
@@ -40,6 +52,7 @@ def test_normalizer_in_the_right_place_trains() -> None:
     venv = VecNormalize(VecTransposeImage(DummyVecEnv([CHANNELS_LAST])), norm_obs=False)
     model = tiny_model("CnnPolicy", venv).learn(15)
     assert model._n_updates > 0 and model.replay_buffer.pos == 15
+    tiny_model("MlpPolicy", VecNormalize(DummyVecEnv([Counters]), norm_obs=False)).learn(5)
 
 
 class Camera(gym.Env):
