@@ -2,6 +2,7 @@
 
 import copy
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -156,6 +157,9 @@ class StraightLine:
     :param model: Copied as it is; its head is one of ``LOSSES``, its reward the standardised error
     """
 
+    #: Latents of each image, whose gradients are normalised together
+    parts: Sequence[slice] = (slice(None),)
+
     def __init__(self, model: CuReSAC):
         policy = model.policy
         self.model = model
@@ -241,10 +245,16 @@ class StraightLine:
         views = self.model.policy.augmentation
         self.next_obs = functools.cache(lambda: self.scaled(views(batch.next_observations)))
         shared = self.encoder(obs)
-        pulls: list[list[th.Tensor]] = []
+        pulls: list[Sequence[th.Tensor]] = []
 
         def learn(loss: th.Tensor, owner: nn.Module, *read: th.Tensor) -> None:
             gradients = th.autograd.grad(loss, read, retain_graph=True)
+            if not sequential:
+                gradients = tuple(gradient.clone() for gradient in gradients)
+                for part in self.parts:
+                    size = th.cat([gradient[:, part] for gradient in gradients]).norm()
+                    for gradient in gradients:
+                        gradient[:, part] /= size
             along = th.autograd.grad(read, list(self.encoder.parameters()), gradients, retain_graph=True)
             self.descend(loss, owner, self.lr)
             if sequential:
@@ -252,8 +262,7 @@ class StraightLine:
                     for parameter, step in zip(self.encoder.parameters(), along, strict=True):
                         parameter.sub_(self.lr * step)
             else:
-                size = th.cat(gradients).norm()
-                pulls.append([step / size for step in along])
+                pulls.append(along)
 
         found: dict[str, th.Tensor] = {}
         errors = th.zeros(len(obs))

@@ -26,9 +26,9 @@ class EncoderUpdate:
     A loss reads ``latents(source)``, a copy of the latents without their graph, and ``collect(source)`` takes its
     gradient there. ``"sequential"`` (Algorithm 1 of the paper) then steps at once, with an optimiser for each source.
     ``"joint"`` steps once, in ``finish``: the gradient of each source is divided by its running root-mean-square norm,
-    and their sum goes back through the encoder in one pass. Its learning rate is multiplied by the square root of the
-    number of sources of this update: Adam divides by the size of the sum, which for uncorrelated gradients of equal
-    size is that root times the size of each.
+    for each image of a dictionary by its own, and their sum goes back through the encoder in one pass. Its learning
+    rate is multiplied by the square root of the number of sources of this update: Adam divides by the size of the sum,
+    which for uncorrelated gradients of equal size is that root times the size of each.
 
     Views are made and encoded when they are first read, and encoded again only after the encoder has been stepped.
 
@@ -56,6 +56,8 @@ class EncoderUpdate:
     ):
         self.encoder, self.target, self.mode, self.learning_rate = encoder, target, mode, lr
         self._parameters = list(encoder.parameters())
+        #: Parts of the latents that have a scale of their own
+        self._parts = list(getattr(encoder, "slices", {"": slice(None)}).values())
         self._make_optimizer = partial(optimizer_class, self._parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
@@ -73,7 +75,7 @@ class EncoderUpdate:
         self.optimizers = {
             name: self.optimizers.get(name) or self._make_optimizer() for name in names if self._parameters
         }
-        self.mean_squares = {source: self.mean_squares.get(source, th.zeros(())) for source in sources}
+        self.mean_squares = {source: self.mean_squares.get(source, th.zeros(len(self._parts))) for source in sources}
         self.weights = {source: self.weights.get(source, 0.0) for source in sources}
         self.metrics: dict[str, th.Tensor] = {}
 
@@ -149,15 +151,17 @@ class EncoderUpdate:
         gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
         if not gradients:
             return
-        norm = _norm(gradients.values())
-        self.metrics[f"latent_grad_norm_{source}"] = norm
+        norms = th.stack([_norm([gradient[:, part] for gradient in gradients.values()]) for part in self._parts])
+        self.metrics[f"latent_grad_norm_{source}"] = norms.norm()
         if self.mode == "joint":
-            mean_square = self.mean_squares[source].to(norm.device).lerp(norm.square(), 1 - self.decay)
-            self.mean_squares[source] = mean_square
+            mean_squares = self.mean_squares[source].to(norms.device).lerp(norms.square(), 1 - self.decay)
+            self.mean_squares[source] = mean_squares
             # Undo the bias of an average that starts at zero, as Adam does.
             self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
-            size = (mean_square / self.weights[source]).sqrt().clamp(min=1e-30)
-            gradients = {name: gradient / size for name, gradient in gradients.items()}
+            sizes = th.ones_like(next(iter(gradients.values()))[0])
+            for part, mean_square in zip(self._parts, mean_squares, strict=True):
+                sizes[part] = (mean_square / self.weights[source]).sqrt().clamp(min=1e-30)
+            gradients = {name: gradient / sizes for name, gradient in gradients.items()}
         self._gradients[source] = gradients
         if self.mode == "sequential":
             self._step()
@@ -190,13 +194,14 @@ class EncoderUpdate:
         return [parameter.grad for parameter in self._parameters if parameter.grad is not None]
 
     def _measure_shares(self) -> None:
-        """Log the norm of each scaled source at the encoder's parameters, and its share of their sum."""
+        """Log the norm of each scaled source at the encoder's parameters, 0 without one, and its share of their sum."""
         norms = {
             source: _norm(self._backward([gradients], retain_graph=True))
             for source, gradients in self._gradients.items()
         }
         total = th.stack(list(norms.values())).sum().clamp(min=1e-30)
-        for source, norm in norms.items():
+        for source in self.mean_squares:
+            norm = norms.get(source, th.zeros_like(total))
             self.metrics |= {f"encoder_grad_norm_{source}": norm, f"encoder_share_{source}": norm / total}
 
     def _forget(self) -> None:

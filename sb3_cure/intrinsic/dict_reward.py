@@ -46,7 +46,7 @@ def make_reward(
 
 
 class DictReward(IntrinsicReward):
-    """A reward of one class for each image of a dictionary: their mean, each divided by its running deviation.
+    """A reward of one class for each image of a dictionary: their mean, each divided by its running size.
 
     All of them read the joint latents; those that are computed from the SRL head read their own image's, as its head
     does.

@@ -383,22 +383,23 @@ class RunningStandardize(nn.Module):
 
 
 class MeanError(nn.Module):
-    """Mean over sensors of their errors, each divided by its running deviation; one sensor's error stays as it is.
+    """Mean over sensors of their errors, each divided by its running size; one sensor's error stays as it is.
 
-    Without it the sensor with the largest errors would decide which states are worth visiting.
+    Without it the sensor with the largest errors would decide which states are worth visiting. The size is the
+    root-mean-square: divided by its deviation, a sensor that shows little change, whose errors are all noise, would.
 
     :param n: Number of sensors
     """
 
-    #: Weight of the past in the running variances, per update
+    #: Weight of the past in the running mean squares, per update
     decay = 0.99
 
-    variances: th.Tensor
+    mean_squares: th.Tensor
     weight: th.Tensor
 
     def __init__(self, n: int):
         super().__init__()
-        self.register_buffer("variances", th.zeros(n))
+        self.register_buffer("mean_squares", th.zeros(n))
         self.register_buffer("weight", th.zeros(()))
 
     @th.no_grad()
@@ -406,16 +407,14 @@ class MeanError(nn.Module):
         """Average the errors.
 
         :param errors: Of each sensor, [B]
-        :param learns: Whether the running variances follow
+        :param learns: Whether the running sizes follow
         :return: [B]
         """
         if len(errors) == 1:
             return errors[0].detach()
         each = th.stack([error.detach().float() for error in errors])
         if learns:
-            # A spread below a thousandth of the errors' size is rounding, as in RewardScale.
-            new = th.maximum(each.var(dim=1, correction=0), 1e-6 * each.square().mean(dim=1))
-            move_average(self.variances, self.weight, new, self.decay)
+            move_average(self.mean_squares, self.weight, each.square().mean(dim=1), self.decay)
         seen = self.weight > 0  # before the first average, nothing is divided
-        deviations = (self.variances / self.weight.clamp(min=1e-12)).sqrt().clamp(min=1e-12)
-        return (each / th.where(seen, deviations, 1.0)[:, None]).mean(dim=0)
+        sizes = (self.mean_squares / self.weight.clamp(min=1e-12)).sqrt().clamp(min=1e-12)
+        return (each / th.where(seen, sizes, 1.0)[:, None]).mean(dim=0)

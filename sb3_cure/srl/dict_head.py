@@ -17,7 +17,7 @@ class DictHead(SRLHead):
     """A head of one class for each image of a dictionary, each on the latents of its own image.
 
     The loss is the sum: each encoder is trained as if its image were alone. The error is the mean over images, each
-    divided by its running deviation.
+    divided by its running size (see ``MeanError``).
 
     :param head_class: Class of the heads
     :param encoder: The shared encoder

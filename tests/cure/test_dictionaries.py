@@ -18,6 +18,7 @@ from updates_for_tests import StraightLine, prepare, sampled, train_once
 from sb3_cure import CuReSAC, CuReTQC
 from sb3_cure.data.samples import Samples
 from sb3_cure.networks.augmentations import Augmentation, RandomCrop, RandomShift
+from sb3_cure.networks.layers import MeanError
 from sb3_cure.srl import RAE, DictHead
 
 # ---------------------------------------------------------------- one key is no other method
@@ -79,6 +80,8 @@ def test_hindsight_trains_with_sb3s_own_buffer() -> None:
 class TwoCameras(StraightLine):
     """An update of the agent with two images and a vector."""
 
+    parts = (slice(0, 8), slice(8, 16))
+
     def standardise_by(self, observations: Any) -> None:
         super().standardise_by(observations["joints"])
 
@@ -93,7 +96,7 @@ class TwoCameras(StraightLine):
             self.head = joint.heads[i]
             loss, error = super().srl(batch.of(key), latents[:, 8 * i : 8 * i + 8])
             losses.append(loss)
-            errors.append(error / error.std(unbiased=False))
+            errors.append(error / error.square().mean().sqrt())
         self.head = joint
         return losses[0] + losses[1], (errors[0] + errors[1]) / 2
 
@@ -187,28 +190,39 @@ def test_head_chooses_an_augmentation_for_each_image() -> None:
 # ---------------------------------------------------------------- heads, rewards
 
 
-def test_error_is_the_mean_over_images_in_their_own_deviations() -> None:
-    """Whatever the sizes of their numbers; measured without noise it does not move the deviations."""
+def test_error_is_the_mean_over_images_by_their_own_sizes() -> None:
+    """Whatever the sizes of their numbers; measured without noise it does not move these."""
     model = sensor_model().learn(40)
     head, policy = model.policy.srl, model.policy
     assert isinstance(head, DictHead) and [type(each) for each in head.heads] == [RAE, RAE]
     batch = policy.samples(model.replay_buffer.sample(16), random=False)
     latents = policy.encode(batch.observations)
-    before = head.mean_error.variances.clone()
+    before = head.mean_error.mean_squares.clone()
     errors = [
         each.error(batch.of(key), latents[:, policy.encoder.slices[key]])
         for key, each in zip(("front", "wrist"), head.heads, strict=True)
     ]
-    deviations = (before / head.mean_error.weight).sqrt()
-    expected = (errors[0] / deviations[0] + errors[1] / deviations[1]) / 2
+    sizes = (before / head.mean_error.weight).sqrt()
+    expected = (errors[0] / sizes[0] + errors[1] / sizes[1]) / 2
     th.testing.assert_close(policy.error(batch), expected)
-    assert th.equal(head.mean_error.variances, before) and float(before.min()) > 0
+    assert th.equal(head.mean_error.mean_squares, before) and float(before.min()) > 0
     # A sensor whose numbers are a thousand times as large weighs the same.
     alike = th.stack([errors[0], 1000 * errors[1]])
-    head.mean_error.variances.copy_(before * th.tensor([1.0, 1e6]))
+    head.mean_error.mean_squares.copy_(before * th.tensor([1.0, 1e6]))
     th.testing.assert_close(head.mean_error(alike, learns=False), expected)
     head.mean_error(th.full((2, 16), th.inf), learns=True)
-    assert head.mean_error.variances.isfinite().all()
+    assert head.mean_error.mean_squares.isfinite().all()
+
+
+def test_camera_that_shows_no_change_does_not_drown_the_other() -> None:
+    """What is left of its errors is noise; those of the other camera decide."""
+    mean_error, rng = MeanError(2), th.Generator().manual_seed(0)
+    for _ in range(300):
+        moving = th.rand(64, generator=rng)
+        still = 0.01 + 1e-5 * th.randn(64, generator=rng)
+        joint = mean_error([moving, still], learns=True)
+    assert th.corrcoef(th.stack([moving, joint]))[0, 1] > 0.99
+    assert mean_error([2 * moving, still], learns=False).mean() > 1.3 * joint.mean()
 
 
 # ---------------------------------------------------------------- environments

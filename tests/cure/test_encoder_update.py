@@ -320,6 +320,33 @@ def test_joint_logs_scaled_gradients_at_the_parameters() -> None:
     assert logged["encoder_share_srl"] < 0.02
 
 
+def test_images_of_a_dictionary_have_sizes_of_their_own() -> None:
+    """The gradients of a loss at a pale image's latents are as large as those at the other's."""
+    encoder: Any = Tiny()
+    encoder.slices = {"front": slice(0, 1), "pale": slice(1, 3)}
+    before = encoder.projection.bias.detach().clone()
+    _, update = make("joint", ("srl",), encoder, optimizer_class=th.optim.SGD)
+    begin(update, 0)
+    leaf = update.latents("srl")
+    leaf.grad = th.tensor([1e3, 1e-3, 1e-3]).repeat(5, 1)
+    update.collect("srl")
+    update.finish()
+    moved = (before - encoder.projection.bias.detach()) / LR
+    th.testing.assert_close(moved, 5 / th.tensor([5.0, 10.0, 10.0]).sqrt(), rtol=1e-4, atol=0)
+    assert float(update.metrics["latent_grad_norm_srl"]) == pytest.approx(1e3 * 5**0.5)
+
+
+def test_source_that_takes_no_part_has_no_share() -> None:
+    """As in phases without it: shares that are logged are those of one update."""
+    _, update = make("joint", ("srl", "task"))
+    whole(update, 0)
+    for step in range(1, MEASURE_INTERVAL + 1):
+        begin(update, step)
+        learn(update, "srl")
+        update.finish()
+    assert [float(update.metrics[f"encoder_share_{name}"]) for name in ("srl", "task")] == [1, 0]
+
+
 def test_shares_are_measured_now_and_then() -> None:
     """In the first update and every 100th, as it costs a pass per source."""
     _, update = make("joint")
