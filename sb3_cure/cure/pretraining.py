@@ -80,7 +80,7 @@ class Pretraining(CuRe):
             raise ValueError("fit_representation has no transitions to learn from: call load_transitions before it.")
         if not self._custom_logger:
             self._logger = configure_logger(self.verbose, self.tensorboard_log, "fit_representation")
-        counted = self._n_updates, self._n_batches
+        counted = self._n_updates, self._n_batches, self._current_progress_remaining
         self._begin_pretraining("random")
         try:
             for update in range(updates):
@@ -90,7 +90,8 @@ class Pretraining(CuRe):
                     self.logger.dump(self._n_updates)
         finally:
             self._restore_settings()
-            self._n_updates, self._n_batches = counted  # training goes on where it was
+            # Training goes on where it was.
+            self._n_updates, self._n_batches, self._current_progress_remaining = counted
             begins = self.num_timesteps == 0 and not self._keeps_replay_buffer
             self._is_pretrained = self._is_pretrained or begins
         return self

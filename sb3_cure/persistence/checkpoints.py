@@ -224,7 +224,7 @@ class ExactCheckpoint(BaseCallback):
         if reason is not None:
             warnings.warn(
                 f"checkpoints cannot keep the state of the environments, as {reason}: a resumed training begins a new "
-                "episode (state_dict() and load_state_dict(state) avoid this).",
+                "episode, without what was set on them (state_dict() and load_state_dict(state) avoid this).",
                 stacklevel=1,
             )
         for name in sorted({name for own in state["callbacks"] for name in own["missing"]}):

@@ -85,7 +85,11 @@ class Persistence(SavesModels, SavesReplayBuffers):
         run.writers[Path(path).resolve()] = writer
         run.resumed = Resumption(model, state)
         if run.resumed.restore_error is not None:
-            warnings.warn(f"the training begins a new episode, as {run.resumed.restore_error}.", stacklevel=2)
+            warnings.warn(
+                f"the training begins a new episode, as {run.resumed.restore_error}; what was set on the environments "
+                "while training is lost.",
+                stacklevel=2,
+            )
         if model.verbose >= 1:
             print(f"Resumed from {folder}, after {model.num_timesteps} agent steps")
         return model

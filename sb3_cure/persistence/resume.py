@@ -1,6 +1,7 @@
 """What a training depends on besides the model and its replay buffer, and how a resumed model gets it back."""
 
 import copy
+import time
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
         "environments": vec_env_state(model.env),
         "callbacks": [callback_state(callback) for callback in run.callbacks],
         "recorded": _recorded(model.logger),
+        "elapsed": time.time_ns() - model.start_time,
         "random": random_state(model),
     }
 
@@ -108,6 +110,7 @@ class Resumption:
         model.action_noise = copy.deepcopy(self._action_noise)
         if continues:
             model._num_timesteps_at_start = self.num_timesteps_at_start
+            model.start_time -= self.state["elapsed"]  # else SB3 divides the steps of both parts by the time of one
         for name, values in self.state["recorded"].items():
             getattr(model.logger, name).update(values)
         saved = list(self.state["callbacks"])

@@ -94,6 +94,20 @@ class FrameWatch(CopyObservations):
                     restartable=False,  # earlier transitions are wrong, too, and may be stored
                 )
 
+    def state_dict(self) -> dict[str, Any]:
+        """Get what was seen, for exact checkpoints.
+
+        :return: State; arguments are the new wrapper's
+        """
+        return {"frames": self._frames, "n_frozen": self._n_frozen, "position": self._position}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what was seen.
+
+        :param state: Result of ``state_dict``
+        """
+        self._frames, self._n_frozen, self._position = state["frames"], state["n_frozen"], state["position"]
+
     def _newest(self, image: np.ndarray) -> np.ndarray:
         """Get the newest frame of a stack, channels first."""
         channels = np.moveaxis(image, channel_axis(image.shape), 0)

@@ -316,11 +316,12 @@ def test_fit_representation_trains_encoder_and_head_alone(algorithm: str, tmp_pa
 def test_training_goes_on_after_fitting() -> None:
     """Neither a random warm-up nor a burst again, its counters and the scale of its bonus as they were."""
     model = tiny_model("CnnPolicy", PixelBox(), warmup_updates=3, curiosity="bonus").learn(14)
-    done = model.num_timesteps, model._n_updates, model._n_batches
+    done, progress = (model.num_timesteps, model._n_updates, model._n_batches), model._current_progress_remaining
     scale = copy.deepcopy(model.policy.scale.state_dict())
     model.fit_representation(5)
     assert differences(scale, model.policy.scale.state_dict()) == []
     assert (model.num_timesteps, model._n_updates, model._n_batches) == done == (14, 7, 7)
+    assert model._current_progress_remaining == progress != 1 / 5
     model.learn(2, reset_num_timesteps=False)
     assert (model.num_timesteps, model._n_updates) == (16, 9)
 

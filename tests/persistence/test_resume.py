@@ -29,10 +29,12 @@ from envs_for_tests import KillAt, Killed, PixelBox, VectorBox, differences, sta
 from gymnasium.wrappers import NormalizeReward
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from logs_for_tests import KeptRows
 from payloads_for_tests import EXECUTED, Payload
 from stable_baselines3 import TD3
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -176,6 +178,25 @@ def test_any_kills_at_any_steps(kills: list[int], save_freq: int, tmp_path_facto
         except Killed:
             continue
     assert differences(_REFERENCE["kills"], outcome(model)) == []
+
+
+def test_speed_is_that_of_both_parts(tmp_path: Path) -> None:
+    """Logged steps are those of the whole call, and so is the time."""
+
+    class Slow(BaseCallback):
+        def _on_training_start(self) -> None:
+            self.model.start_time -= 1000 * 10**9
+
+        def _on_step(self) -> bool:
+            return True
+
+    model = tiny_model("MlpPolicy", VectorBox())
+    with pytest.raises(Killed):
+        model.learn(40, callback=[Slow(), ExactCheckpoint(10, tmp_path), KillAt(25)])
+    resumed, kept = CuReSAC.resume(tmp_path, VectorBox()), KeptRows()
+    resumed.set_logger(Logger(None, [kept]))
+    resumed.learn(40, callback=ExactCheckpoint(10, tmp_path), log_interval=1)
+    assert 1000 <= kept.rows[-1]["time/time_elapsed"] < 2000
 
 
 SCRIPT = textwrap.dedent(

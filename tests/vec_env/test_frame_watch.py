@@ -11,6 +11,7 @@ from dictionaries_for_tests import SensorBox
 from envs_for_tests import PixelBox
 
 from sb3_cure.envs import make_dmc_env
+from sb3_cure.persistence import ResumableEnv
 from sb3_cure.vec_env.frame_watch import EnvFaultError, FrameWatch
 
 
@@ -78,6 +79,21 @@ def test_black_and_frozen_frames_are_noticed(channels_last: bool, episode_length
 def test_harmless_frames_are_no_fault(kind: str, arguments: dict[str, Any], speed: float) -> None:
     """Dark frames where they are allowed; the same pixels at rest, without a state, or for a short time."""
     assert good_steps(FrameWatch(Broken(PixelBox(size=12), kind), **arguments), speed, most=12) == 12
+
+
+def test_resumed_watch_goes_on_with_arguments_of_its_own() -> None:
+    """What was seen is kept; after the error that asks for more ``frozen_steps`` they can be raised."""
+
+    def watch(frozen_steps: int) -> ResumableEnv:
+        env = FrameWatch(Broken(PixelBox(size=12), "frozen"), state=position, frozen_steps=frozen_steps)
+        return ResumableEnv(env)
+
+    before = watch(20)
+    assert good_steps(before, most=3) == 3
+    for frozen_steps, n_good in ((20, 0), (400, 12)):
+        resumed = watch(frozen_steps)
+        resumed.load_exact_state(before.exact_state())
+        assert good_steps(resumed, most=12) == n_good
 
 
 def test_frozen_pixels_of_dm_control_are_noticed() -> None:
