@@ -182,14 +182,20 @@ def named_wrappers(named: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
 
     :param named: As of rl-zoo3's ``env_wrapper``: None, a name or class, alone or with its arguments, or a list of such
     :return: Wrappers and their arguments, innermost first
-    :raises UsageError: as ``find_class``, or for several in one mapping
+    :raises UsageError: as ``find_class``, for several in one mapping, or for statistics that evaluations lack
     """
     for each in named if isinstance(named, list) else [named] if named else []:
         parts = list(each.items()) if isinstance(each, dict) else [(each, {})]
         if len(parts) != 1:
             raise UsageError(f"{each} must be one wrapper with its arguments: give several as a list.")
         ((name, kwargs),) = parts
-        yield (name if isinstance(name, type) else find_class(name)), kwargs
+        wrapper = name if isinstance(name, type) else find_class(name)
+        if wrapper is gym.wrappers.NormalizeObservation:
+            raise UsageError(
+                "evaluations would not share NormalizeObservation's statistics: leave it out, as encoders standardise "
+                "vectors themselves."
+            )
+        yield wrapper, kwargs
 
 
 def find_class(name: str) -> Any:

@@ -499,12 +499,6 @@ def check_arms(cells: Iterable[Cell]) -> None:
     for cell in {(cell.task, cell.method): cell for cell in cells}.values():
         try:
             with contextlib.closing(cell.make_env()) as env, untouched_randomness(th.device("cpu")):
-                wrappers = [wrap for wrap, _ in named_wrappers(cell.arguments.get("env_wrapper"))]
-                if gym.wrappers.NormalizeObservation in wrappers:
-                    raise ValueError(
-                        "evaluations would not share NormalizeObservation's statistics: leave it out, as encoders "
-                        "standardise vectors themselves."
-                    )
                 if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
                     raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
                 cell.make_model(env, device="cpu", buffer_size=1)

@@ -112,7 +112,7 @@ class Estimate:
         """What a difference says: ``"better"``, ``"worse"`` or ``"inconclusive"``."""
         if self.low is None or self.high is None:
             return "one seed: no interval"
-        if self.low == self.high == 0:
+        if self.low == self.high:
             return "inconclusive (all pairs equal)"
         return "better" if self.low > 0 else "worse" if self.high < 0 else "inconclusive"
 
@@ -213,7 +213,7 @@ def sign_flip_p(groups: Sequence[np.ndarray]) -> float:
     weighted = np.concatenate([group / len(group) for group in groups if len(group)] or [np.zeros(0)])
     if len(weighted) < 2:  # which scipy refuses: with either sign it is as far from 0
         return 1.0
-    # scipy compares with a tolerance, so that a sum's rounding does not decide
+    # scipy compares with a relative tolerance, so that a sum's rounding does not decide
     found = stats.permutation_test(
         (weighted,), np.sum, permutation_type="samples", n_resamples=2**16, vectorized=True, random_state=0
     )

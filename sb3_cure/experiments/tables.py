@@ -240,7 +240,7 @@ def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
     :param thresholds: Returns
     :return: The table; without rows for a return that no arm reaches on a task, or above that which ends a cell
     """
-    rows, end = [], experiment.grid.get("stop_at_return") or math.inf
+    rows, end = [], experiment.grid.get("stop_at_return", math.inf)
     lasts = {arm: statistics.summarise_arm(experiment, *arm)["last"] for arm in experiment.arms}
     for task, limit in itertools.product(experiment.tasks, [each for each in thresholds if each <= end]):
         arms = {arm: statistics.steps_to_return(experiment, task, arm, limit) for arm in experiment.methods}

@@ -42,6 +42,7 @@ TYPOS = {
     f"{TRAIN} policy_kwargs:'dict(net_arhc=[8])'": "did you mean net_arch?",
     f"{TRAIN} env_wrapper:\"[{{'sb3_cure.envs.make_pixel_evn': {{}}}}]\"": "did you mean make_pixel_env",
     "train --conf-file fast/best": "--env must name an environment",
+    f"{TRAIN} env_wrapper:\"'gymnasium.wrappers.NormalizeObservation'\"": "evaluations would not share",
     "train --env CartPole-v1 --conf-file fast/best": "actions are Discrete(2)",
     "doctor --env CartPole-v1": "actions are Discrete(2)",
     f"{TRAIN} env_wrapper:\"{{'my_module.Mine': {{}}, 'my_module.Other': {{}}}}\"": "one wrapper with its arguments",

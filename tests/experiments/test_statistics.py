@@ -99,6 +99,12 @@ def test_differences_pair_the_seeds(results: Path) -> None:
     assert final.t.value == pytest.approx(150)
 
 
+def test_equal_pairs_say_nothing() -> None:
+    """Not that chance is ruled out: two seeds may agree by saturating."""
+    for difference in (0.0, 0.5):
+        assert statistics.t_interval([np.full(2, difference)]).verdict == "inconclusive (all pairs equal)"
+
+
 def test_unfinished_cells_are_not_paired(results: Path) -> None:
     """An unfinished cell enters nothing, whatever its files hold; with one pair left there is no interval."""
     (results / TASK / "cure_sac_ae" / "seed1" / "DONE").unlink()
