@@ -548,19 +548,22 @@ def test_map_of_a_dm_control_task_needs_no_names(tmp_path: Path) -> None:
 
 
 def test_state_probe_over_training() -> None:
-    """A row of the untrained encoder, then one each time, of the same episodes; logged."""
+    """A row of the untrained encoder, then one each time, of the same episodes; logged as rows of their own."""
     model, untrained = (tiny_model("CnnPolicy", PixelBox()) for _ in range(2))
     callback = StateProbeCallback(PixelBox(), every=15, n_episodes=3, **MAP)
-    model.learn(35, callback=callback, log_interval=1)
-    assert [row["timesteps"] for row in callback.rows] == [0, 15, 30]
+    kept = KeptRows()
+    model.set_logger(Logger(None, [kept]))
+    model.learn(35, callback=callback, log_interval=100)
     callback.on_period()
+    assert [row["timesteps"] for row in callback.rows] == [0, 15, 30, 35]
     for trained, row in ((untrained, callback.rows[0]), (model, callback.rows[-1])):
         episodes = list(run_episodes(trained, PixelBox(), 3, "random", states=position, seed=0))
         expected = state_probe(trained, episodes, ["x", "y"])
         assert [row["x"], row["y"]] == pytest.approx([expected["x"], expected["y"]])
-    logged = model.logger.name_to_value
-    assert (logged["probe/x"], logged["probe/y"]) == (row["x"], row["y"])
-    assert logged["probe/mean"] == pytest.approx((row["x"] + row["y"]) / 2)
+    for logged, row in zip(kept.rows, callback.rows, strict=True):
+        assert logged["time/total_timesteps"] == row["timesteps"]
+        assert (logged["probe/x"], logged["probe/y"]) == (row["x"], row["y"])
+        assert logged["probe/mean"] == pytest.approx((row["x"] + row["y"]) / 2)
 
 
 @given(
