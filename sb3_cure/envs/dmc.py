@@ -165,9 +165,10 @@ def make_dmc_env(
 ) -> gym.Env:
     """Make a task of the DeepMind Control suite that is seen through pixels.
 
-    Observations are uint8 of shape (3 x frame_stack, image_size, image_size), oldest frame first; the first frame is
-    repeated at reset, and one frame is rendered per agent step. Actions are float32 in [-1, 1]. Episodes last 1000
-    environment steps and end by truncation. ``unwrapped`` is shimmy's ``DmControlCompatibilityV0``.
+    Observations are uint8 of shape (channels x frame_stack, image_size, image_size), 3 channels or 1, oldest frame
+    first; the first frame is repeated at reset, and one frame is rendered per agent step. Actions are float32 in
+    [-1, 1]. Episodes last 1000 environment steps and end by truncation. ``unwrapped`` is shimmy's
+    ``DmControlCompatibilityV0``.
 
     With ``cameras`` or ``proprioception`` observations are dictionaries, for ``"MultiInputPolicy"``: such images under
     ``"image"``, or ``"camera0"``, ``"camera1"``, ... (by their indices), and the robot's own joints under

@@ -127,7 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("demo"), help="folder to write (default: demo)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=10, help="everything ends after so many minutes")
+    parser.add_argument("--minutes", type=float, default=10, help="everything takes about so long")
     parser.add_argument("--steps", type=int, default=TOTAL_STEPS, help="agent steps (environment steps / 8)")
     options = parser.parse_args(arguments)
     if options.minutes <= 0 or options.steps < 1:
