@@ -480,7 +480,7 @@ def test_memories_of_an_emptied_buffer_are_forgotten(of: str | None) -> None:
 
 
 def test_dictionary_rewards_read_their_own_image() -> None:
-    """Per pixel: the views and latents of their own head; the mean of both, each divided by its deviation."""
+    """Per pixel: the views and latents of their own head; the mean of both, each divided by its size."""
     model = sensor_model(intrinsic_kwargs=dict(per_pixel=True), learning_starts=100).learn(20)
     policy: Any = model.policy
     randomise(policy)
@@ -493,7 +493,7 @@ def test_dictionary_rewards_read_their_own_image() -> None:
         for key, head, part in policy.srl.parts(latents):
             seen, drawn = images[key].float() / 255, head.reconstruct(part).float() / 255
             error = ((drawn - seen) ** 2 / (seen.var(dim=0, correction=0) + 8.1e-5)).flatten(1).mean(dim=1)
-            expected.append(error / error.std(correction=0))
+            expected.append(error / error.square().mean().sqrt())
     th.testing.assert_close(reward, sum(expected) / 2, rtol=1e-3, atol=1e-4)
 
 
