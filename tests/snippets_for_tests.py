@@ -88,20 +88,18 @@ def run_page(folder: str) -> bool:
         os._exit(status)
 
 
-def shrink_notebook() -> None:
-    """Steps are parameters of notebooks."""
+def shrink_models(small: Callable[..., gym.Env] = short_episodes) -> None:
+    """And environments, but not what notebooks have as parameters, such as steps."""
     shrink(CuReBase, "__init__", tiny_model)
-    shrink(dmc, "make_dmc_env", short_episodes)
+    shrink(dmc, "make_dmc_env", small)
     sb3_cure.make_dmc_env = envs.make_dmc_env = dmc.make_dmc_env
 
 
 def shrink_everything() -> None:
-    shrink(CuReBase, "__init__", tiny_model)
+    shrink_models(small_env)
     for name in ("learn", "pretrain", "fit_representation"):
         shrink(sb3_cure.CuReSAC, name, few)
-    shrink(dmc, "make_dmc_env", small_env)
     shrink(envs, "make_pixel_env", small_env)
-    sb3_cure.make_dmc_env = envs.make_dmc_env = dmc.make_dmc_env
     sb3_cure.make_pixel_env = envs.make_pixel_env
     shrink(env_util, "make_vec_env", one_worker)
     shrink(rollouts, "run_episodes", two_episodes)

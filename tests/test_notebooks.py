@@ -10,7 +10,7 @@ NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 #: Stands before the first cell: tiny networks, a few updates, short episodes
 SHRINK = f"""
 import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})
-import snippets_for_tests; snippets_for_tests.shrink_notebook()
+import snippets_for_tests; snippets_for_tests.shrink_models()
 """
 #: What replaces the parameter cell of each notebook: it names all parameters, with small values
 SETTINGS = "LEARNING_STARTS, WARMUP_UPDATES, BATCH_SIZE, NETWORKS = 20, 10, 8, {}"

@@ -86,7 +86,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.optimize_memory_usage, self.handle_timeout_termination = False, handle_timeout_termination
         self.frame_stack, self.frames_dir = frame_stack, frames_dir
         self.info_shapes = dict(info_shapes or {})
-        self._spaces = by_key(getattr(observation_space, "spaces", observation_space))
+        self._spaces = by_key(observation_space)
         self._shapes = {key: (n_envs, *shape) for key, shape in by_key(self.obs_shape).items()}
         self.reset()
 

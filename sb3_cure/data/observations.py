@@ -18,8 +18,7 @@ def image_spaces(space: spaces.Space) -> dict[str, spaces.Box]:
     :param space: Space of observations
     :return: Spaces of the images among them by key; an observation that is itself an image has the key ``""``
     """
-    parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-    return {key: part for key, part in parts.items() if is_image_space(part)}  # type: ignore[misc]
+    return {key: part for key, part in by_key(space).items() if is_image_space(part)}  # type: ignore[misc]
 
 
 def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
@@ -45,12 +44,12 @@ def check_images(observations: Any, space: spaces.Space) -> None:
 
 
 def by_key(value: Any) -> dict[str, Any]:
-    """Return an observation, or anything that is kept for each of its parts, as a dictionary by key.
+    """Return an observation, its space, or anything that is kept for each of its parts, as a dictionary by key.
 
-    :param value: Anything, or a dictionary
+    :param value: Anything, or a dictionary, also of spaces
     :return: The dictionary; anything else has the key ``""``, as in ``image_spaces``
     """
-    return value if isinstance(value, dict) else {"": value}
+    return dict(value) if isinstance(value, Mapping) else {"": value}
 
 
 def stacked(observations: Sequence[Any]) -> Any:

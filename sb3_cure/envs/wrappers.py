@@ -12,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import RepeatAction
 from PIL import Image
 
-from sb3_cure.data.observations import image_spaces
+from sb3_cure.data.observations import by_key, image_spaces
 from sb3_cure.envs.rendering import (
     choose_backend,
     free_mujoco_contexts,
@@ -310,8 +310,7 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.padding = padding
         self.frame_stack = at_least_one("frame_stack", frame_stack)
         space = env.observation_space
-        # Of observations that are no dictionary, under the key ""
-        parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
+        parts = by_key(space)
         is_dict = isinstance(space, spaces.Dict)
         boxes = {
             k: box for k, box in parts.items() if isinstance(box, spaces.Box) and (len(box.shape) == 3 or not is_dict)

@@ -171,10 +171,11 @@ class RolloutCallback(PeriodicCallback):
         arguments = dict(deterministic=self.deterministic, seed=self.seed, **kwargs)
         return run_episodes(self.model, self.eval_env, self.n_episodes, actor, **arguments)
 
-    def _log(self, values: dict[str, float], prefix: str) -> None:
+    def _log(self, values: dict[str, float]) -> None:
         """Log what was measured in a row of its own, as SB3 writes none between two episodes."""
         for name, value in values.items():
-            self.logger.record(f"{prefix}/{name}", value, exclude=("stdout", "log") if len(name) > PRINTED_NAME else ())
+            is_long = len(name.partition("/")[2]) > PRINTED_NAME
+            self.logger.record(name, value, exclude=("stdout", "log") if is_long else ())
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 
@@ -213,12 +214,12 @@ class EvalBothCallback(RolloutCallback):
         row: dict[str, float] = {}
         for actor in self.actors:
             results = [(episode.total_reward, episode.srl_errors) for episode in self.run(actor)]
-            row[f"{actor}_reward"] = float(np.mean([reward for reward, _ in results]))
+            row[f"eval/{actor}_reward"] = float(np.mean([reward for reward, _ in results]))
             errors = np.concatenate([errors for _, errors in results])
             if len(errors) > 0:
-                row[f"{actor}_srl_error"] = float(errors.mean())
-        self._log(row, "eval")
-        row = {"timesteps": self.num_timesteps, **{f"eval/{name}": value for name, value in row.items()}}
+                row[f"eval/{actor}_srl_error"] = float(errors.mean())
+        self._log(row)
+        row = {"timesteps": self.num_timesteps, **row}
         self.history.append(row)
         if self.verbose >= 1:
             print(", ".join(f"{key} {value:.4g}" for key, value in row.items()))
@@ -483,7 +484,8 @@ class StateProbeCallback(RolloutCallback):
         """Measure and log."""
         episodes = (episode for actor in self.actors for episode in self.run(actor, states=self.state))
         found = state_probe(self.model, episodes, self.names, self.units)
-        self._log({**found, "mean": float(np.nanmean(list(found.values())))}, "probe")
+        logged = {**found, "mean": float(np.nanmean(list(found.values())))}
+        self._log({f"probe/{name}": value for name, value in logged.items()})
         self.rows.append({"timesteps": self.num_timesteps, **found})
 
 

@@ -1,7 +1,5 @@
 """Put environments into the checks that every training needs."""
 
-from typing import Any
-
 import numpy as np
 from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize, unwrap_vec_wrapper
@@ -39,8 +37,7 @@ def _check_normalizer(venv: VecEnv) -> None:
             "channels last."
         )
     if normalizer is not None and normalizer.norm_obs:
-        space: Any = normalizer.observation_space
-        parts = by_key(getattr(space, "spaces", space))
+        parts = by_key(normalizer.observation_space)
         normalized = parts if normalizer.norm_obs_keys is None else normalizer.norm_obs_keys
         if any(np.issubdtype(parts[key].dtype, np.integer) for key in normalized):
             raise ValueError(
