@@ -103,12 +103,11 @@ class Persistence(SavesModels, SavesReplayBuffers):
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
         run = self._run
-        if run.resumed is not None and run.resumed.num_timesteps != self.num_timesteps:  # pretraining was ended since
-            run.resumed = None
-        elif run.resumed is not None and run.resumed.is_over:
-            load_random_state(self, run.resumed.state["random"])
-            run.resumed = None
         resumed = run.resumed
+        # The resumed call had nothing left to do, or was a pretraining, which has ended: this one goes on after it.
+        if resumed is not None and (resumed.is_over or resumed.num_timesteps != self.num_timesteps):
+            load_random_state(self, resumed.state["random"])
+            resumed = run.resumed = None
         continues = resumed is not None and reset_num_timesteps
         if resumed is not None and continues:
             total_timesteps += resumed.num_timesteps_at_start - resumed.num_timesteps  # what is left, maybe nothing

@@ -318,17 +318,18 @@ def test_learn_ends_interrupted_pretraining(tmp_path: Path) -> None:
     assert (model.num_timesteps, model.replay_buffer.size()) == (15, 15)
 
 
-def test_learn_after_finished_pretraining_begins_as_without_it(tmp_path: Path) -> None:
-    """With the same random warm-up, also if the script was killed between the two calls."""
-    results = []
-    for resumes in (False, True):
-        model = train(CASES["pretraining"], tmp_path / str(resumes))
-        if resumes:
-            with pytest.warns(UserWarning, match="trains nothing"):
-                model = train(CASES["pretraining"], tmp_path / "True", resume=True)
-        model.set_env(pixels()())
-        results.append(outcome(model.learn(15)))
+@pytest.mark.parametrize("keeps", [False, True])
+def test_learn_after_finished_pretraining_begins_as_in_one_script(keeps: bool, tmp_path: Path) -> None:
+    """If the script was killed between the two calls; what is kept of pretraining does not happen twice."""
+    arguments: dict[str, Any] = {"callback": ExactCheckpoint(12, tmp_path), "keep_replay_buffer": keeps}
+    whole = tiny_model("CnnPolicy", pixels()()).pretrain(60, **arguments)
+    resumed = CuReSAC.resume(tmp_path, pixels()(), device="cpu")
+    with pytest.warns(UserWarning, match="trains nothing"):
+        resumed.pretrain(60, **arguments)
+    results = [outcome(model.learn(15)) for model in (whole, resumed)]
     assert differences(*results) == []
+    actions = whole.replay_buffer.actions
+    assert not keeps or not (actions[60:70] == actions[:10]).any(), "the random warm-up is that of pretraining"
 
 
 class Unwilling(BaseCallback):
