@@ -166,6 +166,8 @@ class GridFile(_Part):
         for name, method in self.methods.items():
             if method.pretrain is None and not (method.train and self.budget):
                 raise ValueError(f"method {name!r} neither trains nor pretrains: add pretrain, or train it")
+        if self.coverage is not None and max(self.coverage.at) > self.budget:
+            raise ValueError(f"coverage.at has {max(self.coverage.at)}, after the end of a training of {self.budget}")
         for name in [self.baseline, *(method.baseline or self.baseline for method in self.methods.values())]:
             if name not in self.methods:
                 raise ValueError(f"baseline is {name!r}, but the methods are {', '.join(self.methods)}")
@@ -376,7 +378,7 @@ def load_grid(
     if budget is not None and budget != file.budget:
         _scale(file, budget, path)
     if isinstance(seeds, int) and isinstance(content.get("seeds"), list):
-        if seeds > len(file.seeds):
+        if not 1 <= seeds <= len(file.seeds):
             raise UsageError(f"--seeds is {seeds}, but {path} lists {len(file.seeds)}: say which (0,3,4).")
         seeds = file.seeds[:seeds]
     chosen = file.seeds if seeds is None else _validated(path, {**content, "seeds": seeds}).seeds

@@ -13,7 +13,7 @@ from sb3_cure.cli.usage import UsageError
 from sb3_cure.experiments.grid import DONE, ERROR, SETTINGS, first_difference, read_json, seed_of, short_name
 
 FINISHED, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
-#: Settings that all cells of a task share
+#: Settings that all cells of a task share, with the budget of those that train
 _SHARED = ("eval_every", "eval_episodes", "coverage", "stop_at_return")
 _FIX = "remove the cell's folder and run the grid again"
 
@@ -193,8 +193,12 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
     experiment = Experiment(name or grid["experiment"], root, grid, cells)
     for first, other in itertools.combinations(experiment.finished, 2):
         if first.task == other.task:
-            _check_settings(first, other, SETTINGS if first.method == other.method else _SHARED)
+            both_train = first.config["budget"] and other.config["budget"]
+            shared = (*_SHARED, "budget") if both_train else _SHARED
+            _check_settings(first, other, SETTINGS if first.method == other.method else shared)
     for cell in experiment.finished:
+        if experiment.kind == "visitation" and not len(cell.visitation):
+            raise UsageError(f"{cell.folder} has no visitation.csv, or an empty one: {_FIX}.")
         if cell.config["budget"] > 0 and (experiment.kind != "visitation" or len(cell.evaluations)):
             _check_curve(cell)
     return experiment

@@ -131,11 +131,14 @@ def t_interval(groups: Sequence[np.ndarray]) -> Estimate:
     n = sum(len(group) for group in judged)
     if n == len(judged):  # one value each
         return Estimate(value, n=n)
+    # Of equal numbers, the standard error that is computed may not be 0.
+    errors = [stats.sem(group) if np.ptp(group) else 0.0 for group in judged]
     if len(judged) == 1:
-        reach = float(stats.t.ppf(0.975, n - 1) * stats.sem(judged[0]))
+        reach = float(stats.t.ppf(0.975, n - 1) * errors[0])
     else:
         rng = np.random.default_rng(0)
-        drawn = np.mean([stats.sem(group) * rng.standard_t(len(group) - 1, DRAWS) for group in judged], axis=0)
+        of_tasks = zip(errors, judged, strict=True)
+        drawn = np.mean([error * rng.standard_t(len(group) - 1, DRAWS) for error, group in of_tasks], axis=0)
         # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
         reach = float(np.percentile(np.abs(drawn), 95))
     return Estimate(value, value - reach, value + reach, n)

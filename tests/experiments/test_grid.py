@@ -31,6 +31,8 @@ def test_grid_is_every_task_method_and_seed(tmp_path: Path) -> None:
     assert grid.cells[1].build_arguments()["train_freq"] == (1, "episode"), "YAML knows no pairs"
     assert grid.cells[0].folder == Path("tiny", "PixelBox", "a", "seed3")
     assert all(cell.arguments["batch_size"] == 8 and "env_kwargs" not in cell.arguments for cell in grid.cells)
+    with pytest.raises(UsageError, match=r"--seeds is -1, but .* lists 2"):
+        load_grid(path, seeds=-1)
     few = load_grid(path, seeds=[5], methods=["b"], tasks=["PixelBox"], budget=40)
     assert [(cell.seed, cell.method, cell.budget) for cell in few.cells] == [(5, "b", 40)]
     assert few.description["methods"].keys() == {"a", "b"}, "what was not chosen is still part of the experiment"
@@ -110,6 +112,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         "there is no .*no.yml",
     ),
     "neither of both": (dict(methods={"a": {"config": "zoo.yml", "train": False}}), "'a' neither trains nor"),
+    "cells that are counted too late": (
+        dict(budget=100, coverage=dict(widths=dict(place=1.0), at=[100, 120])),
+        "coverage.at has 120, after the end of a training of 100",
+    ),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
     "pictures that heads cannot judge alike": (
         dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),

@@ -76,10 +76,11 @@ def test_missing_curve_of_finished_cell_is_refused(results: Path) -> None:
         ("sac_ae", 1, {"arguments": {"gamma": 0.5}}),
         ("sac_ae", 1, {"budget": 50_000}),
         ("cure_sac_ae", 0, {"eval_episodes": 3, "arguments": CURE}),
+        ("another", 0, {"budget": 50_000}),
     ],
 )
 def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: int, settings: dict) -> None:
-    """Seeds of an arm must share all settings, arms of a task their evaluations."""
+    """Seeds of an arm must share all settings, arms of a task their evaluations and budget."""
     for path in results.rglob("config.json"):
         path.write_text(json.dumps({**json.loads(path.read_text()), "eval_episodes": 10}))
     write_cell(results, TASK, method, seed, curve(0, 1), **{"eval_episodes": 10, **settings})
@@ -93,6 +94,18 @@ def test_cells_of_earlier_versions_enter_with_those_of_today(results: Path) -> N
     assert list(read_results(results)[0].done(TASK, "sac_ae")) == [0, 1, 2]
     write_cell(results, TASK, "sac_ae", 3, curve(0, 1), algo="cure_tqc", pretrain=None)
     with pytest.raises(UsageError, match=r"seed3 was run with algo 'cure_tqc', but .*seed2 with 'cure_sac'"):
+        read_results(results)
+
+
+def test_arms_that_do_not_train_have_another_budget(results: Path) -> None:
+    write_cell(results, TASK, "pretrained", 0, {}, budget=0)
+    assert (TASK, "pretrained") in read_results(results)[0].arms
+
+
+def test_visits_that_are_missing_are_refused(results: Path) -> None:
+    """Else ratios would rest on fewer seeds than are said to be done."""
+    write_grid(results, kind="visitation")
+    with pytest.raises(UsageError, match=r"seed0 has no visitation\.csv"):
         read_results(results)
 
 

@@ -1,5 +1,6 @@
 """Numbers of learning curves, against values computed by hand."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -100,9 +101,10 @@ def test_differences_pair_the_seeds(results: Path) -> None:
 
 
 def test_equal_pairs_say_nothing() -> None:
-    """Not that chance is ruled out: two seeds may agree by saturating."""
-    for difference in (0.0, 0.5):
-        assert statistics.t_interval([np.full(2, difference)]).verdict == "inconclusive (all pairs equal)"
+    """Not that chance is ruled out: seeds may agree by saturating. Rounding makes no spread of it."""
+    for difference, n in itertools.product((0.0, 0.1, 0.7), (2, 3, 6, 7)):
+        for groups in ([np.full(n, difference)], [np.full(n, difference), np.full(3, 0.2)]):
+            assert statistics.t_interval(groups).verdict == "inconclusive (all pairs equal)"
 
 
 def test_unfinished_cells_are_not_paired(results: Path) -> None:
