@@ -146,7 +146,7 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
         raise UsageError(f"{task} wants other --env-kwargs: {one_sentence(error)}") from error
     except (ValueError, gym.error.Error) as error:
         raise UsageError(f"{task} cannot be trained: {one_sentence(error)}") from error
-    returns = play_randomly(_below_camera(env))
+    returns = play_randomly(_below_camera(env) if task.startswith("dmc_pixels/") else env)
     env.close()
     if len(returns) < MIN_EPISODES:
         raise UsageError(
@@ -164,7 +164,10 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
 
 
 def _below_camera(env: gym.Env) -> gym.Env:
-    """Unwrap a DMC task to the environment below its camera, so that nothing is rendered; keep its step limit."""
+    """Unwrap a ``dmc_pixels`` task to what is below its camera, so that nothing is rendered; keep its step limit.
+
+    Ids of users may have wrappers above the camera that change rewards, actions or ends.
+    """
     inner: Any = env
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, DMCPixels):

@@ -7,7 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import TimeLimit, TransformReward
 
+from sb3_cure import make_dmc_env
 from sb3_cure.cli import doctor
 from sb3_cure.cli.main import main
 
@@ -118,6 +120,18 @@ def test_doctor_gives_the_environment_its_arguments(
     arguments = ["--env-kwargs", "reward_of:{'each': 2}", "max_episode_steps:7"]
     assert main(["doctor", "--env", "Walk-v0", *arguments]) == 0
     assert "in 60 of 60 episodes; returns 14 to 14" in capsys.readouterr().out
+
+
+def test_doctor_plays_what_is_trained(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A task of DeepMind Control that another id wraps, here in rewards of 0."""
+
+    def sparse(**kwargs: Any) -> gym.Env:
+        env = make_dmc_env("cartpole", "balance", image_size=16, renderer="fast")
+        return TransformReward(TimeLimit(env, 3), lambda reward: 0.0)
+
+    monkeypatch.setitem(gym.registry, "Sparse-v0", EnvSpec("Sparse-v0", entry_point=sparse))
+    assert main(["doctor", "--env", "Sparse-v0"]) == 0
+    assert "in 0 of 60 episodes; returns 0 to 0." in capsys.readouterr().out
 
 
 def test_doctor_shortens_the_episodes_of_dmc_tasks() -> None:
