@@ -188,7 +188,7 @@ def run_episodes(
             if state_of:
                 true_states.append(np.array(state_of(env)))
             if render:
-                frames.append(env.render())
+                frames.append(np.array(env.render()))  # which the environment may write into again
             actions.append(np.array(action))
             observation, reward, terminated, truncated, _ = env.step(action)
             finished = terminated or truncated
@@ -196,7 +196,7 @@ def run_episodes(
             rewards.append(float(reward))
             dones.append(terminated)
         if render:
-            frames.append(env.render())
+            frames.append(np.array(env.render()))
         seen: Any = _channels_first(stacked(observations), model.observation_space)
         errors = np.zeros(0, np.float32)
         if getattr(model.policy, "measures_errors", False):

@@ -125,6 +125,19 @@ def test_the_requested_policy_acts(actor: str) -> None:
     np.testing.assert_allclose(episode.srl_errors, (drawn - target).square().flatten(1).mean(1), rtol=1e-4)
 
 
+def test_each_frame_is_a_picture_of_its_own() -> None:
+    """Also where the environment renders into one array."""
+    env, canvas = Recorder(), np.zeros((4, 4, 3), np.uint8)
+
+    def render() -> np.ndarray:
+        canvas[:] = len(env.actions)
+        return canvas
+
+    env.render = render  # type: ignore[method-assign]
+    (episode,) = run_episodes(tiny_model("CnnPolicy", PixelBox()), env, 1, render=True)
+    assert [frame.max() for frame in episode.frames] == list(range(21))
+
+
 def test_true_states_are_kept_on_request() -> None:
     """Those before each step, as a function of the environment says; for dm_control that of its physics."""
     model = tiny_model("CnnPolicy", PixelBox()).learn(20)
