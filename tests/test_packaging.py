@@ -17,6 +17,7 @@ from packaging.version import Version
 from stable_baselines3.common.envs import FakeImageEnv
 
 from sb3_cure import CuReSAC, __version__, recipe
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.cli.zoo_files import GRIDS, ZOO, zoo_file
 from sb3_cure.srl import VAE
 
@@ -99,6 +100,9 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     zoo = {"srl": "sb3_cure.srl.VAE", "train_freq": [1, "episode"], "frame_stack": 3, "normalize": True}
     own.write_text(yaml.safe_dump({"default": zoo}))
     assert recipe(own) == {"srl": VAE, "train_freq": (1, "episode")}
+    own.write_text("default: {policy_kwargs: 'dict(net_arch=[8])'}")
+    with pytest.raises(UsageError, match=r"policy_kwargs is the text 'dict\(net_arch=\[8\]\)': write a mapping"):
+        recipe(own)
     env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
     model = CuReSAC("CnnPolicy", env, **recipe("fast/drq_single_view", buffer_size=10))
     assert (model.srl, model.curiosity, model.gamma) == (None, None, 0.98)

@@ -127,8 +127,12 @@ def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:
 
     :param read: Arguments as read from a file
     :return: Arguments as the model takes them
-    :raises UsageError: as ``find_class``
+    :raises UsageError: as ``find_class``, or for text instead of a mapping
     """
+    if isinstance(read.get("policy_kwargs"), str):  # which rl-zoo's commands evaluate, as any code
+        raise UsageError(
+            f"policy_kwargs is the text {read['policy_kwargs']!r:.60}: write a mapping, such as {{net_arch: [256]}}."
+        )
     arguments = {**read, **named_classes(read)}
     if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does
         arguments["train_freq"] = tuple(arguments["train_freq"])

@@ -117,14 +117,14 @@ class QuantileCritic(LatentCritic):
     :param n_quantiles: Quantiles of each critic
     :param top_quantiles_to_drop_per_net: Quantiles to drop for each critic
     :param kwargs: As of ``LatentCritic``
-    :raises ValueError: if no quantile is left
+    :raises ValueError: if no quantile is left, or the number to drop is negative
     """
 
     def __init__(self, *args: Any, n_quantiles: int = 25, top_quantiles_to_drop_per_net: int = 2, **kwargs: Any):
         super().__init__(*args, n_values=n_quantiles, **kwargs)  # type: ignore[misc]
-        if top_quantiles_to_drop_per_net >= n_quantiles:
+        if not 0 <= top_quantiles_to_drop_per_net < n_quantiles:
             raise ValueError(
-                f"top_quantiles_to_drop_per_net={top_quantiles_to_drop_per_net} leaves none of "
+                f"top_quantiles_to_drop_per_net={top_quantiles_to_drop_per_net} must be at least 0, and leave some of "
                 f"n_quantiles={n_quantiles}."
             )
         self.n_kept = (n_quantiles - top_quantiles_to_drop_per_net) * self.n_critics

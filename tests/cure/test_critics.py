@@ -100,6 +100,7 @@ def test_quantile_critic_drops_the_largest(n_critics: int, dropped: int) -> None
     th.testing.assert_close(critic.value(latents, actions), every.mean(dim=1, keepdim=True))
 
 
-def test_critic_without_quantiles_is_refused() -> None:
-    with pytest.raises(ValueError, match="leaves none of n_quantiles=2"):
-        QuantileCritic(3, 2, [8], nn.ReLU, 2, n_quantiles=2, top_quantiles_to_drop_per_net=3)
+@pytest.mark.parametrize("dropped", [-1, 2])
+def test_critic_keeps_some_of_its_quantiles(dropped: int) -> None:
+    with pytest.raises(ValueError, match="must be at least 0, and leave some of n_quantiles=2"):
+        QuantileCritic(3, 2, [8], nn.ReLU, 2, n_quantiles=2, top_quantiles_to_drop_per_net=dropped)
