@@ -19,7 +19,7 @@ POLICIES: dict[str, type[BasePolicy]] = {
 }
 
 
-class CuReSAC(Persistence, Pretraining, CuRe, SAC):  # type: ignore[misc]
+class CuReSAC(Pretraining, Persistence, CuRe, SAC):  # type: ignore[misc]
     """SAC from pixels, with state representation learning and a curious policy that seeks badly represented states.
 
     All arguments are described at ``CuReBase``.
@@ -29,7 +29,7 @@ class CuReSAC(Persistence, Pretraining, CuRe, SAC):  # type: ignore[misc]
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = POLICIES
 
 
-class CuReTQC(Persistence, Pretraining, CuRe, TQC):  # type: ignore[misc]
+class CuReTQC(Pretraining, Persistence, CuRe, TQC):  # type: ignore[misc]
     """Truncated quantile critics from pixels, with state representation learning and a curious policy.
 
     All arguments are described at ``CuReBase``; ``top_quantiles_to_drop_per_net`` is TQC's; ``n_quantiles`` is one of

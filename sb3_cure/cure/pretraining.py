@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import configure_logger
 
@@ -229,12 +228,9 @@ class Pretraining(CuRe):
                 f"curiosity was set to {self.curiosity!r} after the model was made, with networks of another kind: "
                 "make a new model. (With curiosity_prob=0 a separate curious policy learns, but does not act.)"
             )
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self._is_pretrained and not self.is_pretraining:
+        if self._is_pretrained:
             self._restart_random_streams()
-        return super()._setup_learn(*args, **kwargs)
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _check_that_srl_learns(self, call: str) -> None:
         if self.srl is None:
@@ -280,8 +276,9 @@ class Pretraining(CuRe):
         return [*super()._excluded_save_params(), "_initial_rng_state"]
 
     def _restart_random_streams(self) -> None:
-        """Reset all RNGs to their state after construction."""
+        """Reset all RNGs to their state after construction, not to that of a resumed pretraining."""
         self._is_pretrained = False
+        self._run.resumed = None  # type: ignore[attr-defined]  # of Persistence
         if self.seed is not None:
             self.set_random_seed(self.seed)
             th.set_rng_state(self._initial_rng_state)
