@@ -39,6 +39,7 @@ def test_sb3s_lines_have_sb3s_defaults() -> None:
     ours = {name: each.default for name, each in inspect.signature(CuReSAC.__init__).parameters.items()}
     theirs = {name: each.default for name, each in inspect.signature(SAC.__init__).parameters.items()}
     given = {**ours, **names["model"]}
+    assert given["update"] == "sequential" and given.pop("policy_kwargs") == {"net_arch": [256, 256]}
     assert given["encoder_tau"] == given["tau"] and given["ent_coef_lr_factor"] == given["actor_update_interval"] == 1
     for name, default in theirs.items():
         assert given.get(name, default) == default, name
