@@ -13,8 +13,9 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_cure.networks.encoders import Encoder
 
-#: Joint updates between two measurements of each source's share, which costs a backward pass for each source
-MEASURE_INTERVAL = 100
+#: Joint updates between two measurements of each source's share, which costs a backward pass for each source; a prime,
+#: so that sources which take part in every k-th update are not met always or never
+MEASURE_INTERVAL = 101
 
 #: Takes the name of a step and the gradients that it follows; raises if one is not finite
 Check = Callable[[str, list[th.Tensor]], None]

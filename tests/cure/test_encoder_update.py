@@ -348,10 +348,25 @@ def test_source_that_takes_no_part_has_no_share() -> None:
 
 
 def test_shares_are_measured_now_and_then() -> None:
-    """In the first update and every 100th, as it costs a pass per source."""
+    """In the first update and every 101st, as it costs a pass per source."""
     _, update = make("joint")
     measured = [whole(update, step)["encoder_share_task"] for step in range(MEASURE_INTERVAL + 1)]
     assert len(set(measured[:-1])) == 1 and measured[-1] != measured[0]
+
+
+@pytest.mark.parametrize("interval", [2, 3, 4, 5])
+def test_shares_tell_of_sources_that_rest(interval: int) -> None:
+    """A source that takes part in every second update has its share in every second measurement."""
+    _, update = make("joint", ("srl", "task"))
+    shares = []
+    for step in range(2 * interval * MEASURE_INTERVAL):
+        begin(update, step)
+        for source in ("srl", "task")[: 1 + (step % interval == 0)]:
+            learn(update, source)
+        update.finish()
+        if step % MEASURE_INTERVAL == 0:
+            shares.append(float(update.metrics["encoder_share_task"]))
+    assert sum(share > 0 for share in shares) == 2
 
 
 def test_measuring_changes_no_training(monkeypatch: pytest.MonkeyPatch) -> None:
