@@ -204,15 +204,15 @@ class CuRe(CuReBase):
                 each.update_statistics(batch.views)
         self._metrics = {}
         learners = self._learners() if learns_rl else []
-        srl = self._srl_loss(batch) if learns_srl else None
         rewarded = "task" if self.curiosity == "bonus" else "curious"
+        is_rewarded = rewarded in learners
+        reward: Any = policy.intrinsic
+        steps_encoder = is_rewarded and reward.trains_encoder and self.update == "sequential"
+        srl = self._srl_loss(batch, learns=not steps_encoder) if learns_srl else None
         # Computed before the steps of head and encoder
-        rewards = self._intrinsic_rewards(batch, srl) if rewarded in learners else None
+        rewards = self._intrinsic_rewards(batch, srl) if is_rewarded else None
         if srl is not None:
-            reward: Any = policy.intrinsic
-            if rewards is not None and reward.trains_encoder and self.update == "sequential":
-                srl = self._srl_loss(batch)  # again, as the reward's loss has stepped the encoder
-            self._update_srl(srl.loss)
+            self._update_srl((self._srl_loss(batch) if steps_encoder else srl).loss)
         if "task" in learners:
             self._update_task(batch, rewards if rewarded == "task" else None)
         if "curious" in learners:

@@ -209,6 +209,24 @@ def test_head_without_reader_does_not_run(kind: str, intrinsic: str, per_pixel: 
         assert modes == [True, True] + [False, False] * reads_error
 
 
+@pytest.mark.parametrize(
+    "update, intrinsic, expected",
+    [("sequential", "icm", [False, True]), ("sequential", "rnd", [True]), ("joint", "icm", [True])],
+)
+def test_head_learns_once_from_a_batch(update: str, intrinsic: str, expected: list[bool]) -> None:
+    """Also where the reward's loss has stepped the encoder before: a head that counts would count twice."""
+    model = tiny_model("CnnPolicy", PixelBox(), intrinsic=intrinsic, update=update).learn(10)
+    srl, modes = model.policy.srl, []
+
+    def loss(*arguments: Any) -> SRLOutput:
+        modes.append(th.is_grad_enabled())
+        return type(srl).loss(srl, *arguments)
+
+    srl.loss = loss
+    model.train(1, batch_size=8)
+    assert modes == expected
+
+
 @pytest.mark.parametrize("per_pixel, runs", [(False, 1), (True, 0)])
 def test_frozen_head_runs_once_for_the_error_of_the_next_observation(per_pixel: bool, runs: int) -> None:
     arguments: dict[str, Any] = dict(curiosity_target="next_observation", intrinsic_kwargs=dict(per_pixel=per_pixel))
