@@ -207,12 +207,13 @@ class CuRe(CuReBase):
         rewarded = "task" if self.curiosity == "bonus" else "curious"
         is_rewarded = rewarded in learners
         reward: Any = policy.intrinsic
+        # Then the head's loss is of the encoder after that step.
         steps_encoder = is_rewarded and reward.trains_encoder and self.update == "sequential"
-        srl = self._srl_loss(batch, learns=not steps_encoder) if learns_srl else None
+        srl = self._srl_loss(batch) if learns_srl and not steps_encoder else None
         # Computed before the steps of head and encoder
         rewards = self._intrinsic_rewards(batch, srl) if is_rewarded else None
-        if srl is not None:
-            self._update_srl((self._srl_loss(batch) if steps_encoder else srl).loss)
+        if learns_srl:
+            self._update_srl((srl or self._srl_loss(batch)).loss)
         if "task" in learners:
             self._update_task(batch, rewards if rewarded == "task" else None)
         if "curious" in learners:
