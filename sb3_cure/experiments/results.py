@@ -197,8 +197,8 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
             shared = (*_SHARED, "budget") if both_train else _SHARED
             _check_settings(first, other, SETTINGS if first.method == other.method else shared)
     for cell in experiment.finished:
-        if experiment.kind == "visitation" and not len(cell.visitation):
-            raise UsageError(f"{cell.folder} has no visitation.csv, or an empty one: {_FIX}.")
+        if experiment.kind == "visitation" and cell.visitation.columns.empty:
+            raise UsageError(f"{cell.folder} has no visitation.csv: {_FIX}.")
         if cell.config["budget"] > 0 and (experiment.kind != "visitation" or len(cell.evaluations)):
             _check_curve(cell)
     return experiment
