@@ -204,17 +204,17 @@ with deterministic actions. The highest return is 1000. {minutes}
 
 {arms}
 
-`best` and `best_cure` make an update for every second agent step, the others for every one: they learn less from a step, and
-take fewer minutes ([how long to a return](speed.md#time-to-a-return)). `drq` is the recipe with an update for every step,
-`recipe("fast/best", train_freq=1)`.
+`best` and `best_cure` make an update for every second agent step, the others for every one: they learn less from a
+step, and take fewer minutes ([how long to a return](speed.md#time-to-a-return)). `drq` is the recipe with an update for
+every step, `recipe("fast/best", train_freq=1)`.
 
 ![episode return over environment steps]({picture})
 
 Lines are means over seeds, bands one standard deviation; the numbers of seeds are those that have run. These pixels are
 not the papers', so that returns compare with each other and not with published ones. The cells are those of
 `zoo_configs/experiments/fast/benchmark.yml`. Their raw data is in `results/fast_benchmark/`; those that have not run
-there are taken from `results/by_the_clock_amx/` (in bf16, on another CPU), or, with seeds from 220 on, from the experiment on
-[dense rewards](../results/curiosity.md) in `results/fast_dense/`.
+there are taken from `results/by_the_clock_amx/` (in bf16, on another CPU), or, with seeds from 220 on, from the
+experiment on [dense rewards](../results/curiosity.md) in `results/fast_dense/`.
 """
 
 
