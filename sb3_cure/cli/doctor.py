@@ -168,13 +168,11 @@ def _below_camera(env: gym.Env) -> gym.Env:
 
     Ids of users may have wrappers above the camera that change rewards, actions or ends.
     """
-    inner: Any = env
-    while isinstance(inner, gym.Wrapper):
-        if isinstance(inner, DMCPixels):
-            limit = env.spec.max_episode_steps if env.spec else None
-            return inner.env if limit is None else TimeLimit(inner.env, limit)
-        inner = inner.env
-    return env
+    camera: Any = env
+    while not isinstance(camera, DMCPixels):
+        camera = camera.env
+    limit = env.spec.max_episode_steps if env.spec else None
+    return camera.env if limit is None else TimeLimit(camera.env, limit)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
