@@ -356,7 +356,7 @@ def test_shares_are_measured_now_and_then() -> None:
 
 @pytest.mark.parametrize("interval", [2, 3, 4, 5])
 def test_shares_tell_of_sources_that_rest(interval: int) -> None:
-    """A source that takes part in every second update has its share in every second measurement."""
+    """A source that takes part in every k-th update has its share in every k-th measurement."""
     _, update = make("joint", ("srl", "task"))
     shares = []
     for step in range(2 * interval * MEASURE_INTERVAL):

@@ -185,6 +185,19 @@ def test_zero_learning_rate_freezes_everything(srl: str, update: str) -> None:
     assert differences(before, dict(model.policy.named_parameters())) == []
 
 
+def modes_of_the_head(model: CuReSAC) -> list[bool]:
+    """Whether gradients are enabled, at each call of the head's loss from now on."""
+    srl: Any = model.policy.srl
+    modes: list[bool] = []
+
+    def loss(*arguments: Any) -> SRLOutput:
+        modes.append(th.is_grad_enabled())
+        return type(srl).loss(srl, *arguments)  # type: ignore[no-any-return]
+
+    srl.loss = loss
+    return modes
+
+
 @pytest.mark.parametrize(
     "intrinsic, per_pixel, reads_error", [("srl_error", False, True), ("srl_error", True, False), ("rnd", None, False)]
 )
@@ -194,13 +207,7 @@ def test_head_without_reader_does_not_run(kind: str, intrinsic: str, per_pixel: 
     settings: dict[str, Any] = dict(srl_schedule="alternating", srl_period=1) if kind == "alternating" else {}
     kwargs = {} if per_pixel is None else dict(per_pixel=per_pixel)
     model = tiny_model("CnnPolicy", PixelBox(), intrinsic=intrinsic, intrinsic_kwargs=kwargs, **settings).learn(10)
-    srl, modes = model.policy.srl, []
-
-    def loss(*arguments: Any) -> SRLOutput:
-        modes.append(th.is_grad_enabled())
-        return type(srl).loss(srl, *arguments)
-
-    srl.loss = loss
+    modes = modes_of_the_head(model)
     if kind == "frozen":
         model.representation_frozen = True
         model.train(2, batch_size=8)
@@ -225,13 +232,7 @@ def test_head_learns_once_from_a_batch(update: str, trains_encoder: bool, expect
 
     Reader.trains_encoder = trains_encoder
     model = tiny_model("CnnPolicy", PixelBox(), intrinsic=Reader, update=update).learn(10)
-    srl, modes = model.policy.srl, []
-
-    def loss(*arguments: Any) -> SRLOutput:
-        modes.append(th.is_grad_enabled())
-        return type(srl).loss(srl, *arguments)
-
-    srl.loss = loss
+    modes = modes_of_the_head(model)
     model.train(1, batch_size=8)
     assert modes == expected
 
@@ -240,12 +241,10 @@ def test_head_learns_once_from_a_batch(update: str, trains_encoder: bool, expect
 def test_frozen_head_runs_once_for_the_error_of_the_next_observation(per_pixel: bool, runs: int) -> None:
     arguments: dict[str, Any] = dict(curiosity_target="next_observation", intrinsic_kwargs=dict(per_pixel=per_pixel))
     model = filled_model(srl="rae", **arguments)
-    srl: Any = model.policy.srl
-    calls: list[Any] = []
-    srl.loss = lambda *given: (calls.append(given), type(srl).loss(srl, *given))[1]
+    modes = modes_of_the_head(model)
     model.representation_frozen = True
     model.train(1, 8)
-    assert len(calls) == runs
+    assert len(modes) == runs
 
 
 # ------------------------------------------------------------------ who acts
