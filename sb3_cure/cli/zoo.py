@@ -1,6 +1,7 @@
 """``train`` and ``optimize``: rl-zoo3's programs with CuRe's algorithms."""
 
 import argparse
+import os
 import sys
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import optuna
 import rl_zoo3.train
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import SimpleLinearSchedule, StoreDict
+from rl_zoo3.utils import SimpleLinearSchedule, StoreDict, get_latest_run_id
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
@@ -47,6 +48,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``env_kwargs`` of the file hold for the evaluation's environments, too;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
+    - trainings that are started together get a folder each;
     - ``--trial-id 0`` selects the first trial, instead of being taken for no trial;
     - settings that cannot be used are refused in one sentence, and training prints the remaining time;
     - ``optimize`` samples only what the chosen kind of curiosity uses.
@@ -77,6 +79,17 @@ class ExperimentManager(exp_manager.ExperimentManager):
             experiment = super().setup_experiment()
         self._updates_before = 0 if experiment is None else getattr(experiment[0], "_n_updates", 0)
         return experiment
+
+    def create_log_folder(self) -> None:
+        while True:
+            try:
+                os.makedirs(self.save_path)
+                break
+            except FileExistsError:  # of a training that was started at the same time
+                number = get_latest_run_id(self.log_path, self.env_name) + 1
+                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
+                self.params_path = f"{self.save_path}/{self.env_name}"
+        super().create_log_folder()
 
     def create_callbacks(self) -> None:
         super().create_callbacks()

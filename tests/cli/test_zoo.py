@@ -160,6 +160,21 @@ def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
     assert yaml.safe_load("1e-3") == "1e-3", "that of others is as it was"
 
 
+def test_trainings_started_together_have_a_folder_each(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both count the folders before either makes its own."""
+    read = zoo.ExperimentManager.read_hyperparameters
+
+    def read_while_others_start(manager: zoo.ExperimentManager) -> Any:
+        Path(manager.save_path).mkdir(parents=True)
+        return read(manager)
+
+    monkeypatch.setattr(zoo.ExperimentManager, "read_hyperparameters", read_while_others_start)
+    train("--eval-freq", "-1")
+    theirs, ours = sorted(Path("logs/cure_sac").iterdir())
+    assert not list(theirs.iterdir())
+    assert {f"{RUN}.zip", "0.monitor.csv", RUN} <= {path.name for path in ours.iterdir()}
+
+
 def test_statistics_beside_a_trained_agent_stay_unread(set_up: Callable[..., Any], run: Path, folder: Path) -> None:
     """They are pickled, and their run's settings did not ask for them."""
     copied = hostile(run, folder, "vecnormalize.pkl", "cos\nmkdir\n(S'pwned'\ntR.")
