@@ -104,6 +104,8 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"policy_kwargs is the text 'dict\(net_arch=\[8\]\)': write a mapping"):
         recipe(own)
     env = FakeImageEnv(n_channels=3, screen_height=32, screen_width=32, discrete=False, channel_first=True)
+    for augmentation in (None, "crop"):  # which does not take the ``pad`` of the file's shift
+        CuReSAC("CnnPolicy", env, **recipe("fast/drq_single_view", buffer_size=10, augmentation=augmentation))
     model = CuReSAC("CnnPolicy", env, **recipe("fast/drq_single_view", buffer_size=10))
     assert (model.srl, model.curiosity, model.gamma) == (None, None, 0.98)
     with pytest.raises(ValueError, match=r"did you mean fast/curl"):

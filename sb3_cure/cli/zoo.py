@@ -25,6 +25,7 @@ from sb3_cure.cli.usage import UsageError, missing_file, nearest, parse, refusal
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
     DEFAULT_ALGORITHM,
+    changed,
     check_environment,
     import_module,
     named_classes,
@@ -65,7 +66,8 @@ class ExperimentManager(exp_manager.ExperimentManager):
         is_yaml = path.suffix in (".yml", ".yaml")
         if not is_yaml or (self.algo not in ALGORITHMS and self.args.conf_file is None):  # rl-zoo3's own settings
             return super().read_hyperparameters()
-        settings = {**zoo_entry(path, self.env_name.gym_id, self.args.gym_packages), **(self.custom_hyperparams or {})}
+        entry = zoo_entry(path, self.env_name.gym_id, self.args.gym_packages)
+        settings = changed(entry, self.custom_hyperparams or {})
         if self.env_kwargs:
             settings["env_kwargs"] = self.env_kwargs
         saved = OrderedDict(sorted(settings.items()))

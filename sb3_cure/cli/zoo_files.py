@@ -119,7 +119,19 @@ def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict
     :raises UsageError: if there is no such file or entry
     """
     entry = zoo_entry(zoo_file(name), env_id)
-    return {**model_arguments({key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}), **changes}
+    return changed(model_arguments({key: value for key, value in entry.items() if key not in _NOT_OF_MODEL}), changes)
+
+
+def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Change settings; another head, reward or augmentation does not take the arguments of the one before.
+
+    :param settings: As read from a file
+    :param changes: Settings that take their place
+    :return: Both
+    """
+    parts = [part for part in ("srl", "intrinsic", "augmentation") if part in changes]
+    stale = {f"{part}_kwargs" for part in parts if changes[part] != settings.get(part)}
+    return {**{key: value for key, value in settings.items() if key not in stale}, **changes}
 
 
 def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:

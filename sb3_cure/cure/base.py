@@ -97,7 +97,7 @@ class CuReBase(OffPolicyAlgorithm):
         Algorithm 1 to the letter), see ``EncoderUpdate``
     :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 for images where the hardware computes it
     :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: actions then
-        come from a policy that is one step behind
+        come from a policy that is one call of ``train`` behind
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number
     :param ent_coef_lr_factor: Learning rate of the temperatures as a multiple of ``learning_rate``
     :param kwargs: The remaining arguments of the base class (``seed``, ``verbose``, ``policy_kwargs``, ...)
@@ -235,8 +235,8 @@ class CuReBase(OffPolicyAlgorithm):
         self._mixer = CuriousMixer(self.seed)
         if self.replay_buffer_class is None:
             self.replay_buffer_class = FrameStackReplayBuffer
-        if self._frame_stack is None:
-            self._frame_stack = self.replay_buffer_kwargs.get("frame_stack") or infer_frame_stack(self.env)
+        given = self.replay_buffer_kwargs.get("frame_stack")
+        self._frame_stack = given or self._frame_stack or infer_frame_stack(self.env)
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             if "frame_stack" in inspect.signature(self.replay_buffer_class).parameters:
                 self.replay_buffer_kwargs.setdefault("frame_stack", self._frame_stack)

@@ -24,7 +24,6 @@ from sb3_cure.data.buffers import FrameStackReplayBuffer, transitions
 from sb3_cure.data.observations import rows_of
 from sb3_cure.data.samples import Samples
 from sb3_cure.intrinsic import RewardInputs
-from sb3_cure.networks.augmentations import Augmentation
 from sb3_cure.networks.precision import compute_in
 from sb3_cure.srl import SRLOutput, get_srl_class
 
@@ -70,13 +69,13 @@ class CuRe(CuReBase):
             self._mixer.forget()  # who acted in a `learn` before this one
         elif self.task and self.curiosity in ("separate", "random"):
             starts: Any = self._last_episode_starts
-            second = self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
-            if second.any():
+            is_second = self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
+            if is_second.any():
                 if self.curiosity == "random":
                     chosen = self._mixer.hold(self.action_space.sample)
                 else:
-                    chosen, _ = self.predict_curious(rows_of(self._last_obs, second))
-                actions[second] = self.policy.scale_action(chosen)
+                    chosen, _ = self.predict_curious(rows_of(self._last_obs, is_second))
+                actions[is_second] = self.policy.scale_action(chosen)
         if action_noise is not None:  # added once, whoever acts
             actions = np.clip(actions + action_noise(), -1, 1)
         return self.policy.unscale_action(actions), actions
@@ -102,7 +101,7 @@ class CuRe(CuReBase):
         """Make the burst of updates after the random steps, as SAC-AE does."""
         updates = self.warmup_updates
         if updates is None:
-            wanted = self._learns_srl and self.learning_starts > 0
+            wanted = self._has_trainable_head and self.learning_starts > 0
             updates = get_srl_class(self.srl).warmup_updates if wanted else 0  # type: ignore[arg-type]
         elif self.learning_starts == 0 and self.replay_buffer.size() * self.n_envs < self.batch_size:  # type: ignore[union-attr]
             return  # until there is a batch
@@ -142,10 +141,11 @@ class CuRe(CuReBase):
         for _ in range(gradient_steps):
             learns_srl, learns_rl, n_batches = self._plan()
             for _ in range(n_batches):
-                batch = self._sample_batch(batch_size, learns_rl)
+                learners = self._learners() if learns_rl else []
+                batch = self._sample_batch(batch_size, learners)
                 self._guard.update = self._n_updates
                 with crash_report(self, batch), compute_in(self.policy, self._computed_precision):
-                    metrics.append(self._update(batch, learns_srl, learns_rl))
+                    metrics.append(self._update(batch, learns_srl, learners))
                 self._n_batches += 1
                 self._n_rl_batches += learns_rl
             self._n_updates += 1
@@ -158,22 +158,22 @@ class CuRe(CuReBase):
         if gradient_steps > 0:
             log_reconstructions(self, batch, gradient_steps)
 
-    def _sample_batch(self, batch_size: int, learns_rl: bool) -> Samples:
+    def _sample_batch(self, batch_size: int, learners: list[str]) -> Samples:
         """Draw transitions and the views of them that the encoder sees."""
         buffer: Any = self.replay_buffer
         prepare = self.policy.prepare
         batch = self.policy.samples(buffer.sample(batch_size, env=self._vec_normalize_env))
-        if self.n_steps > 1 and self.task and learns_rl:
+        if self.n_steps > 1 and "task" in learners:
             n_step = buffer.n_step(self.n_steps, self.gamma, self._vec_normalize_env)
             batch = batch._replace(n_step=n_step._replace(next_observations=prepare(n_step.next_observations)))
-        goes_on = learns_rl and "curious" in self._learners() and not self.curiosity_episodic
+        goes_on = "curious" in learners and not self.curiosity_episodic
         if goes_on and type(buffer) is FrameStackReplayBuffer:  # a subclass may sample otherwise
             batch = batch._replace(restarts=prepare(buffer.restarts(self._vec_normalize_env)))
         return batch
 
     def _plan(self) -> tuple[bool, bool, int]:
         """Whether the next update trains the representation, whether actors and critics, and its number of batches."""
-        learns_srl = self._learns_srl
+        learns_srl = self._has_trainable_head
         learns_rl = self.task or self._has_curious_agent
         if not (learns_srl and learns_rl):
             return learns_srl, learns_rl, 1
@@ -183,7 +183,7 @@ class CuRe(CuReBase):
         return srl_phase, not srl_phase, 2
 
     @property
-    def _learns_srl(self) -> bool:
+    def _has_trainable_head(self) -> bool:
         return self.srl is not None and not self.representation_frozen
 
     def _is_due(self, n_before: int, interval: int) -> bool:
@@ -195,7 +195,7 @@ class CuRe(CuReBase):
         own_interval = self.curious_interval if name == "curious" else 1
         return self._is_due(self._n_rl_batches // own_interval, interval)
 
-    def _update(self, batch: Samples, learns_srl: bool, learns_rl: bool) -> Metrics:
+    def _update(self, batch: Samples, learns_srl: bool, learners: list[str]) -> Metrics:
         """UpdateSRL, UpdateTaskAC and UpdateCuriousAC of Algorithm 1 on one batch."""
         policy, encoder = self.policy, self.policy.encoder_update
         encoder.begin(self._views(batch), self._guard.check)
@@ -203,17 +203,17 @@ class CuRe(CuReBase):
             for each in (policy.encoder, policy.encoder_target):
                 each.update_statistics(batch.views)
         self._metrics = {}
-        learners = self._learners() if learns_rl else []
         rewarded = "task" if self.curiosity == "bonus" else "curious"
-        is_rewarded = rewarded in learners
-        reward: Any = policy.intrinsic
-        # Then the head's loss is of the encoder after that step.
-        steps_encoder = is_rewarded and reward.trains_encoder and self.update == "sequential"
-        srl = self._srl_loss(batch) if learns_srl and not steps_encoder else None
-        # Computed before the steps of head and encoder
-        rewards = self._intrinsic_rewards(batch, srl) if is_rewarded else None
+        srl = rewards = None
+        if rewarded in learners:  # rewards are those before the steps of head and encoder
+            reward: Any = policy.intrinsic
+            reward_steps_encoder = reward.trains_encoder and encoder.mode == "sequential"
+            # The head's loss must see the encoder as this step leaves it.
+            srl = self._srl_loss(batch) if learns_srl and not reward_steps_encoder else None
+            rewards = self._intrinsic_rewards(batch, srl)
         if learns_srl:
-            self._update_srl((srl or self._srl_loss(batch)).loss)
+            srl = srl or self._srl_loss(batch)
+            self._update_srl(srl.loss)
         if "task" in learners:
             self._update_task(batch, rewards if rewarded == "task" else None)
         if "curious" in learners:
@@ -271,7 +271,7 @@ class CuRe(CuReBase):
         """UpdateSRL: train the head and, through the latents, the encoder."""
         srl: Any = self.policy.srl
         leaves = self.policy.encoder_update.leaves("srl")
-        self._learn("srl", "srl", loss, srl.optimizer)
+        self._step_with_encoder("srl", "srl", loss, srl.optimizer)
         if leaves and all(leaf.grad is None for leaf in leaves):
             warnings.warn(
                 f"the loss of {type(srl).__name__} does not depend on the latents that it is given, so it does not "
@@ -291,7 +291,7 @@ class CuRe(CuReBase):
             )
         raw = raw.detach().float()
         if loss is not None:
-            self._learn("intrinsic", "intrinsic reward", loss.float(), reward.optimizer)
+            self._step_with_encoder("intrinsic", "intrinsic reward", loss.float(), reward.optimizer)
         scaled = self.policy.scale(raw, self.curiosity_beta, self.normalize_curiosity, self._has_curious_agent)
         self._note(
             {
@@ -339,7 +339,7 @@ class CuRe(CuReBase):
             next_values = agent.critic_target.target_values(encoder.target_latents(next_view), next_actions)
             target = rewards + discounts * (next_values - agent.temperature() * next_log_prob)
         critic_loss = agent.critic.loss(encoder.latents(name), actions, target)
-        self._learn(name, f"{name} critic", critic_loss, agent.critic.optimizer)
+        self._step_with_encoder(name, f"{name} critic", critic_loss, agent.critic.optimizer)
         self._note({f"{prefix}critic_loss": critic_loss, f"{prefix}q_target": target.mean()})
         if self._is_agents_step_due(name, self.actor_update_interval):
             self._update_actor(name, agent)
@@ -370,7 +370,7 @@ class CuRe(CuReBase):
         """Add to this update's metrics."""
         self._metrics |= {name: value.detach() for name, value in metrics.items()}
 
-    def _learn(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:
+    def _step_with_encoder(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:
         """Step the loss's own parameters, and give the encoder its gradient at the latents."""
         self._optimize(name, loss, optimizer, self.policy.encoder_update.leaves(source))
         self.policy.encoder_update.collect(source)
@@ -392,12 +392,12 @@ class CuRe(CuReBase):
     def _reward_inputs(self, batch: Samples, srl: SRLOutput | None) -> RewardInputs:
         """What an intrinsic reward may read of this batch, of the encoder and of the replay buffer."""
         policy, encoder = self.policy, self.policy.encoder_update
-        # Without augmentation the centred views are also those of the other losses, which need their graph.
-        shared = type(policy.augmentation) is Augmentation
-        graph = shared or policy.intrinsic.trains_encoder  # type: ignore[union-attr]
+        is_random = policy.augmentation.is_random
+        # Without random views the other losses read these latents, too, and need their graph.
+        graph = policy.intrinsic.trains_encoder or not is_random  # type: ignore[union-attr]
 
         def read(name: str) -> th.Tensor:
-            return encoder.latents("intrinsic", name if shared else f"centred {name}", graph)
+            return encoder.latents("intrinsic", f"centred {name}" if is_random else name, graph)
 
         def look_up(rows: np.ndarray, env_inds: np.ndarray) -> Samples:
             sampled = transitions(self.replay_buffer, rows, env_inds, self._vec_normalize_env)  # type: ignore[arg-type]

@@ -13,8 +13,8 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_cure.networks.encoders import Encoder
 
-#: Joint updates between two measurements of each source's share, which costs a backward pass for each source; a prime,
-#: so that sources which take part in every k-th update are not met always or never
+#: Joint updates between two measurements of each source's share, which costs a backward pass for each source. A prime,
+#: so that a source that learns in every k-th update alone is neither always nor never measured
 MEASURE_INTERVAL = 101
 
 #: Takes the name of a step and the gradients that it follows; raises if one is not finite
@@ -62,7 +62,7 @@ class EncoderUpdate:
         self._make_optimizer = partial(optimizer_class, self._parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
         self.mean_squares: dict[str, th.Tensor] = {}
-        self.weights: dict[str, float] = {}
+        self.total_weights: dict[str, float] = {}
         self.set_sources(sources)
         self._n_updates = 0
         self._reset({})
@@ -77,7 +77,7 @@ class EncoderUpdate:
             name: self.optimizers.get(name) or self._make_optimizer() for name in names if self._parameters
         }
         self.mean_squares = {source: self.mean_squares.get(source, th.zeros(len(self._parts))) for source in sources}
-        self.weights = {source: self.weights.get(source, 0.0) for source in sources}
+        self.total_weights = {source: self.total_weights.get(source, 0.0) for source in sources}
         self.metrics: dict[str, th.Tensor] = {}
 
     # ------------------------------------------------------------ one update
@@ -110,7 +110,8 @@ class EncoderUpdate:
 
         :param source: Name of the loss; latents of a loss that does not train the encoder carry no gradient
         :param name: Name of the views
-        :param graph: Whether these views need their graph, for this loss or for another one, whatever the grad mode
+        :param graph: Whether any loss of this update needs the graph of these latents, which is then built even under
+            ``no_grad``
         :return: fp32, [B, features_dim]
         """
         if name not in self._latents:
@@ -158,10 +159,10 @@ class EncoderUpdate:
             mean_squares = self.mean_squares[source].to(norms.device).lerp(norms.square(), 1 - self.decay)
             self.mean_squares[source] = mean_squares
             # Undo the bias of an average that starts at zero, as Adam does.
-            self.weights[source] += (1 - self.decay) * (1 - self.weights[source])
+            self.total_weights[source] += (1 - self.decay) * (1 - self.total_weights[source])
             sizes = th.ones_like(next(iter(gradients.values()))[0])
             for part, mean_square in zip(self._parts, mean_squares, strict=True):
-                sizes[part] = (mean_square / self.weights[source]).sqrt().clamp(min=1e-30)
+                sizes[part] = (mean_square / self.total_weights[source]).sqrt().clamp(min=1e-30)
             gradients = {name: gradient / sizes for name, gradient in gradients.items()}
         self._gradients[source] = gradients
         if self.mode == "sequential":
@@ -228,7 +229,7 @@ class EncoderUpdate:
         return {
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
             "mean_squares": {source: value.clone() for source, value in self.mean_squares.items()},
-            "weights": dict(self.weights),
+            "total_weights": dict(self.total_weights),
             "n_updates": self._n_updates,
         }
 
@@ -239,19 +240,19 @@ class EncoderUpdate:
         :param strict: Whether a state of other sources or of the other mode is an error (else it is skipped)
         :raises RuntimeError: if ``strict`` and the state belongs to another mode or other sources
         """
-        if state["optimizers"].keys() != self.optimizers.keys() or state["weights"].keys() != self.weights.keys():
+        if any(state[part].keys() != getattr(self, part).keys() for part in ("optimizers", "mean_squares")):
             if not strict:
                 return
             # As torch's own load_state_dict; SB3's `load` takes a ValueError for an archive of an old DQN.
             raise RuntimeError(
-                f"the saved encoder was trained by {sorted(state['weights'])} with optimisers "
-                f"{sorted(state['optimizers'])}, this one by {sorted(self.weights)} with {sorted(self.optimizers)}: "
-                "load with the update=, srl= and curiosity= it was trained with."
+                f"the saved encoder was trained by {sorted(state['mean_squares'])} with optimisers "
+                f"{sorted(state['optimizers'])}, this one by {sorted(self.mean_squares)} with "
+                f"{sorted(self.optimizers)}: load with the update=, srl= and curiosity= it was trained with."
             )
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
         self.mean_squares = {source: value.clone() for source, value in state["mean_squares"].items()}
-        self.weights, self._n_updates = dict(state["weights"]), state["n_updates"]
+        self.total_weights, self._n_updates = dict(state["total_weights"]), state["n_updates"]
 
 
 def _norm(tensors: Iterable[th.Tensor]) -> th.Tensor:

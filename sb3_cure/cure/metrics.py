@@ -32,7 +32,7 @@ def means(updates: list[Metrics]) -> dict[str, float]:
 
 
 def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: int) -> None:
-    """Log pictures after the first update and now and then, for loggers that keep them (TensorBoard).
+    """Log pictures after the first update and then every ``RECONSTRUCTION_INTERVAL``, where loggers keep them.
 
     :param model: The model
     :param batch: The samples of the latest update

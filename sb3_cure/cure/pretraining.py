@@ -34,7 +34,7 @@ class Pretraining(CuRe):
         #: Whether the running pretraining leaves its transitions in the replay buffer
         self._keeps_replay_buffer = False
         #: Whether the next ``learn`` resets all RNGs to their state after construction
-        self._is_pretrained = False
+        self._restarts_random_streams = False
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
@@ -93,7 +93,7 @@ class Pretraining(CuRe):
             # Training goes on where it was.
             self._n_updates, self._n_batches, self._current_progress_remaining = counted
             begins = self.num_timesteps == 0 and not self._keeps_replay_buffer
-            self._is_pretrained = self._is_pretrained or begins
+            self._restarts_random_streams = self._restarts_random_streams or begins
         return self
 
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
@@ -123,7 +123,11 @@ class Pretraining(CuRe):
 
         own = self.policy.state_dict()
         here, there = transferred(own), transferred(networks)
-        for name in here | there or dict.fromkeys(parts):
+        if not here and not there:
+            raise ValueError(
+                f"{path} and this model have no encoder or head with parameters: there is nothing to transfer."
+            )
+        for name in here | there:
             ours, theirs = (tuple(getattr(each[name], "shape", ())) if name in each else None for each in (here, there))
             if ours is None or ours != theirs:
                 raise ValueError(
@@ -131,9 +135,9 @@ class Pretraining(CuRe):
                     "images, encoders and heads, and for a curious agent (not with curiosity=None) equal algorithms, "
                     "actions and rewards."
                 )
-        ignored = ({"srl"} if self.srl is None else set()) | (
-            set() if transfers_curious else {"intrinsic", "activation"}
-        )
+        ignored = set() if transfers_curious else {"intrinsic", "activation"}
+        if self.srl is None:
+            ignored.add("srl")
         for name, ours in self.policy.architecture.items():
             theirs = their_architecture.get(name)
             if name not in ignored and ours != theirs:
@@ -228,7 +232,7 @@ class Pretraining(CuRe):
                 f"curiosity was set to {self.curiosity!r} after the model was made, with networks of another kind: "
                 "make a new model. (With curiosity_prob=0 a separate curious policy learns, but does not act.)"
             )
-        if self._is_pretrained:
+        if self._restarts_random_streams:
             self._restart_random_streams()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
@@ -270,14 +274,14 @@ class Pretraining(CuRe):
         self.num_timesteps = self._n_updates = self._n_batches = self._n_rl_batches = 0
         self._warmed_up = False
         self._last_obs = None
-        self._is_pretrained = not self._keeps_replay_buffer
+        self._restarts_random_streams = not self._keeps_replay_buffer
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_initial_rng_state"]
 
     def _restart_random_streams(self) -> None:
         """Reset all RNGs to their state after construction, not to that of a resumed pretraining."""
-        self._is_pretrained = False
+        self._restarts_random_streams = False
         self._run.resumed = None  # type: ignore[attr-defined]  # of Persistence
         if self.seed is not None:
             self.set_random_seed(self.seed)

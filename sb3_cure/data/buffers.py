@@ -160,6 +160,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         if self.handle_timeout_termination:
             row["timeouts"] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(self.n_envs)
         for key, shape in self.info_shapes.items():
+            if not all(key in info for info in infos):
+                raise ValueError(f"info has no {key!r}, which replay_buffer_kwargs=dict(info_shapes=...) keeps.")
             row[f"infos/{key}"] = np.array([info[key] for info in infos]).reshape(self.n_envs, *shape)
         counts = {}
         for key, ring in self.rings.items():

@@ -61,12 +61,11 @@ class Background:
         if self._images is not None:
             self._show(int(self.rng.integers(len(self._images))))
 
-    def _show(self, number: int | None) -> None:
+    def _show(self, number: int) -> None:
         self.drawn = number
-        if self._images is not None and number is not None:
-            with Image.open(self._images[number]) as image:
-                fitted = ImageOps.fit(image.convert("RGB"), (self.size, self.size), Image.Resampling.BOX)
-            self._image = np.asarray(fitted)
+        with Image.open(self._images[number]) as image:  # type: ignore[index]
+            fitted = ImageOps.fit(image.convert("RGB"), (self.size, self.size), Image.Resampling.BOX)
+        self._image = np.asarray(fitted)
 
     def mask(self, camera: Any) -> np.ndarray:
         """Find sky and ground by segmentation.
@@ -91,7 +90,7 @@ class Background:
     def state_dict(self) -> dict[str, Any]:
         """Get what the frames to come depend on, for exact resume.
 
-        :return: What the frames to come depend on
+        :return: State of the generator, and the number of the image
         """
         return {"rng": self.rng.bit_generator.state, "drawn": self.drawn}
 
@@ -101,4 +100,5 @@ class Background:
         :param state: Result of ``state_dict``
         """
         self.rng.bit_generator.state = state["rng"]
-        self._show(state["drawn"])
+        if state["drawn"] is not None:
+            self._show(state["drawn"])

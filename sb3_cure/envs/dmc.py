@@ -53,11 +53,15 @@ class DMCPixels(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
         proprioception: bool = False,
         seed: int | None = None,
     ) -> None:
-        built: dict[str, Any] = dict(
-            image_size=image_size, grayscale=grayscale, renderer=renderer, background=background
+        RecordConstructorArgs.__init__(  # without the seed: what was drawn from it is part of the state
+            self,
+            cameras=list(cameras.items()),
+            image_size=image_size,
+            grayscale=grayscale,
+            renderer=renderer,
+            background=background,
+            proprioception=proprioception,
         )
-        # No seed: what was drawn from it is part of the state.
-        RecordConstructorArgs.__init__(self, cameras=list(cameras.items()), proprioception=proprioception, **built)
         super().__init__(env)
         self.image_size = size = at_least_one("image_size", image_size)
         self.grayscale, self.renderer, self._indices = grayscale, renderer, cameras

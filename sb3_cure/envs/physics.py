@@ -140,17 +140,18 @@ def _is_own(model: Any, joint: int) -> bool:
     return not floats and not body.startswith(("ball", "peg", "box", "spinner"))
 
 
-def telling_coordinates(names: list[str]) -> tuple[str, str]:
-    """Choose the two coordinates that show best what a task is about, for maps.
+def map_coordinates(names: Sequence[str], chosen: Sequence[str] | None = None) -> tuple[str, str]:
+    """Return the two coordinates of a map.
 
     :param names: Names of the state's coordinates, as of ``physics_state_names``
-    :return: The two of them that show best what the agent does, for maps: of cartpole the pole's angle and its
-        velocity, of finger the finger's angle and the body's velocity, of reacher both angles, ...
-    :raises ValueError: if there are fewer than two
+    :param chosen: The two to show; by default those that show best what a task is about, else the first two
+    :return: Their names
+    :raises ValueError: unless they are two of the names
     """
-    if len(names) < 2:
-        raise ValueError(f"the state has the coordinates {names}, but a map needs two: give at least two names.")
-    return next((pair for pair in _MAP_COORDINATES if set(pair) <= set(names)), (names[0], names[1]))
+    pair = chosen or next((pair for pair in _MAP_COORDINATES if set(pair) <= set(names)), names[:2])
+    if isinstance(pair, str) or len(pair) != 2 or not set(pair) <= set(names):
+        raise ValueError(f"a map needs two coordinates of {', '.join(names)}, not {pair!r}.")
+    return pair[0], pair[1]
 
 
 def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
@@ -162,24 +163,11 @@ def coordinate_labels(coordinates: tuple[str, str]) -> tuple[str, str]:
     return _MAP_COORDINATES.get(coordinates) or (coordinates[0].replace("_", " "), coordinates[1].replace("_", " "))
 
 
-def check_coordinates(coordinates: Sequence[str], names: Sequence[str]) -> None:
-    """Check that a map is of two coordinates of the state.
-
-    :param coordinates: Two coordinates of the state, by name
-    :param names: Names of all coordinates
-    :raises ValueError: if they are not two of these
-    """
-    if not isinstance(coordinates, Sequence) or len(coordinates) != 2 or not set(coordinates) <= set(names):
-        raise ValueError(
-            f"coordinates are {coordinates!r}, but a map needs two of the state's: choose of {', '.join(names)}."
-        )
-
-
 def is_of_the_suite(control: Any) -> bool:
     """Check whether ``integration_state`` knows all that a task may change.
 
     :param control: An environment of dm_control, without Gymnasium
-    :return: Whether ``integration_state`` knows all that its task may change
+    :return: Whether it does
     """
     from dm_control.rl.control import Environment
 
@@ -190,7 +178,7 @@ def integration_state(control: Any) -> dict[str, Any]:
     """Get all that the future of an environment depends on.
 
     :param control: An environment of the DeepMind Control suite, without Gymnasium
-    :return: All that its future depends on: numbers, arrays and dictionaries of these
+    :return: Numbers, arrays and dictionaries of these
     """
     import mujoco
 

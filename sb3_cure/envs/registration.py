@@ -33,7 +33,7 @@ def dmc_env_id(domain: str, task: str) -> str:
 
     :param domain: Domain of the DeepMind Control suite, such as ``"cartpole"``
     :param task: Task of that domain, such as ``"swingup"``
-    :return: The Gymnasium id of the task seen through pixels
+    :return: The id
     """
     return f"dmc_pixels/{domain}-{task}-v0"
 

@@ -51,7 +51,7 @@ def is_software_renderer(name: str) -> bool:
     """Check whether a renderer computes on the CPU.
 
     :param name: What OpenGL calls its renderer
-    :return: Whether it computes on the CPU
+    :return: Whether it does
     """
     return any(software in name.lower() for software in SOFTWARE_RENDERERS)
 
@@ -61,7 +61,7 @@ def judge_renderer(name: str, gpus: Sequence[str]) -> str | None:
 
     :param name: What OpenGL calls its renderer
     :param gpus: Names of the GPUs of this machine
-    :return: A warning if frames are computed by the CPU although there is a GPU, else None
+    :return: The warning, or None
     """
     if not is_software_renderer(name) or not gpus:
         return None

@@ -28,7 +28,7 @@ def _gl_error(cause: object) -> GLUnavailableError:
 def is_headless() -> bool:
     """Check whether no display is named on which a window could be opened.
 
-    :return: Whether no display is named on which a window could be opened
+    :return: Whether there is none
     """
     return sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 

@@ -6,6 +6,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 #: Sides of fewer pixels are taken for those of tables and grids.
 MIN_SIDE = 8
+#: MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
+UNBOUNDED = 1e10
 
 
 def check_observation_space(space: spaces.Space, policy: str | type | None = None) -> None:
@@ -30,21 +32,21 @@ def check_observation_space(space: spaces.Space, policy: str | type | None = Non
 
 
 def check_action_space(space: spaces.Space) -> None:
-    """Refuse integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1, and equal bounds.
+    """Refuse integers, as replay buffers would cut the policy's numbers in [-1, 1] to -1, 0 and 1, and useless bounds.
 
     :param space: Space of actions
-    :raises ValueError: If it is no box of floats, or a lower bound equals the upper one, between which SB3's policies
-        would scale to numbers that are not finite
+    :raises ValueError: If it is no box of floats, or SB3's policies would scale to numbers that are not finite (between
+        equal bounds), or to the bounds of an actuator that has none
     """
     if not (isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)):
         raise ValueError(
-            f"actions are {space}, but policies give real numbers: let an ActionWrapper, whose action_space is a Box "
-            "of floats, make the environment's of them."
+            f"actions are {space}, but policies output real numbers: wrap the environment in an ActionWrapper that "
+            "maps a Box of floats to these actions."
         )
-    if (space.low == space.high).any():
+    if not ((space.low > -UNBOUNDED) & (space.high < UNBOUNDED) & (space.low < space.high)).all():
         raise ValueError(
-            f"actions are {space}, where a lower bound equals the upper one: wrap the environment in NormalizeActions "
-            "of sb3_cure.envs, which leaves them as they must be."
+            f"actions are {space}, where some have no bounds, or but one value: wrap the environment in "
+            "NormalizeActions of sb3_cure.envs, which takes these for actions in [-1, 1], or holds them."
         )
 
 

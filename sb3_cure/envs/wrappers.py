@@ -20,10 +20,8 @@ from sb3_cure.envs.rendering import (
     mujoco_renderer_of,
     render_in_own_context,
 )
-from sb3_cure.envs.spaces_check import check_observation_space
+from sb3_cure.envs.spaces_check import UNBOUNDED, check_observation_space
 
-# MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
-UNBOUNDED = 1e10
 #: Rows and columns of a fast frame that are averaged to one of the image. This smooths edges as multisampling does,
 #: which takes software renderers several times as long
 OVERSAMPLING = 2
@@ -251,9 +249,8 @@ class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs)
         self._keys = list(images if keys is None else keys)
         if not self._keys or not set(self._keys) <= set(images):
             check_observation_space(space)  # says more of images that are nested or floats
-            raise ValueError(
-                f"ResizeImages needs images, uint8 with three dimensions, which are {keys or 'not'} in {space}."
-            )
+            missing = "" if keys is None else f" under {sorted(set(keys) - set(images))}"
+            raise ValueError(f"ResizeImages found no images, uint8 with three dimensions,{missing} in {space}.")
         resized = {
             key: spaces.Box(0, 255, self._resize(np.zeros(images[key].shape, np.uint8)).shape, np.uint8)
             for key in self._keys

@@ -25,10 +25,10 @@ from sb3_cure.cure.reconstructions import newest_frames
 from sb3_cure.data.buffers import frame_stacks, stored_places, transitions
 from sb3_cure.data.observations import by_key, image_spaces
 from sb3_cure.envs import physics_state, physics_state_names, physics_state_units
-from sb3_cure.envs.physics import check_coordinates, telling_coordinates
+from sb3_cure.envs.physics import map_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import decoding, diagnostics
-from sb3_cure.evaluation.encoding import encoder_of
+from sb3_cure.evaluation.encoders import encoder_of
 from sb3_cure.evaluation.rollouts import (
     Episode,
     as_arrays,
@@ -414,8 +414,7 @@ class CuriosityMapCallback(RolloutCallback):
         super().__init__(eval_env, every, **kwargs)
         self.folder, self.bins = Path(folder), bins
         self.state, self.names, self.units = _true_state(eval_env, state, names)
-        self.coordinates = coordinates or telling_coordinates(self.names)
-        check_coordinates(self.coordinates, self.names)
+        self.coordinates = map_coordinates(self.names, coordinates)
         #: By policy, the states of the last map, [n, d], and their SRL errors, [n]
         self.visits: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         from sb3_cure.evaluation import plots  # noqa: F401  (fail before training if a package is missing)
@@ -502,10 +501,10 @@ class DiagnosticsCallback(PeriodicCallback):
 
     Works with every off-policy algorithm of SB3; checks that do not apply are left out. Each number is logged as
     ``diagnostics/<name>``; ``sb3_cure.evaluation.diagnostics`` defines them and the thresholds, with reasons.
-    A look takes less time than one update with a batch of as many observations.
+    All checks together take less time than one update with a batch of as many observations.
 
-    :param every: Agent steps between two looks
-    :param verbose: 1 prints each look
+    :param every: Agent steps between two rounds of checks
+    :param verbose: 1 prints each number
     """
 
     def __init__(self, every: int = 1000, verbose: int = 0):
@@ -521,7 +520,7 @@ class DiagnosticsCallback(PeriodicCallback):
 
     def on_period(self) -> None:
         """Check, log and warn; stop after a problem, as it may explain those that follow."""
-        for name, value, problem in filter(None, diagnostics.look(self.model, self._reward_std)):
+        for name, value, problem in filter(None, diagnostics.run_checks(self.model, self._reward_std)):
             self.logger.record(f"diagnostics/{name}", float(value))
             if self.verbose >= 1:
                 print(f"{name} {value:.3g}")

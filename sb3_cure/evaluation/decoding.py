@@ -10,8 +10,9 @@ from torch.nn import functional as F
 
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.observations import by_key
-from sb3_cure.evaluation.encoding import encoder_of
+from sb3_cure.evaluation.encoders import encoder_of
 from sb3_cure.networks.decoders import PixelDecoder
+from sb3_cure.networks.layers import most_layers
 
 
 def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int = 1000, key: str = "") -> nn.Module:
@@ -27,8 +28,8 @@ def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int
     """
     images, latents = _images_and_latents(model, sample(1), key)
     shape = tuple(images.shape[1:])
-    layers = min(4, (min(shape[1:]) + 1) // 4)  # as many as small images allow
-    decoder: nn.Module = PixelDecoder(latents.shape[1], shape, n_layers=layers).to(model.device)
+    n_layers = min(4, most_layers(*shape[1:]))
+    decoder: nn.Module = PixelDecoder(latents.shape[1], shape, n_layers=n_layers).to(model.device)
     optimizer = th.optim.Adam(decoder.parameters(), lr=1e-3)
     for _ in range(updates):
         images, latents = _images_and_latents(model, sample(64), key)

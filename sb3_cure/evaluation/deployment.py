@@ -29,9 +29,9 @@ class DeterministicActor(nn.Module):
     def __init__(self, model: OffPolicyAlgorithm, actor: str | None = None):
         super().__init__()
         trained = trained_actors(model)
-        actor = trained[0] if actor is None else actor
+        actor = next(iter(trained), None) if actor is None else actor
         if actor not in trained:
-            raise ValueError(f"actor must be {' or '.join(map(repr, trained))} for this model, not {actor!r}.")
+            raise ValueError(f"actor must be one of {trained} that this model trains, not {actor!r}.")
         policy: Any = model.policy
         self.actor: Any = policy.curious.actor if actor == "curious" else policy.actor
         # In a tuple, so that critics and decoder are no part of what is exported

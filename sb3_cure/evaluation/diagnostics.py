@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from sb3_cure.cure.policies import CuRePolicy
 from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import image_spaces, images_of
-from sb3_cure.evaluation.encoding import encoder_of
+from sb3_cure.evaluation.encoders import encoder_of
 from sb3_cure.srl import RAE, DictHead
 
 #: Observations of the replay buffer that are looked at
@@ -72,8 +72,8 @@ class Temperature(NamedTuple):
 
 
 @th.no_grad()
-def look(model: Any, reward_std: Any) -> Iterator[Finding | None]:
-    """Look at a model in training, from cause to effect: a problem may explain those that follow.
+def run_checks(model: Any, reward_std: Any) -> Iterator[Finding | None]:
+    """Check a model in training, from cause to effect: a problem may explain those that follow.
 
     Behind a constant image all latents are alike, and next to a huge temperature no reward counts.
 

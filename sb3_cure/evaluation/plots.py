@@ -18,7 +18,7 @@ from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 from sb3_cure.cure.reconstructions import newest_frames
-from sb3_cure.envs.physics import check_coordinates, coordinate_labels, telling_coordinates
+from sb3_cure.envs.physics import coordinate_labels, map_coordinates
 from sb3_cure.evaluation.rollouts import HighestErrors, binned_errors
 
 #: Matplotlib style file of all figures: ``plt.style.use(STYLE)``
@@ -414,13 +414,12 @@ def curiosity_map(
     :param visits: By policy, the states of all steps, [n, d], and their SRL errors, [n] or empty
     :param names: Names of the coordinates of a state, [d]
     :param title: Title of the figure
-    :param coordinates: Names of the two to show; by default ``telling_coordinates``
+    :param coordinates: Names of the two to show; by default ``map_coordinates``
     :param units: Units of the coordinates, [d]; angles ("rad") are shown from -pi to pi
     :param bins: Bins along each axis
     :raises ValueError: if ``coordinates`` are not two of the names
     """
-    coordinates = coordinates or telling_coordinates(list(names))
-    check_coordinates(coordinates, names)
+    coordinates = map_coordinates(names, coordinates)
     columns = [list(names).index(name) for name in coordinates]
     both = [None if units is None else units[column] for column in columns]
     seen = np.concatenate([states[:, columns] for states, _ in visits.values()])

@@ -19,7 +19,7 @@ from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import by_key, images_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
-from sb3_cure.evaluation.encoding import encoder_of
+from sb3_cure.evaluation.encoders import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
 ACTORS = ("task", "curious", "random")
@@ -111,8 +111,8 @@ def balanced_negatives(model: BaseAlgorithm, env: gym.Env, seed: int | None = No
     :param seed: Seed of the resets and of random actions
     """
     every = heads_by_key(getattr(model.policy, "srl", None))
-    heads: dict[str, Any] = {key: head for key, head in every.items() if isinstance(head, CURL) and head.bank_filled}
-    banks = {key: head.bank[: int(head.bank_filled)].clone() for key, head in heads.items()}
+    heads: dict[str, Any] = {key: head for key, head in every.items() if isinstance(head, CURL) and head.n_banked}
+    banks = {key: head.bank[: head.n_banked].clone() for key, head in heads.items()}
     actors = [*trained_actors(model), "random"] if heads else []
     seen = [as_trained(model, next(run_episodes(model, env, 1, actor, seed=seed)).observations) for actor in actors]
     for key, head in heads.items():

@@ -215,7 +215,7 @@ class _Record(BaseCallback):
         if not self._has_begun:  # by pretraining; the records of earlier attempts are restored by now
             self._has_begun = True
             model: Any = self.model
-            self.attempts.append({"started": _now(), **_describe(model), "cpu_seconds": 0.0})
+            self.attempts.append({"started": _timestamp(), **_describe(model), "cpu_seconds": 0.0})
 
     def _on_step(self) -> bool:
         self._tick()
@@ -308,7 +308,7 @@ class _Record(BaseCallback):
         return {
             **_describe(model),
             "started": self.attempts[0]["started"],
-            "finished": _now(),
+            "finished": _timestamp(),
             "seconds": round(self.seconds, 1),
             "cpu_seconds": self.cpu_seconds,
             "attempts": len(self.attempts),
@@ -370,5 +370,5 @@ def _describe(model: CuReSAC) -> dict[str, Any]:
     return {**describe_run(), "device": str(model.device), "precision": model._computed_precision}
 
 
-def _now() -> str:
+def _timestamp() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

@@ -19,6 +19,7 @@ from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
     GRIDS,
     ZOO,
+    changed,
     check_environment,
     model_arguments,
     named_classes,
@@ -441,8 +442,10 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
     """
     method = file.methods[name]
     entry = {"policy": "CnnPolicy", **zoo_entry(path.parent / zoo_file(method.config, ZOO), task)}
-    for key, value in method.overrides.items():
-        entry[key] = _merged(entry.get(key), value) if key in _MERGED else value
+    overrides = {
+        key: _merged(entry.get(key), value) if key in _MERGED else value for key, value in method.overrides.items()
+    }
+    entry = changed(entry, overrides)
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
     return Cell(
         experiment=file.experiment,

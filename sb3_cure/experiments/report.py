@@ -196,7 +196,7 @@ def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) ->
 
 def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
     """Whose error it is: the head's, or that of a reward which reconstructs what its own autoencoder sees."""
-    arguments = next(iter(experiment.done(task, arm).values())).config["arguments"]
+    arguments = next(iter(experiment.finished_cells(task, arm).values())).config["arguments"]
     options = arguments.get("intrinsic_kwargs") or {}
     rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
     own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")
@@ -327,7 +327,7 @@ def media_of(experiment: Experiment, which: str) -> Iterator[tuple[CellResult, l
     :return: Cells and what to show of them
     """
     for task, method in experiment.arms if which != "none" else ():
-        for cell in experiment.done(task, method).values():
+        for cell in experiment.finished_cells(task, method).values():
             if files := [cell.folder / name for name in MEDIA if (cell.folder / name).exists()]:
                 yield cell, [Figure(path.name, render_text("media", path.name), path.read_bytes()) for path in files]
                 if which == "first":

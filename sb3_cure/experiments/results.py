@@ -47,7 +47,7 @@ class CellResult:
     coverage: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         return self.status == FINISHED
 
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +74,7 @@ class CellResult:
         :return: States by actor, [n, d] each, and the units of their coordinates; both empty if there are none
         """
         path = self.folder / "visits.npz"
-        if not self.done or not path.exists():
+        if not self.is_done or not path.exists():
             return {}, ()
         with np.load(path) as file:
             names = [name for name in file.files if name.endswith("_states")]
@@ -139,7 +139,7 @@ class Experiment:
 
     @property
     def finished(self) -> list[CellResult]:
-        return [cell for cell in self.cells.values() if cell.done]
+        return [cell for cell in self.cells.values() if cell.is_done]
 
     def of_arm(self, task: str, method: str) -> dict[int, CellResult]:
         """Cells of an arm on a task.
@@ -150,14 +150,14 @@ class Experiment:
         """
         return {seed: self.cells[key] for seed in self.seeds if (key := (task, method, seed)) in self.cells}
 
-    def done(self, task: str, method: str) -> dict[int, CellResult]:
+    def finished_cells(self, task: str, method: str) -> dict[int, CellResult]:
         """Finished cells of an arm on a task.
 
         :param task: Short name of the task
         :param method: Name of the arm
         :return: Cells by seed
         """
-        return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.done}
+        return {seed: cell for seed, cell in self.of_arm(task, method).items() if cell.is_done}
 
 
 def read_results(folder: str | Path) -> list[Experiment]:

@@ -47,7 +47,7 @@ def steps_to_return(experiment: Experiment, task: str, method: str, limit: float
     :param limit: The return
     :return: The steps of each seed with a curve, infinite without such an evaluation, [seeds]
     """
-    curves = [cell.curve() for cell in experiment.done(task, method).values()]
+    curves = [cell.curve() for cell in experiment.finished_cells(task, method).values()]
     return np.array([next(iter(steps[1:][values[1:] >= limit]), np.inf) for steps, values in curves if len(steps) > 1])
 
 
@@ -60,7 +60,7 @@ def stack_curves(experiment: Experiment, column: str = "return_mean") -> Curves:
     """
     found: Curves = {}
     for task, method in experiment.arms:
-        curves = [cell.curve(column) for cell in experiment.done(task, method).values()]
+        curves = [cell.curve(column) for cell in experiment.finished_cells(task, method).values()]
         # Of steps that were counted twice the last one
         seeds = [pd.Series(values, steps).groupby(level=0).last() for steps, values in curves if len(steps)]
         if seeds:
@@ -80,7 +80,7 @@ def summarise_arm(experiment: Experiment, task: str, method: str) -> pd.DataFram
         (``start_error``; nan: not measured) of the first one
     """
     rows = {}
-    for seed, cell in experiment.done(task, method).items():
+    for seed, cell in experiment.finished_cells(task, method).items():
         steps, values = cell.curve()
         if len(steps) > 1:
             starts = cell.evaluations.reindex(columns=["return_mean", "task_srl_error"]).iloc[0]
@@ -184,9 +184,9 @@ def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Es
 
 def _at_common_end(experiment: Experiment, task: str, method: str, column: str) -> Iterator[dict[int, float]]:
     """Values of an arm, and of its baseline, by seed, at the last step that both of a pair reached (interpolated)."""
+    arms = [experiment.finished_cells(task, arm) for arm in (method, experiment.baseline_of(method))]
     ours, theirs = (
-        {seed: curve for seed, cell in experiment.done(task, arm).items() if len((curve := cell.curve(column))[0])}
-        for arm in (method, experiment.baseline_of(method))
+        {seed: curve for seed, cell in cells.items() if len((curve := cell.curve(column))[0])} for cells in arms
     )
     last = {seed: min(ours[seed][0][-1], theirs[seed][0][-1]) for seed in ours if seed in theirs}
     return ({seed: float(np.interp(end, *arm[seed])) for seed, end in last.items()} for arm in (ours, theirs))
@@ -201,7 +201,7 @@ def final_values(experiment: Experiment, task: str, method: str, column: str) ->
     :param column: As of ``CellResult.curve``
     :return: The last value of each finished cell that has one
     """
-    curves = {seed: cell.curve(column)[1] for seed, cell in experiment.done(task, method).items()}
+    curves = {seed: cell.curve(column)[1] for seed, cell in experiment.finished_cells(task, method).items()}
     return {seed: float(values[-1]) for seed, values in curves.items() if len(values)}
 
 

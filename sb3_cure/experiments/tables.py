@@ -171,7 +171,7 @@ def value_and_interval(estimate: Estimate) -> str:
     return f"{number_text(estimate.value, 2)} {shown}" if math.isfinite(estimate.value) else NONE
 
 
-def _list(values: Iterable[Any]) -> str:
+def _joined(values: Iterable[Any]) -> str:
     return ", ".join(dict.fromkeys(str(value) for value in values if value not in (None, ""))) or NONE
 
 
@@ -207,7 +207,7 @@ def curves_table(experiment: Experiment) -> Table:
     rows = []
     for task, method in experiment.arms:
         digits, arm = return_digits(experiment, task), statistics.summarise_arm(experiment, task, method)
-        missing = NONE if experiment.done(task, method) else _state(experiment, task, method)
+        missing = NONE if experiment.finished_cells(task, method) else _state(experiment, task, method)
         row = [mean_std_text(arm[measure].to_numpy(), digits) or missing for measure in ("area", "final")]
         rows.append([task, method, str(len(arm)), *row])
     return _table("Learning curves", "task; arm; >seeds; >area under curve; >final return", rows, render_text("curves"))
@@ -347,7 +347,7 @@ def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Ta
 
 def _baselines(experiment: Experiment) -> str:
     own = [name for name in experiment.methods if experiment.baseline_of(name) != experiment.baseline]
-    return _list([experiment.baseline, *(f"of {name} {experiment.baseline_of(name)}" for name in own)])
+    return _joined([experiment.baseline, *(f"of {name} {experiment.baseline_of(name)}" for name in own)])
 
 
 def coverage_table(experiment: Experiment, rows: Sequence[Occupancy]) -> Table:
@@ -367,7 +367,7 @@ def coverage_table(experiment: Experiment, rows: Sequence[Occupancy]) -> Table:
         ]
         shown.append([row.task, row.method, row.actor, *numbers, value_and_interval(row.task_ratio)])
     columns = "; ".join(["task; arm; actor; >seeds; >states; >occupied cells", *_RATIOS])
-    dimensions = _list(f"{row.task}: {row.dimensions}" for row in rows)
+    dimensions = _joined(f"{row.task}: {row.dimensions}" for row in rows)
     note = render_text("coverage", dimensions, GRID_INTERVALS, _baselines(experiment))
     return _table("Coverage of the true state space", columns, shown, note)
 
@@ -411,10 +411,10 @@ def conditions_table(experiment: Experiment) -> Table:
         attempts: list[dict[str, Any]] = [*run.get("history", ()), run]
         versions = [each["versions"] for each in attempts if each.get("versions")]
         packages = [", ".join(f"{name} {number}" for name, number in each.items()) for each in versions]
-        named = _list(letters.setdefault(each, chr(ord("A") + len(letters))) for each in packages)
+        named = _joined(letters.setdefault(each, chr(ord("A") + len(letters))) for each in packages)
         trained = number_text(float(steps[-1])) if len(steps) else NONE
         pretrained = f"{number_text(phase['budget'])} ({phase['collector']})" if phase else NONE
-        machine = [_list(each.get(key) for each in attempts) for key in ("device", "precision", "machine")]
+        machine = [_joined(each.get(key) for each in attempts) for key in ("device", "precision", "machine")]
         times = [NONE if run.get(key) is None else time_text(run[key]) for key in ("seconds", "cpu_seconds")]
         row = [cell.task, cell.method, str(cell.seed), trained, pretrained, *times, *machine]
         rows.append([*row, named, _commits(cell), str(run.get("attempts") or NONE)])
@@ -433,4 +433,4 @@ def conditions_table(experiment: Experiment) -> Table:
 def _commits(cell: CellResult) -> str:
     """Commits of all attempts at a cell, and of its last measurement."""
     attempts: Sequence[Mapping[str, Any]] = cell.run.get("history", ())
-    return _list([*(each.get("commit") or "unknown" for each in attempts), cell.run.get("commit")])
+    return _joined([*(each.get("commit") or "unknown" for each in attempts), cell.run.get("commit")])

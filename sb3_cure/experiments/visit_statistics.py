@@ -168,7 +168,7 @@ def _visits(experiment: Experiment, task: str) -> tuple[dict[_Key, np.ndarray], 
     visits: dict[_Key, np.ndarray] = {}
     units: tuple[str, ...] = ()
     for method in experiment.methods:
-        for seed, cell in experiment.done(task, method).items():
+        for seed, cell in experiment.finished_cells(task, method).items():
             states, own_units = cell.states()
             visits |= {(method, actor, seed): visited for actor, visited in states.items() if visited.size}
             units = own_units or units

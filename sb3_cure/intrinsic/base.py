@@ -198,9 +198,9 @@ class RewardScale(nn.Module):
         :param reward: Raw reward of each sample, [B]
         :param beta: Factor of the reward, beta in the paper
         :param normalize: Whether to standardise; False is the paper's formula
-        :param center: Whether to subtract the mean when standardising. False for a bonus added to a task's reward: with
-            mean zero it would make long episodes neither better nor worse. It is then divided by its root mean square:
-            divided by its deviation, an error that varies little would be clipped to a constant
+        :param center: Whether to subtract the mean when standardising. False for a bonus added to a task's reward: a
+            mean of zero would make long episodes neither better nor worse. The bonus is then divided by its root mean
+            square; divided by its deviation, an error that varies little would be clipped to a constant
         :return: Scaled reward, [B, 1]
         """
         if normalize:

@@ -71,7 +71,7 @@ class DictReward(IntrinsicReward):
         self.mean_reward = MeanError(len(stacks))
         self.slices = dict.fromkeys(stacks, slice(None))
         if reward_class.needs_srl and isinstance(srl, DictHead):
-            self.slices = dict(zip(srl.keys, srl.slices, strict=True))
+            self.slices = srl.slices
         for name in ("needs_srl", "trains_encoder", "measures"):
             setattr(self, name, getattr(self.rewards[0], name))
 

@@ -7,8 +7,9 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from torch import nn
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
+from sb3_cure.intrinsic.reward_networks import scaled
 from sb3_cure.networks.decoders import PixelDecoder, squared_error
-from sb3_cure.networks.layers import RunningStandardize, small_mlp
+from sb3_cure.networks.layers import RunningStandardize, most_layers, small_mlp
 
 
 class Reconstruction(IntrinsicReward):
@@ -30,7 +31,7 @@ class Reconstruction(IntrinsicReward):
         self.vectors: RunningStandardize | None = None
         if is_image_space(self.observation_space):
             shape: tuple[int, ...] = self.observation_space.shape  # type: ignore[assignment]
-            n_layers = min(n_layers, (min(shape[1:]) + 1) // 4)
+            n_layers = min(n_layers, most_layers(*shape[1:]))
             self.decoder = PixelDecoder(self.features_dim, shape, n_filters, n_layers)
         else:
             self.vectors = RunningStandardize(self.observation_space)
@@ -76,6 +77,4 @@ class Reconstruction(IntrinsicReward):
         return squared_error(self.decoder, latents, observations, self._target)
 
     def _target(self, observations: th.Tensor) -> th.Tensor:
-        if self.vectors is not None:
-            return self.vectors(observations)  # type: ignore[no-any-return]
-        return observations.float().div_(255).sub_(0.5)  # in the memory order in which the decoder draws
+        return scaled(observations, self.observation_space) if self.vectors is None else self.vectors(observations)

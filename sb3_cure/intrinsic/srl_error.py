@@ -87,7 +87,7 @@ class SRLError(IntrinsicReward):
         views = srl.augment.center(observations)
         if views.dim() == 4:
             return scale_images(views.contiguous(memory_format=th.channels_last))
-        return srl.encoder.flatten(views)  # type: ignore[no-any-return]
+        return srl.encoder.vector_target(views)  # type: ignore[no-any-return]
 
     def _error(self, target: th.Tensor, latents: th.Tensor) -> th.Tensor:
         drawn = self._srl[0].reconstruct(latents)

@@ -1,7 +1,7 @@
 """Augmentations: the encoder sees a random view of observations in training, and a centred one otherwise."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -21,6 +21,9 @@ class Augmentation:
 
     :param observation_space: Space of the stored observations
     """
+
+    #: Whether views are drawn at random
+    is_random: ClassVar[bool] = False
 
     def __init__(self, observation_space: spaces.Space):
         self.observation_space = observation_space
@@ -60,6 +63,8 @@ class RandomShift(Augmentation):
     :param pad: Largest shift, pixels
     """
 
+    is_random = True
+
     def __init__(self, observation_space: spaces.Space, pad: int = 4):
         super().__init__(_image_space(observation_space, "shift"))
         self.pad = pad
@@ -87,6 +92,8 @@ class RandomCrop(Augmentation):
     :param size: Sides of the crops, pixels: one number or (height, width); None: 84 % of each side of the images
     :raises ValueError: if the crops are not smaller than the images
     """
+
+    is_random = True
 
     def __init__(self, observation_space: spaces.Space, size: int | tuple[int, int] | None = None):
         super().__init__(_image_space(observation_space, "crop"))
@@ -130,6 +137,8 @@ class DictAugmentation(Augmentation):
     :param observation_space: Dictionary of images and vectors
     :param images: Augmentation of each image, by key
     """
+
+    is_random = True
 
     def __init__(self, observation_space: spaces.Dict, images: dict[str, Augmentation]):
         super().__init__(observation_space)
@@ -180,8 +189,8 @@ def make_augmentation(
         parts = {
             key: make_augmentation(name, space, **kwargs) for key, space in image_spaces(observation_space).items()
         }
-        is_plain = all(type(part) is Augmentation for part in parts.values())
-        return Augmentation(observation_space) if is_plain else DictAugmentation(observation_space, parts)
+        is_random = any(part.is_random for part in parts.values())
+        return DictAugmentation(observation_space, parts) if is_random else Augmentation(observation_space)
     if callable(name):
         name = name(observation_space)
     return AUGMENTATIONS[name](observation_space, **kwargs)

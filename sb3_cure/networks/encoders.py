@@ -72,7 +72,7 @@ class Encoder(BaseFeaturesExtractor):
         :param views: [B, *view shape]
         """
 
-    def flatten(self, views: Any) -> th.Tensor:
+    def vector_target(self, views: Any) -> th.Tensor:
         """Flatten views of vectors as an autoencoder draws them: in the units in which the trunk reads them.
 
         :param views: [B, *view shape]
@@ -165,7 +165,7 @@ class VectorEncoder(Encoder):
         """
         self.trunk[0].update(views)  # type: ignore[index, operator]
 
-    def flatten(self, views: Any) -> th.Tensor:
+    def vector_target(self, views: Any) -> th.Tensor:
         """Flatten and standardise views: forces of 100 N would drown joints in an error of raw units.
 
         :param views: [B, *shape], or a dictionary of them

@@ -79,6 +79,16 @@ def conv_sizes(height: int, width: int, n_layers: int) -> list[tuple[int, int]]:
     return sizes
 
 
+def most_layers(height: int, width: int) -> int:
+    """Compute how many convolutions of ``conv_sizes`` an image allows.
+
+    :param height: Height of the image, pixels
+    :param width: Width of the image, pixels
+    :return: Number of convolutions
+    """
+    return (min(height, width) + 1) // 4
+
+
 def scale_images(images: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:
     """Convert images from bytes to [0, 1]; leave floats, which are in [0, 1] already, as they are.
 
@@ -293,8 +303,11 @@ class Projection(nn.Module):
 
     def __init__(self, in_dim: int, out_dim: int, tanh: bool = True):
         super().__init__()
-        if out_dim < 3:  # LayerNorm turns one number into a constant, and two into their order
-            raise ValueError(f"features_dim is {out_dim}, of which LayerNorm leaves nothing to learn: use at least 3.")
+        if out_dim < 3:
+            raise ValueError(
+                f"features_dim={out_dim} is too small: LayerNorm turns one latent into a constant and two into their "
+                "order. Use at least 3."
+            )
         self.linear = Linear(in_dim, out_dim)
         self.norm = nn.LayerNorm(out_dim)
         self.tanh = tanh
@@ -385,8 +398,8 @@ class RunningStandardize(nn.Module):
 class MeanError(nn.Module):
     """Mean over sensors of their errors, each divided by its running size; one sensor's error stays as it is.
 
-    Without it the sensor with the largest errors would decide which states are worth visiting. The size is the
-    root-mean-square: divided by its deviation, a sensor that shows little change, whose errors are all noise, would.
+    Without it the sensor with the largest errors would decide which states are worth visiting. The size is the root
+    mean square, not the standard deviation, which would amplify a sensor whose errors are nearly constant.
 
     :param n: Number of sensors
     """

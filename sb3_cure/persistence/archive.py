@@ -228,7 +228,7 @@ class SavesModels(OffPolicyAlgorithm):
         settings = archive.settings(cls, custom_objects or {}, kwargs)
         for key in ("policy_kwargs", "srl_kwargs"):  # optimisers would keep what they were saved with
             if kwargs.get(key, settings.get(key)) != settings.get(key):
-                raise ValueError(f"the {key} do not equal those that {name} was saved with: leave them out.")
+                raise ValueError(f"{key} differ from those that {name} was saved with: leave them out.")
         if env is not None:
             env = cls._wrap_env(env, settings.get("verbose", 0))
             check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
@@ -243,10 +243,7 @@ class SavesModels(OffPolicyAlgorithm):
                 raise ArchiveError(f"{name} has {key:.50}, which is no setting: it is damaged, or of another version.")
         vars(model).update(settings)
         if unknown := kwargs.keys() - vars(model).keys() - archive.content["settings"].keys():
-            raise TypeError(f"load has {min(unknown)!r}, but {cls.__name__} has no such setting: correct its name.")
-        changed, saved = kwargs.get("replay_buffer_kwargs"), settings.get("replay_buffer_kwargs", {})
-        if changed is not None and "frame_stack" in saved:  # which the environment may not tell
-            kwargs["replay_buffer_kwargs"] = {"frame_stack": saved["frame_stack"], **changed}
+            raise TypeError(f"load() got {min(unknown)!r}, which is no setting of {cls.__name__}: correct its name.")
         vars(model).update(kwargs)
         model._setup_model()
         replaced, archived = {**(custom_objects or {}), **kwargs}, archive.content["settings"]

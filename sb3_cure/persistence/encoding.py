@@ -39,7 +39,7 @@ from sb3_cure.networks import encoders
 from sb3_cure.srl import SRL_HEADS
 
 #: Version of the file format
-VERSION = 5
+VERSION = 6
 _DTYPES = {
     **{th.bool: "BOOL", th.float16: "F16", th.bfloat16: "BF16", th.float32: "F32", th.float64: "F64"},
     **{th.int8: "I8", th.int16: "I16", th.int32: "I32", th.int64: "I64"},
@@ -225,7 +225,7 @@ def _revived(kind: type, attributes: dict[str, Any]) -> Any:
     return value
 
 
-def _arguments(names: str, space: Any) -> dict[str, Any]:
+def _space_kwargs(names: str, space: Any) -> dict[str, Any]:
     """Get the arguments that a space was made with."""
     return {"dtype": space.dtype.type} | {name: getattr(space, name) for name in names.split()}
 
@@ -262,11 +262,11 @@ _KINDS: dict[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]] = {
     "bytes": (bytes, lambda value: np.frombuffer(value, np.uint8), lambda array: array.tobytes()),
     "Path": (type(Path()), str, Path),
     "TrainFreq": (TrainFreq, list, lambda parts: TrainFreq(*parts)),
-    "Box": (spaces.Box, partial(_arguments, "low high shape"), lambda given: spaces.Box(**given)),
-    "Discrete": (spaces.Discrete, partial(_arguments, "n start"), lambda given: spaces.Discrete(**given)),
+    "Box": (spaces.Box, partial(_space_kwargs, "low high shape"), lambda given: spaces.Box(**given)),
+    "Discrete": (spaces.Discrete, partial(_space_kwargs, "n start"), lambda given: spaces.Discrete(**given)),
     "MultiDiscrete": (
         spaces.MultiDiscrete,
-        partial(_arguments, "nvec start"),
+        partial(_space_kwargs, "nvec start"),
         lambda given: spaces.MultiDiscrete(**given),
     ),
     "MultiBinary": (spaces.MultiBinary, lambda space: space.n, spaces.MultiBinary),

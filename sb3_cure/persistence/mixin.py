@@ -123,8 +123,8 @@ class Persistence(SavesModels, SavesReplayBuffers):
             resumed.is_over = self.num_timesteps >= total
             if resumed.is_over:
                 warnings.warn(
-                    f"this call trains nothing, as the resumed training has made {self.num_timesteps} agent steps: the "
-                    "next learn is a call of its own.",
+                    f"this call trains nothing: the resumed training had already made its {self.num_timesteps} agent "
+                    "steps. The next learn() starts a new call.",
                     stacklevel=5,
                 )
         return total, callback

@@ -64,10 +64,10 @@ class RAE(SRLHead):
 
         :param views: Centred views, [B, *view shape], images in 0-255
         :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
-        :return: Images in [-0.5, 0.5], [B, C, H, W]; vectors as ``encoder.flatten`` gives them, [B, out_dim]
+        :return: Images in [-0.5, 0.5], [B, C, H, W]; vectors as ``encoder.vector_target`` gives them, [B, out_dim]
         """
         if not self.pixels:
-            return self.encoder.flatten(views)
+            return self.encoder.vector_target(views)
         # NHWC, as the decoder writes: reading two memory orders at once is far slower than one copy of bytes.
         images = views.contiguous(memory_format=th.channels_last)
         # SAC-AE's floor(x / 2^(8 - bits)) / 2^bits + U(0, 1) / 2^bits - 0.5, for speed in int16 until the last line:

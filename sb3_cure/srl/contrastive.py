@@ -40,14 +40,19 @@ class CURL(SRLHead):
         # Negatives of `error`, the first observations of training: negatives from the batch would change with it, and a
         # batch of one has none.
         self.register_buffer("bank", th.zeros((bank_size, *observation_space.shape), dtype=th.uint8))  # type: ignore[misc]
-        self.register_buffer("bank_filled", th.zeros((), dtype=th.long))
-        # The fill level as a Python number, which needs no device synchronisation; None: read the buffer
-        self._n_banked: int | None = None
-        self.register_load_state_dict_post_hook(self._forget_fill_level)
+        #: Observations in the bank: a Python number, as reading a tensor would synchronise a GPU
+        self.n_banked = 0
 
-    @staticmethod
-    def _forget_fill_level(head: nn.Module, incompatible_keys: object) -> None:
-        head._n_banked = None  # type: ignore[assignment]
+    def get_extra_state(self) -> th.Tensor:
+        """Return how many observations are in the bank."""
+        return th.tensor(self.n_banked)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        """Restore how many observations are in the bank.
+
+        :param state: Result of ``get_extra_state``
+        """
+        self.n_banked = int(state)
 
     @classmethod
     def choose_augmentation(cls, observation_space: spaces.Space) -> str:
@@ -80,7 +85,7 @@ class CURL(SRLHead):
         :param augmentation: The policy's
         :raises ValueError: if there is no augmentation
         """
-        if type(augmentation) is Augmentation:
+        if not augmentation.is_random:
             raise ValueError("srl='curl' compares two random views, but augmentation is None: use 'shift' or 'crop'.")
         super().bind(target_encoder, augmentation)
 
@@ -114,7 +119,7 @@ class CURL(SRLHead):
         # The same offset for all, drawn as for one image of many channels: neither batch size nor order matters.
         views = self.augment(batch.observations.flatten(0, 1)[None], th.Generator().manual_seed(0))
         own = self._keys(views.unflatten(1, batch.observations.shape[:2])[0])
-        negatives = self.bank[: int(self.bank_filled)]  # type: ignore[index, arg-type]
+        negatives = self.bank[: self.n_banked]  # type: ignore[index, arg-type]
         bank = self._keys(self.augment(negatives, th.Generator().manual_seed(1))) if len(negatives) > 0 else own[:0]
         weighted = latents @ self.W
         logits = th.cat([(weighted * own).sum(dim=1, keepdim=True), weighted @ bank.T], dim=1)
@@ -146,15 +151,11 @@ class CURL(SRLHead):
 
     @th.no_grad()
     def _fill_bank(self, observations: th.Tensor) -> None:
-        bank: th.Tensor = self.bank  # type: ignore[assignment]
-        if self._n_banked is None:
-            self._n_banked = int(self.bank_filled)  # type: ignore[arg-type]
-        room = len(bank) - self._n_banked
+        room = len(self.bank) - self.n_banked  # type: ignore[arg-type]
         if room > 0:
-            self._write_bank(self._n_banked, observations[:room])
+            self._write_bank(self.n_banked, observations[:room])
 
     def _write_bank(self, start: int, observations: th.Tensor) -> None:
         """Store observations from this place on, and drop those behind them."""
-        self._n_banked = start + len(observations)
-        self.bank[start : self._n_banked] = observations  # type: ignore[index, operator]
-        self.bank_filled.fill_(self._n_banked)  # type: ignore[operator]
+        self.n_banked = start + len(observations)
+        self.bank[start : self.n_banked] = observations  # type: ignore[index, operator]

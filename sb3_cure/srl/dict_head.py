@@ -36,9 +36,9 @@ class DictHead(SRLHead):
         self.heads = nn.ModuleList(
             head_class(image, observation_space[key], **kwargs) for key, image in encoder.images.items()
         )
-        #: Keys of the images, and their parts of the latents
-        self.keys, self.slices = tuple(encoder.images), tuple(encoder.slices.values())
-        self.mean_error = MeanError(len(self.keys))
+        #: Part of the joint latents that belongs to each image, by key
+        self.slices = encoder.slices
+        self.mean_error = MeanError(len(self.heads))
         self.error_tells_novelty = head_class.error_tells_novelty  # type: ignore[misc]
         self.optimizer_kwargs = self.heads[0].optimizer_kwargs  # type: ignore[assignment]
 
@@ -86,8 +86,8 @@ class DictHead(SRLHead):
 
     def after_step(self) -> None:
         """Update the moving averages of each head."""
-        for head in heads_by_key(self).values():
-            head.after_step()
+        for head in self.heads:
+            head.after_step()  # type: ignore[operator]
 
     def parts(self, latents: th.Tensor) -> list[tuple[str, Any, th.Tensor]]:
         """Split joint latents.
@@ -95,8 +95,7 @@ class DictHead(SRLHead):
         :param latents: Joint latents, [B, features_dim]
         :return: Key, head and latents of each image
         """
-        parts = zip(self.keys, self.heads, self.slices, strict=True)
-        return [(key, head, latents[:, where]) for key, head, where in parts]
+        return [(key, head, latents[:, self.slices[key]]) for key, head in heads_by_key(self).items()]
 
 
 def heads_by_key(head: SRLHead | None) -> dict[str, Any]:
@@ -106,5 +105,5 @@ def heads_by_key(head: SRLHead | None) -> dict[str, Any]:
     :return: The head of each image of a dictionary by key, or the head itself under the key ``""``
     """
     if isinstance(head, DictHead):
-        return {key: head.heads[i] for i, key in enumerate(head.keys)}
+        return dict(zip(head.slices, head.heads, strict=True))
     return {} if head is None else {"": head}

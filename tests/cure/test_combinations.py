@@ -139,10 +139,11 @@ def test_update_stays_on_its_device(cell: tuple[Any, ...], mode: str, meta_devic
     model.replay_buffer = collector.replay_buffer
     model.replay_buffer.device = meta_device
     for part in model.policy.modules():  # what rewards and banks read once, when they begin
-        vars(part).update({name: 0 for name in ("_n_banked", "_is_measured") if hasattr(part, name)})
+        vars(part).update({name: 0 for name in ("_is_measured",) if hasattr(part, name)})
     for _ in range(2):
         learns_srl, learns_rl, _ = model._plan()
-        metrics = model._update(model._sample_batch(8, learns_rl), learns_srl, learns_rl)
+        learners = model._learners() if learns_rl else []
+        metrics = model._update(model._sample_batch(8, learners), learns_srl, learners)
         assert {value.device for value in metrics.values()} == {meta_device}
 
 

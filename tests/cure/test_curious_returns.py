@@ -79,7 +79,7 @@ def test_dying_is_worth_what_follows(head: type[SRLHead], is_episodic: bool, pay
 def test_restarts_are_normalised_as_successors_are() -> None:
     env = VecNormalize(DummyVecEnv([Cliff]), norm_reward=False)
     model = tiny_model("MlpPolicy", env, learning_starts=200, batch_size=64).learn(200)
-    batch = model._sample_batch(64, learns_rl=True)
+    batch = model._sample_batch(64, model._learners())
     ended = batch.dones[:, 0] > 0
     assert 0 < ended.sum() < 64
     assert th.equal(batch.restarts[~ended], batch.next_observations[~ended])

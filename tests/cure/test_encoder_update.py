@@ -69,7 +69,7 @@ def whole(update: EncoderUpdate, step: int, **scales: float) -> dict[str, float]
     :return: What is logged
     """
     begin(update, step)
-    for source in update.weights:
+    for source in update.total_weights:
         learn(update, source, scales.get(source, 1.0))
     update.finish()
     return {name: float(value) for name, value in update.metrics.items()}
@@ -267,10 +267,11 @@ def test_sources_come_and_go(mode: str) -> None:
     whole(update, 0)
     before = str(update.state_dict())
     update.set_sources(("srl", "task", "curious"))
-    assert update.weights["curious"] == 0
+    assert update.total_weights["curious"] == 0
     assert {"latent_grad_norm_curious", "latent_grad_norm_task"} <= whole(update, 1).keys()
     update.set_sources(("srl", "task"))
-    assert not any("curious" in name for name in [*update.state_dict()["weights"], *update.optimizers, *update.metrics])
+    kept = [*update.state_dict()["total_weights"], *update.optimizers, *update.metrics]
+    assert not any("curious" in name for name in kept)
     other = make(mode, ("srl", "task"))[1]
     other.load_state_dict(update.state_dict())
     _, again = make(mode, ("srl", "task"))

@@ -590,7 +590,7 @@ def test_vectors_are_learned_from(update: str) -> None:
     observations = model.replay_buffer.sample(200).observations
     with th.no_grad():
         drawn = model.policy.srl.reconstruct(model.policy.encode(observations))
-    wanted = model.policy.encoder.flatten(observations)  # standardised
+    wanted = model.policy.encoder.vector_target(observations)  # standardised
     # The mean vector would score the variance.
     assert (drawn - wanted).square().mean() < 0.05 * wanted.var()
 

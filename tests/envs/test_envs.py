@@ -31,7 +31,7 @@ from sb3_cure.envs import (
     physics_state_units,
     register_dmc_envs,
 )
-from sb3_cure.envs.physics import telling_coordinates
+from sb3_cure.envs.physics import map_coordinates
 from sb3_cure.envs.rendering import GLUnavailableError, check_gl, load_gl
 from sb3_cure.envs.wrappers import ActionRepeat, action_repeat_of
 from sb3_cure.vec_env import FaultTolerantSubprocVecEnv
@@ -486,7 +486,7 @@ def test_true_state_is_that_of_the_physics_by_name(
         else:
             assert np.isclose(np.sin(value), np.sin(table[joint].item()))
             assert unit in (("m/s", "rad/s") if joint != name else ("m", "rad"))
-    assert telling_coordinates(names) == telling
+    assert map_coordinates(names) == telling
     before = state.copy()
     env.step(-np.ones(env.action_space.shape, np.float32))
     np.testing.assert_array_equal(state, before)

@@ -173,14 +173,23 @@ def test_integer_actions_are_refused() -> None:
         tiny_model("MlpPolicy", env)
 
 
-def test_action_without_a_choice_is_refused() -> None:
-    """A locked joint, which the policy's scaling would divide by zero; wrapped it stays where it must be."""
+@pytest.mark.parametrize(
+    ("low", "high", "wrapped"),
+    [
+        (0.5, 0.5, 0.5),
+        (-1e10, 1e10, -1),
+        (np.finfo(np.float32).min, np.finfo(np.float32).max, -1),
+        (-np.inf, np.inf, -1),
+    ],
+)
+def test_actions_that_cannot_be_scaled_are_refused(low: float, high: float, wrapped: float) -> None:
+    """A locked joint, which the policy's scaling would divide by zero, and bounds of an actuator that has none."""
     env = Returns(spaces.Box(-1, 1, (2,)), np.zeros(2, np.float32))
-    env.action_space = spaces.Box(np.array([-1, 0.5], np.float32), np.array([1, 0.5], np.float32))
+    env.action_space = spaces.Box(np.array([-1, low], np.float32), np.array([1, high], np.float32))
     with pytest.raises(ValueError, match="NormalizeActions"):
         tiny_model("MlpPolicy", env)
     tiny_model("MlpPolicy", NormalizeActions(env))
-    assert NormalizeActions(env).action(np.array([1, -1], np.float32)).tolist() == [1, 0.5]
+    assert NormalizeActions(env).action(np.array([1, -1], np.float32)).tolist() == [1, wrapped]
 
 
 # ------------------------------------------------------------------------------------------------------------- resize
@@ -211,9 +220,9 @@ def test_images_of_dictionaries_are_resized_by_key() -> None:
     assert shapes == {"front": (16, 16, 3), "wrist": (3, 48, 48), "joints": (2,)}
     assert env.reset()[0] in env.observation_space
     for keys in (["joints"], ["left"]):
-        with pytest.raises(ValueError, match="ResizeImages needs images"):
+        with pytest.raises(ValueError, match="ResizeImages found no images"):
             ResizeImages(camera_and_joints(), 16, keys=keys)
-    with pytest.raises(ValueError, match="ResizeImages needs images"):
+    with pytest.raises(ValueError, match="ResizeImages found no images"):
         ResizeImages(VectorBox(), 16)
     nested = Returns(spaces.Dict(pixels=spaces.Dict(top=image(48, 64, 3))), None)
     with pytest.raises(ValueError, match=r"'pixels' is a Dict, which .* flatten it"):

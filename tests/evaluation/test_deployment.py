@@ -86,7 +86,7 @@ def test_actions_follow_further_training() -> None:
 def test_wrong_actors_and_scaled_images_are_refused() -> None:
     """Floats in [0, 1] would be divided by 255 once more, and give actions all the same."""
     model = tiny_model("CnnPolicy", PixelBox(), curiosity=None)
-    with pytest.raises(ValueError, match="actor must be 'task' for this model, not 'curious'"):
+    with pytest.raises(ValueError, match=r"actor must be one of \['task'\] that this model trains, not 'curious'"):
         DeterministicActor(model, "curious")
     with pytest.raises(ValueError, match=r"images must be uint8, not torch.float32"):
         DeterministicActor(model)(th.rand(1, 6, 36, 36))

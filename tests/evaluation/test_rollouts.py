@@ -170,7 +170,7 @@ def test_negatives_are_taken_evenly_from_each_policy() -> None:
     # Two policies share it without a curious one; other models are left alone.
     plain = tiny_model("CnnPolicy", PixelBox(), srl="curl", curiosity=None).learn(20)
     with balanced_negatives(plain, env, seed=3):
-        assert int(plain.policy.srl.bank_filled) == 64
+        assert plain.policy.srl.n_banked == 64
     for other in (tiny_model("CnnPolicy", PixelBox()), SAC("MlpPolicy", VectorBox())):
         before = {key: value.clone() for key, value in other.policy.state_dict().items()}
         with balanced_negatives(other, env):

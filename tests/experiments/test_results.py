@@ -27,7 +27,7 @@ def test_only_finished_cells_enter_statistics(tmp_path: Path) -> None:
     assert [cell.status for cell in experiment.cells.values()] == [
         "done", "unfinished", "not run", "not run", "not run", "not run",
     ]  # fmt: skip
-    assert list(experiment.done(TASK, "sac_ae")) == [0]
+    assert list(experiment.finished_cells(TASK, "sac_ae")) == [0]
     assert statistics.paired_differences(experiment) == []
 
 
@@ -91,7 +91,7 @@ def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: i
 def test_cells_of_earlier_versions_enter_with_those_of_today(results: Path) -> None:
     """Keys that an earlier version did not write are no other setting; those that two later ones have are."""
     write_cell(results, TASK, "sac_ae", 2, curve(0, 1), algo="cure_sac", pretrain=None)
-    assert list(read_results(results)[0].done(TASK, "sac_ae")) == [0, 1, 2]
+    assert list(read_results(results)[0].finished_cells(TASK, "sac_ae")) == [0, 1, 2]
     write_cell(results, TASK, "sac_ae", 3, curve(0, 1), algo="cure_tqc", pretrain=None)
     with pytest.raises(UsageError, match=r"seed3 was run with algo 'cure_tqc', but .*seed2 with 'cure_sac'"):
         read_results(results)

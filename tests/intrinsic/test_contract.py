@@ -179,7 +179,7 @@ def test_reward_that_trains_the_encoder_moves_it(augmentation: str | None, updat
         assert moved(before, groups(model)) == trained | {"curious critic"}
         reward: Any = model.policy.intrinsic
         assert all((each.grad is not None) == bool(trained) for each in (reward.given[0].latents,))
-        assert ("intrinsic" in model.policy.encoder_update.weights) == bool(trained)
+        assert ("intrinsic" in model.policy.encoder_update.total_weights) == bool(trained)
 
 
 @UPDATES
@@ -198,9 +198,9 @@ def test_head_trains_the_encoder_beside_a_reward_of_its_error_that_does(update: 
 def test_rewards_survive_pretraining(reward: type[IntrinsicReward], curiosity: str | None) -> None:
     """The pretraining's curious agent gets them; a bonus is still added afterwards."""
     model = tiny_model("MlpPolicy", VectorBox(), intrinsic=reward, curiosity=curiosity)
-    sources = set(model.policy.encoder_update.weights)
+    sources = set(model.policy.encoder_update.total_weights)
     model.pretrain(14).learn(14)
-    assert set(model.policy.encoder_update.weights) == sources
+    assert set(model.policy.encoder_update.total_weights) == sources
     assert (model.policy.intrinsic is None) == (curiosity is None)
 
 

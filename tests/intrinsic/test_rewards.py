@@ -108,10 +108,10 @@ def test_trains_without_a_task_and_in_pretraining(arm: str, pixels: bool) -> Non
     logged = train_once(model)
     assert all(map(math.isfinite, logged.values())) and logged["curious_reward_std"] > 0
     model = tiny_model(policy, env, curiosity=None, **ARMS[arm])
-    before, sources = groups(model), set(model.policy.encoder_update.weights)
+    before, sources = groups(model), set(model.policy.encoder_update.total_weights)
     model.pretrain(14)
     assert "head" in moved(before, groups(model)) and "actor" not in moved(before, groups(model))
-    assert set(model.policy.encoder_update.weights) == sources and model.policy.intrinsic is None
+    assert set(model.policy.encoder_update.total_weights) == sources and model.policy.intrinsic is None
     model.learn(12)
 
 
@@ -120,7 +120,8 @@ def test_optimiser_has_what_is_trained_and_the_encoder_what_is_declared(arm: str
     """Frozen networks are not stepped; a source of the encoder is there exactly where the reward trains it."""
     model = filled_model(pixels=True, curiosity_encoder_grad=False, **ARMS[arm])
     reward = reward_of(model)
-    assert ("intrinsic" in model.policy.encoder_update.weights) == reward.trains_encoder == (arm in ("icm", "impact"))
+    sources = model.policy.encoder_update.total_weights
+    assert ("intrinsic" in sources) == reward.trains_encoder == (arm in ("icm", "impact"))
     trained = [p for p in reward.parameters() if p.requires_grad]
     held = [] if reward.optimizer is None else reward.optimizer.param_groups[0]["params"]
     assert set(map(id, held)) == set(map(id, trained))
@@ -485,7 +486,7 @@ def test_dictionary_rewards_read_their_own_image() -> None:
     policy: Any = model.policy
     randomise(policy)
     sampled = policy.samples(model.replay_buffer.sample(8), random=False)  # type: ignore[union-attr]
-    images = {key: noise_images(model.observation_space[key]) for key in policy.srl.keys}  # type: ignore[index]
+    images = {key: noise_images(model.observation_space[key]) for key in policy.srl.slices}  # type: ignore[index]
     batch, latents = sampled._replace(observations={**sampled.observations, **images}), th.randn(8, 18)
     with th.no_grad():
         _, reward = reward_of(model).loss(inputs_of(model, batch, latents, latents))

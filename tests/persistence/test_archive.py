@@ -96,7 +96,7 @@ def test_schedules_noises_and_classes_come_back(schedule: Any, noise: Any, extra
     ).learn(14)
     loaded: Any = CuReSAC.load(saved(model))
     assert loaded.policy_kwargs == model.policy_kwargs and loaded.policy_class is model.policy_class
-    with pytest.raises(ValueError, match="the srl_kwargs do not equal"):  # of which the optimiser's would be ignored
+    with pytest.raises(ValueError, match="srl_kwargs differ"):  # of which the optimiser's would be ignored
         CuReSAC.load(saved(model), srl_kwargs=dict(decoder_weight_decay=0.5))
     assert loaded.train_freq == model.train_freq and loaded.replay_buffer_class is model.replay_buffer_class
     for progress in (1.0, 0.7, 0.1):
@@ -251,7 +251,7 @@ def test_excluded_settings_become_defaults() -> None:
 
 @pytest.mark.parametrize("version", [3, 99])
 def test_files_of_other_versions_are_refused(version: int) -> None:
-    sentence = f"has format {version} of another version of sb3_cure, and this one reads format 5"
+    sentence = f"has format {version} of another version of sb3_cure, and this one reads format 6"
     with pytest.raises(ArchiveError, match=sentence):
         CuReSAC.load(io.BytesIO(changed_data(lambda node: node.update(format=version))()))
     header, body = parts_of(examples()["buffer"])

@@ -132,6 +132,8 @@ def test_load_keeps_the_frame_stack_beside_other_arguments_of_the_buffer(tmp_pat
     tiny_model("CnnPolicy", make(), replay_buffer_kwargs=dict(frame_stack=2)).save(tmp_path / "model.zip")
     loaded = CuReSAC.load(tmp_path / "model.zip", make(), replay_buffer_kwargs=dict(frames_dir=tmp_path / "frames"))
     assert loaded.replay_buffer.frame_stack == loaded.policy._arguments["reward_settings"]["frame_stack"] == 2
+    other = CuReSAC.load(tmp_path / "model.zip", env=make(), replay_buffer_kwargs=dict(frame_stack=1))
+    assert other.replay_buffer.frame_stack == other.policy._arguments["reward_settings"]["frame_stack"] == 1
 
 
 def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
@@ -146,7 +148,7 @@ def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     # A learning rate of zero moves nothing but the targets, towards the networks.
     moved = differences(before, dict(loaded.policy.named_parameters()))
     assert moved and all("target" in name for name in moved)
-    with pytest.raises(TypeError, match="load has 'batchsize', but CuReSAC has no such setting"):
+    with pytest.raises(TypeError, match="'batchsize', which is no setting of CuReSAC"):
         CuReSAC.load(tmp_path / "model", batchsize=8)
 
 

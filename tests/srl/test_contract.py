@@ -227,7 +227,7 @@ def test_dictionary_heads_are_each_images_own() -> None:
 
     model = sensor_model(srl=Counts, augmentation="shift").learn(13)
     policy: Any = model.policy
-    assert policy.srl.keys == ("front", "wrist")
+    assert tuple(policy.srl.slices) == ("front", "wrist")
     for key, head in heads_by_key(policy.srl).items():
         assert head.n_steps == 3
         assert head.augment is policy.augmentation.of(key) and head.augment.observation_space.shape[1] == SIDES[key]

@@ -116,7 +116,7 @@ def test_set_bank_chooses_the_negatives() -> None:
     encoder, head, space = trained_curl(bank_size=16)
     chosen = noise_images(space, 5, seed=11)
     head.set_bank(chosen)
-    assert int(head.bank_filled) == 5 and th.equal(head.bank[:5], chosen)
+    assert head.n_banked == 5 and th.equal(head.bank[:5], chosen)
     _, fresh = make(CURL, space, bank_size=16)
     fresh.load_state_dict({**head.state_dict(), "bank": th.cat([chosen, th.zeros_like(head.bank[5:])])})
     observations = noise_images(space, 4, seed=9)
@@ -131,7 +131,7 @@ def test_set_bank_chooses_the_negatives() -> None:
 def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
     """A restored head gives the same errors and goes on filling where the other stopped."""
     encoder, head, space = trained_curl(bank_size=16)
-    assert int(head.bank_filled) == 12
+    assert head.n_banked == 12
     _, other = make(CURL, space, bank_size=16)
     if trained_before:
         full = noise_images(space, 16, seed=5)
@@ -143,7 +143,7 @@ def test_bank_travels_in_the_state_dict(trained_before: bool) -> None:
     more = noise_images(space, 6, seed=7)
     for each in (head, other):
         each.loss(batch_of(more), encode(encoder, more))
-    assert int(other.bank_filled) == 16
+    assert other.n_banked == 16
     assert th.equal(other.bank, head.bank)
     assert th.equal(other.bank[12:], more[:4])
 
