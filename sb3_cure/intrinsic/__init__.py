@@ -8,6 +8,8 @@ from sb3_cure.intrinsic.dict_reward import DictReward, make_reward
 from sb3_cure.intrinsic.registry import INTRINSIC_REWARDS, get_intrinsic_class
 from sb3_cure.intrinsic.shuffled import Shuffled
 
+INTRINSIC_REWARDS["shuffled"] = Shuffled  # wraps any of the others, by their names
+
 __all__ = [
     "INTRINSIC_REWARDS",
     "DictReward",

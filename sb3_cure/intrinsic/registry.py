@@ -7,7 +7,6 @@ from sb3_cure.intrinsic.impact import Impact
 from sb3_cure.intrinsic.particle import Particle
 from sb3_cure.intrinsic.reconstruction import Reconstruction
 from sb3_cure.intrinsic.rnd import RND
-from sb3_cure.intrinsic.shuffled import Shuffled
 from sb3_cure.intrinsic.srl_error import SRLError
 from sb3_cure.srl import SRLHead
 
@@ -23,7 +22,6 @@ INTRINSIC_REWARDS: dict[str, type[IntrinsicReward]] = {
     "impact": Impact,
     "disagreement": Disagreement,
     "particle": Particle,
-    "shuffled": Shuffled,
 }
 
 

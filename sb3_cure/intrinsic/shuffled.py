@@ -6,6 +6,7 @@ import torch as th
 
 from sb3_cure.intrinsic.base import IntrinsicReward, OwnGenerator, RewardInputs
 from sb3_cure.intrinsic.dict_reward import make_reward
+from sb3_cure.intrinsic.registry import get_intrinsic_class
 
 
 class Shuffled(IntrinsicReward):
@@ -18,8 +19,6 @@ class Shuffled(IntrinsicReward):
     """
 
     def __init__(self, *args: Any, settings: dict[str, Any], of: str | type[IntrinsicReward] = "auto", **kwargs: Any):
-        from sb3_cure.intrinsic.registry import get_intrinsic_class  # which names this class, too
-
         super().__init__(*args)
         reward_class = get_intrinsic_class(of, settings.get("srl"))
         spaces_of = self.observation_space, self.action_space
