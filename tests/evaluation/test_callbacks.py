@@ -360,7 +360,7 @@ class Wide(PixelBox):
         (lambda path: CuriosityMapCallback(PixelBox(), path), "has no physics of dm_control"),
         (lambda path: StateProbeCallback(PixelBox(), state=position), "state and names belong together"),
         (lambda path: CuriosityMapCallback(PixelBox(), path, state=position, names=["x"]), "a map needs two"),
-        (lambda path: CuriosityMapCallback(PixelBox(), path, coordinates=("x", "z"), **MAP), "choose of x, y"),
+        (lambda path: CuriosityMapCallback(PixelBox(), path, coordinates=("x", "z"), **MAP), "two coordinates of x, y"),
     ],
 )
 def test_refused_before_training(make: Any, message: str, tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_large_cameras_are_warned_of_before_memory_is_spent(monkeypatch: pytest.
 def test_too_few_latents_are_refused(features_dim: int) -> None:
     """LayerNorm makes 0 of one number, and of two their order: all observations would look alike."""
     for make in (lambda **k: PixelEncoder(image_space(), **k), lambda **k: VectorEncoder(spaces.Box(-1, 1, (7,)), **k)):
-        with pytest.raises(ValueError, match=rf"features_dim is {features_dim}, .* use at least 3"):
+        with pytest.raises(ValueError, match=rf"features_dim={features_dim} is too small: .* Use at least 3"):
             make(features_dim=features_dim)
 
 
