@@ -1,7 +1,7 @@
 """``sb3-cure doctor``: show this machine, the choices that follow from it, and what to install.
 
-The exit status is 0 if training can work, else 1; things that are only slow are warnings. With ``--env`` it shows
-instead how often random actions meet a reward there, on which it depends whether curiosity is worth its time.
+The exit status is 0 if training can work, else 1; things that are only slow are warnings. With ``--env`` it
+instead shows how often random actions meet a reward there, which decides whether curiosity is worth its time.
 """
 
 import argparse
@@ -39,7 +39,7 @@ EXTRAS = {
     "cluster": "the same on several machines",
     "notebooks": "running the notebooks",
 }
-#: What to do, by the share of random episodes that meet a reward at most
+#: What to do, by the largest share of random episodes with a reward to which the advice applies
 ADVICE = {
     0.05: (
         "Hardly any: exploration decides. Try curiosity in bouts (--conf-file fast/best_cure). On one such task it "

@@ -22,7 +22,7 @@ class Command(NamedTuple):
     purpose: str
 
 
-#: Programs are imported when they run: that takes seconds, and their packages may be missing
+#: Programs are imported only when they run: importing takes seconds, and their packages may be missing
 COMMANDS = {
     "train": Command("sb3_cure.cli.zoo:train", "zoo", "train from a YAML file (rl-zoo3's train)"),
     "enjoy": Command("sb3_cure.cli.enjoy:enjoy", "zoo", "watch a trained agent, or only print its returns"),

@@ -46,7 +46,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - an entry ``dmc_pixels:`` of a YAML file applies to all tasks of this namespace without an entry of their own, and
       ``my_module:My-v0:`` to an environment that ``my_module`` registers;
     - in a file 1e-3 is a number, as in grids;
-    - ``env_kwargs`` of the file hold for the evaluation's environments, too;
+    - ``env_kwargs`` of the file also apply to the environments of evaluations;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
     - trainings that are started together get a folder each;

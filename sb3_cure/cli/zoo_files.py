@@ -26,7 +26,7 @@ GRIDS = ZOO / "experiments"
 def zoo_file(name: str | Path, folder: Path = ZOO) -> Path:
     """Find a YAML file.
 
-    :param name: A file of the package by its path in ``folder`` without suffix, or the path of any other with suffix
+    :param name: A file of the package, by its path in ``folder`` without suffix; or the path of another, with suffix
     :param folder: ``ZOO`` or ``GRIDS``
     :return: Path of the file; one with a suffix is returned as it is, whether it exists or not
     :raises UsageError: with the nearest names, for an unknown one
@@ -123,7 +123,7 @@ def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict
 
 
 def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Change settings; another head, reward or augmentation does not take the arguments of the one before.
+    """Change settings; another head, reward or augmentation does not inherit the arguments of the former one.
 
     :param settings: As read from a file
     :param changes: Settings that take their place
@@ -196,7 +196,7 @@ def named_classes(arguments: Mapping[str, Any]) -> dict[str, Any]:
 def named_wrappers(named: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Import the wrappers that settings name.
 
-    :param named: As of rl-zoo3's ``env_wrapper``: None, a name or class, alone or with its arguments, or a list of such
+    :param named: As for rl-zoo3's ``env_wrapper``: None, a name or class, alone or with its arguments, or a list
     :return: Wrappers and their arguments, innermost first
     :raises UsageError: as ``find_class``, for several in one mapping, or for statistics that evaluations lack
     """

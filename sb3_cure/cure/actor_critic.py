@@ -23,11 +23,11 @@ class TrunkActor(MixedPrecision, Actor):
     def get_action_dist_params(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor, dict[str, th.Tensor]]:
         """Compute mean and log standard deviation before squashing.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; for dictionaries, a tuple of these
         :return: Mean and log standard deviation, [B, action_dim] each, and an empty dictionary
         """
         latent = run_mlp(self.latent_pi, self.features_extractor(obs), self.compute_dtype)
-        # Rescaled, not clamped: a clamped log std has no gradient with which to come back.
+        # Rescaled, not clamped: a clamped log std has no gradient that could bring it back.
         log_std = th.tanh(self.log_std(latent))  # type: ignore[operator]
         log_std = LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (log_std + 1)
         return self.mu(latent), log_std, {}
@@ -35,7 +35,7 @@ class TrunkActor(MixedPrecision, Actor):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Choose actions.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; for dictionaries, a tuple of these
         :param deterministic: Whether to return the mean actions
         :return: Actions in [-1, 1], [B, action_dim]
         """
@@ -45,7 +45,7 @@ class TrunkActor(MixedPrecision, Actor):
     def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Choose actions and compute their log-probabilities.
 
-        :param obs: Trunk features of the encoder, [B, trunk_dim]; of dictionaries a tuple of such parts
+        :param obs: Trunk features of the encoder, [B, trunk_dim]; for dictionaries, a tuple of these
         :return: Actions in [-1, 1], [B, action_dim], and their log-probabilities, [B, 1]
         """
         mean, log_std, _ = self.get_action_dist_params(obs)

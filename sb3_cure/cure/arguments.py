@@ -1,6 +1,6 @@
-"""CuRe's own arguments: types, ranges and choices as one table, and what does not go together.
+"""CuRe's own arguments: types, ranges and choices as one table, and combinations that are refused.
 
-SB3's own arguments are SB3's to check.
+SB3 checks its own arguments.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ Schedule = Callable[[float], float]
 
 
 class CuReArguments(BaseModel):
-    """Types, ranges and choices; defaults are the constructor's."""
+    """Types, ranges and choices of the arguments; their defaults are in ``CuReBase``'s constructor."""
 
     model_config = ConfigDict(from_attributes=True, arbitrary_types_allowed=True)
 
@@ -60,7 +60,7 @@ def check_arguments(model: Any) -> None:
     """Refuse arguments out of their range, and combinations that would silently train something else.
 
     :param model: A CuRe model, its arguments set
-    :raises ValueError: for the first that cannot work, in one sentence
+    :raises ValueError: for the first argument or combination that cannot work, in one sentence
     """
     choose_intrinsic(model)  # refuses names and classes that are neither heads nor rewards
     try:
@@ -78,7 +78,7 @@ def check_arguments(model: Any) -> None:
 
 
 def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
-    """Choose the intrinsic reward; of ``"auto"`` the head decides.
+    """Choose the class of the intrinsic reward; with ``"auto"`` it depends on the head.
 
     :param model: A CuRe model, its arguments set
     :return: Class of the reward
@@ -93,7 +93,7 @@ def _depends_on_observation_alone(model: Any) -> bool:
 
 
 def _conflicts(model: Any) -> Iterator[str]:
-    """Combinations that must not be, each with what to do instead."""
+    """Describe each combination that is refused, and what to do instead."""
     buffer: type = model.replay_buffer_class or FrameStackReplayBuffer
     ours = issubclass(buffer, FrameStackReplayBuffer)
     separate = model.curiosity == "separate"
@@ -116,18 +116,18 @@ def _conflicts(model: Any) -> Iterator[str]:
         )
     if issubclass(buffer, NStepReplayBuffer) or (model.n_steps > 1 and not ours):
         yield (
-            f"{buffer.__name__} has no n-step returns that keep the next observation of one step, which heads and "
-            "rewards need: leave replay_buffer_class out, and set n_steps."
+            f"{buffer.__name__} cannot return n-step returns together with the observation one step later, which "
+            "heads and rewards need: leave replay_buffer_class out, and set n_steps."
         )
     if model.overlap and issubclass(buffer, HerReplayBuffer):
         yield (
-            "overlap=True updates while the environments step, when HerReplayBuffer cannot ask them for rewards: use "
-            "overlap=False."
+            "overlap=True makes updates while the environments step, and HerReplayBuffer cannot ask them for rewards "
+            "then: use overlap=False."
         )
     if model.optimize_memory_usage and not ours and issubclass(buffer, ReplayBuffer):
         yield (
             f"optimize_memory_usage=True makes {buffer.__name__} return the next episode's first observation at the "
-            "end of an episode: leave replay_buffer_class out, which keeps each frame once anyway."
+            "end of an episode: leave replay_buffer_class out, as the default buffer keeps each frame once anyway."
         )
     if not issubclass(model.policy_class, CuRePolicy):
         yield (
@@ -136,6 +136,6 @@ def _conflicts(model: Any) -> Iterator[str]:
         )
     if model.use_sde:
         yield (
-            "use_sde=True explores by noise on the features of one actor, which the shared encoder changes: leave it "
-            "out."
+            "use_sde=True explores with noise on the features of one actor, which change whenever the shared encoder "
+            "learns: leave it out."
         )

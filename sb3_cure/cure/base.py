@@ -1,4 +1,4 @@
-"""Everything of CuRe but its algorithm: arguments, set-up, environments and saving."""
+"""Everything in CuRe except its algorithm: arguments, set-up, environments and saving."""
 
 import inspect
 import warnings
@@ -39,12 +39,13 @@ class CuReBase(OffPolicyAlgorithm):
     Defaults are the paper's table of hyperparameters. Timesteps are *agent* steps, as everywhere in SB3: environment
     steps divided by the action repeat.
 
-    With ``srl=None, curiosity=None`` it is SAC or TQC with one shared encoder, which the critics alone train.
+    With ``srl=None, curiosity=None`` it is SAC or TQC with one shared encoder, trained by the critics alone.
 
     :param policy: ``"CnnPolicy"`` for images, ``"MlpPolicy"`` for vectors, ``"MultiInputPolicy"`` for dictionaries of
         both, or a subclass of ``CuRePolicy``
     :param env: Environment, vectorised environment, or Gymnasium id
-    :param learning_rate: Of everything but the temperatures; a number or a schedule of the remaining progress
+    :param learning_rate: Learning rate of everything except the temperatures; a number, or a schedule of the remaining
+        progress
     :param buffer_size: Transitions in the replay buffer
     :param learning_starts: Agent steps with uniformly random actions before learning
     :param batch_size: Transitions per update
@@ -55,47 +56,51 @@ class CuReBase(OffPolicyAlgorithm):
     :param srl: ``"rae"`` (regularised autoencoder, as SAC-AE), ``"curl"`` (contrastive, as CURL), ``"vae"``, ``"spr"``,
         ``"forward"``, ``"inverse"`` (see ``sb3_cure.srl``), a subclass of ``SRLHead``, or None
     :param srl_kwargs: Arguments of the head
-    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of SRL and of RL in
-        turn, each of ``srl_period`` gradient steps of two updates, so that after a pair of phases both have had as many
-        updates as if simultaneous
+    :param srl_schedule: ``"simultaneous"``: SRL and RL in every update; ``"alternating"``: phases of SRL and of RL take
+        turns. Each phase has ``srl_period`` gradient steps of two updates each, so that after a pair of phases both
+        have had as many updates as with ``"simultaneous"``
     :param srl_period: Gradient steps per phase when alternating
     :param srl_interval: The SRL loss trains head and encoder in every ``srl_interval``-th update. It does so in every
-        update in the burst, when alternating (in the phases of SRL), and where nothing else is learned
-    :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error of heads whose error tells
-        novelty, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
-        the latents do not hold of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
+        update during the burst (``warmup_updates``), in the SRL phases of ``"alternating"``, and where nothing else is
+        learned
+    :param intrinsic: What the curious agent is rewarded for: ``"auto"`` (the SRL error if the head's error is
+        high on novel observations, else ``"rnd"``), ``"srl_error"`` (the paper), ``"reconstruction"`` (what
+        the latents miss of the image, for any head), ``"rnd"``, ``"icm"``, ``"impact"``, ``"disagreement"``,
         ``"particle"``, ``"shuffled"`` (another reward, by default that of ``"auto"``, in a random order: a control), or
         a subclass of ``IntrinsicReward``
     :param intrinsic_kwargs: Arguments of the reward
     :param curiosity: ``"separate"``: a second actor-critic gets the intrinsic reward; ``"bonus"``: it is added to the
         task's; ``"random"``: the second actor draws a uniform action for each bout (control); None: off
     :param curiosity_prob: p_c, probability with which the second actor acts; a number in [0, 1], or a schedule
-    :param curiosity_bout: L: who acts is redrawn with probability 1/L per step, and at resets. 1: the paper's coin;
-        ``"episode"``: at resets only
+    :param curiosity_bout: L: who acts is redrawn with probability 1/L per step, and at resets. 1: a coin flip per
+        step, as in the paper; ``"episode"``: at resets only
     :param curiosity_beta: beta, factor of the intrinsic reward
     :param curiosity_gamma: Discount factor of the curious agent; 0 needs ``curiosity_target="next_observation"`` where
         the reward is the SRL error of one observation
     :param curiosity_ent_coef: Temperature of the curious agent, as ``ent_coef``; None: like ``ent_coef``
     :param curiosity_episodic: Whether the curious return ends where the episode terminates. By default it goes on with
         the first observation of the next episode: a reward of mean zero would otherwise make dying attractive wherever
-        the error is low. (Replay buffers of SB3, and subclasses of ours: with the terminal observation)
-    :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: the paper's letter
-    :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (free) or ``"next_observation"``
+        the error is low. (With SB3's replay buffers and subclasses of ours, it goes on with the terminal observation)
+    :param normalize_curiosity: Standardise the reward (see ``RewardScale``); False: exactly as in the paper
+    :param curiosity_target: Whose SRL error rewards a transition: ``"observation"`` (at no cost) or
+        ``"next_observation"``
     :param curiosity_encoder_grad: Whether the curious critics train the encoder (the paper: yes)
-    :param curious_interval: The separate curious agent and its reward learn in every ``curious_interval``-th update, or
-        in each update of the burst
+    :param curious_interval: The separate curious agent and its reward learn in every ``curious_interval``-th update,
+        and in every update of the burst
     :param task: False: a curious agent alone, which collects, acts and learns without task reward
     :param augmentation: What the encoder sees: ``"shift"``, ``"crop"``, None, or ``"auto"``: what the head needs
     :param augmentation_kwargs: Arguments of the augmentation (``pad`` of shifts, ``size`` of crops; pixels)
-    :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: what the head wants (RAE:
-        1000), or 0 where there is no warm-up or the head is frozen. With ``learning_starts=0`` the burst waits for
-        ``batch_size`` transitions. In each update of it actors, temperatures and targets learn, as in SAC-AE's code
+    :param warmup_updates: Gradient steps in one burst after ``learning_starts``; None: the head's default (RAE:
+        1000), or 0 where there is no random warm-up or the head is frozen. With ``learning_starts=0`` the burst waits
+        for ``batch_size`` transitions. In the burst, actors, temperatures and targets learn in every update, as in
+        SAC-AE's code
     :param actor_update_interval: Updates of the critics per update of actors and temperatures
     :param target_update_interval: Updates between two Polyak steps
     :param encoder_tau: Polyak rate of the target encoder
     :param update: ``"joint"`` (one encoder pass for all) or ``"sequential"`` (a pass and a step for each loss:
         Algorithm 1 to the letter), see ``EncoderUpdate``
-    :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 for images where the hardware computes it
+    :param precision: ``"auto"``, ``"fp32"`` or ``"bf16"``; auto is bf16 for images on hardware that computes
+        it natively
     :param overlap: Update while worker processes (``SubprocVecEnv``) step and render the environments: actions then
         come from a policy that is one call of ``train`` behind
     :param ent_coef: Temperature: ``"auto_<initial value>"``, ``"auto"`` or a fixed number
@@ -211,9 +216,9 @@ class CuReBase(OffPolicyAlgorithm):
         self._warmed_up = self._in_burst = False
         #: Whether encoder and head are kept as they are; it can be set at any time
         self.representation_frozen = False
-        #: What the update that runs logs
+        #: Metrics of the current update
         self._metrics: dict[str, th.Tensor] = {}
-        #: While ``learn`` runs with ``overlap=True``: the environments, which make updates as they step
+        #: While ``learn`` runs with ``overlap=True``: the environments, wrapped so that updates run while they step
         self._overlapped: OverlappedVecEnv | None = None
         self._action_repeat = 1
         #: Frames per observation, for buffers and rewards; kept in archives, as models are loaded without environments
@@ -240,11 +245,11 @@ class CuReBase(OffPolicyAlgorithm):
         if issubclass(self.replay_buffer_class, FrameStackReplayBuffer):
             if "frame_stack" in inspect.signature(self.replay_buffer_class).parameters:
                 self.replay_buffer_kwargs.setdefault("frame_stack", self._frame_stack)
-            # Else SB3's `learn` marks the newest row as done.
+            # If this were True, SB3's `learn` would mark the newest row as done.
             self.optimize_memory_usage = False
         user_kwargs, settings = self.policy_kwargs, self._policy_settings()
         if own := sorted(user_kwargs.keys() & settings.keys()):
-            raise ValueError(f"policy_kwargs has {own}, which the algorithm sets: give it its own arguments instead.")
+            raise ValueError(f"policy_kwargs has {own}, which the algorithm sets: pass these to the algorithm instead.")
         self.policy_kwargs = {**user_kwargs, **settings}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "`n_steps=")  # SB3 cannot know that our buffer has returns of n steps
@@ -259,7 +264,7 @@ class CuReBase(OffPolicyAlgorithm):
             self._set_temperature(name)
 
     def _policy_settings(self) -> dict[str, Any]:
-        """Arguments of the policy that follow from the algorithm's."""
+        """Arguments of the policy that are derived from the algorithm's."""
         rewarded = self.curiosity in ("separate", "bonus")
         return dict(
             critic_class=self.critic_class,
@@ -277,7 +282,7 @@ class CuReBase(OffPolicyAlgorithm):
         )
 
     def _set_temperature(self, name: str) -> None:
-        """Give an agent its temperature; SB3's attributes are the task's."""
+        """Give an agent its temperature; the task agent's is also in SB3's attributes."""
         agent, ent_coef = self.policy.agents[name], self.ent_coef
         if name == "curious" and self.curiosity_ent_coef is not None:
             ent_coef = self.curiosity_ent_coef
@@ -306,7 +311,8 @@ class CuReBase(OffPolicyAlgorithm):
     def get_env(self) -> VecEnv | None:
         """Get the environments.
 
-        :return: Without ``FiniteCheck``, as callbacks compare the types of training and evaluation environments
+        :return: The environments without ``FiniteCheck``, because callbacks compare the types of training and
+            evaluation environments
         """
         return self.env.venv if isinstance(self.env, FiniteCheck) else self.env
 
@@ -341,8 +347,8 @@ class CuReBase(OffPolicyAlgorithm):
         for each in nested_callbacks(initialised):
             if share_environment(getattr(each, "eval_env", None), self.env):
                 raise ValueError(
-                    f"{type(each).__name__} evaluates in the training environment, so that transitions are stored that "
-                    "never happened: give it an eval_env of its own."
+                    f"{type(each).__name__} evaluates in the training environment, which would store transitions that "
+                    "never happened: give it a separate eval_env."
                 )
         return initialised
 
@@ -356,12 +362,12 @@ class CuReBase(OffPolicyAlgorithm):
     ) -> tuple[int, BaseCallback]:
         buffer: Any = self.replay_buffer
         if isinstance(buffer, HerReplayBuffer):
-            buffer.env = self.env  # SB3 keeps the one before `set_env`
+            buffer.env = self.env  # SB3 does not update it in `set_env`
             if reset_num_timesteps or self._last_obs is None:  # the environments are reset
                 with warnings.catch_warnings(action="ignore"):
                     buffer.truncate_last_trajectory()
         total, callback = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-        # As SB3 does after each step; else the first one sees the previous call's progress.
+        # SB3 sets this after each step; without this line the first step would see the previous call's progress.
         self._current_progress_remaining = 1 - self.num_timesteps / max(total, 1)
         env: Any = self.env
         restarts_workers = getattr(env.unwrapped, "on_env_fault", None) == "restart"
@@ -370,7 +376,7 @@ class CuReBase(OffPolicyAlgorithm):
                 f"a {type(buffer).__name__} cannot leave out the steps of workers that died: use "
                 "on_env_fault='raise', or leave replay_buffer_class out."
             )
-        # SB3's own workers tell what the outermost wrapper has, which may be Gymnasium's `RepeatAction`.
+        # Gymnasium's `RepeatAction` has no `action_repeat`; wrappers of ours add it, but SB3's workers may lack them.
         known = [name for name in ("action_repeat", "num_repeats") if env.has_attr(name)]
         repeat = env.get_attr(known[0])[0] if known else 1
         self._action_repeat = repeat if isinstance(repeat, int) else 1
@@ -401,7 +407,7 @@ class CuReBase(OffPolicyAlgorithm):
 
     @property
     def _progress_remaining(self) -> float:
-        """Progress that schedules get: SB3's own is below zero if the last rollout exceeds ``total_timesteps``."""
+        """Remaining progress for schedules: SB3's own falls below zero if the last rollout exceeds the total."""
         return max(self._current_progress_remaining, 0.0)
 
     def dump_logs(self) -> None:

@@ -87,11 +87,13 @@ class FiniteGuard:
 
 @contextlib.contextmanager
 def crash_report(model: OffPolicyAlgorithm, batch: Any) -> Iterator[None]:
-    """Write the batch of a ``NonFiniteError`` next to the logs, or among temporary files, and name the folder in it.
+    """On a ``NonFiniteError``, write the batch into a folder, and name that folder in the error.
+
+    The folder lies next to the logs or, without logs, among temporary files.
 
     :param model: The model
     :param batch: Samples that it learns from within this context
-    :raises NonFiniteError: the one that was raised within
+    :raises NonFiniteError: the error that was raised within this context
     """
     try:
         yield

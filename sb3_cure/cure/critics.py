@@ -1,6 +1,6 @@
 """Critics on the latents of the shared encoder: SAC's twin Q-values and TQC's truncated quantiles.
 
-In targets, [B, K] are K values of each sample: K = 1 for SAC, the quantiles that are kept for TQC.
+Targets have the shape [B, K], with K values per sample: one for SAC, the quantiles that are kept for TQC.
 """
 
 from collections.abc import Iterable
@@ -20,7 +20,8 @@ class LatentCritic(MixedPrecision):
 
     :param features_dim: Size of the latents
     :param action_dim: Size of the actions
-    :param net_arch: Hidden layers; of ``"residual"`` the hidden units of each block, the first also their common width
+    :param net_arch: Hidden layers; for ``"residual"`` the hidden units of each block, of which the first is also the
+        width of all blocks
     :param activation_fn: Activation function
     :param n_critics: Number of critics
     :param n_values: Values that each critic returns
@@ -113,10 +114,10 @@ class TwinCritic(LatentCritic):
 class QuantileCritic(LatentCritic):
     """TQC's critics: quantiles, of which the largest are dropped from the target (Kuznetsov et al., 2020).
 
-    :param args: As of ``LatentCritic``
+    :param args: As for ``LatentCritic``
     :param n_quantiles: Quantiles of each critic
     :param top_quantiles_to_drop_per_net: Quantiles to drop for each critic
-    :param kwargs: As of ``LatentCritic``
+    :param kwargs: As for ``LatentCritic``
     :raises ValueError: if no quantile is left, or the number to drop is negative
     """
 

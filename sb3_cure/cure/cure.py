@@ -1,8 +1,8 @@
 """CuRe: curiosity-driven representations for an off-policy actor-critic (Algorithm 1 of the paper).
 
-Compare with SB3's ``sac.py``: ``_sample_action`` mixes who acts, ``_train`` samples and calls ``_update``, in which
-each update of Algorithm 1 is a method. Critics know their own mathematics (``critics.py``); ``encoder_update.py`` says
-how several losses step the encoder that they share.
+Compare with SB3's ``sac.py``: ``_sample_action`` chooses who acts; ``_train`` samples batches and calls ``_update``,
+which has a method for each update of Algorithm 1. Losses and targets of the critics are in ``critics.py``;
+``encoder_update.py`` describes how several losses train the encoder that they share.
 """
 
 import warnings
@@ -44,7 +44,7 @@ class CuRe(CuReBase):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Predict actions of the curious policy, as ``predict`` does of the task's.
+        """Predict actions of the curious policy, as ``predict`` does for the task policy.
 
         :param observation: One observation or a batch, as for ``predict``
         :param state: Unused (SB3's signature)
@@ -61,12 +61,12 @@ class CuRe(CuReBase):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Let the curious (or, as a control, a random) actor act where the mixer chooses it, else the task's."""
+        """Let the curious (or, as a control, a random) actor act where the mixer chooses it, else the task actor."""
         if self.curiosity == "random" and not self.task:  # uniform actions all the time
             learning_starts = self.num_timesteps + 1
         _, actions = super()._sample_action(learning_starts, None, n_envs)
         if self.num_timesteps < learning_starts:
-            self._mixer.forget()  # who acted in a `learn` before this one
+            self._mixer.forget()  # who acted in an earlier `learn` no longer matters
         elif self.task and self.curiosity in ("separate", "random"):
             starts: Any = self._last_episode_starts
             is_second = self._mixer.choose(starts, self.curiosity_prob, self.curiosity_bout, self._progress_remaining)
@@ -104,7 +104,7 @@ class CuRe(CuReBase):
             wanted = self._has_trainable_head and self.learning_starts > 0
             updates = get_srl_class(self.srl).warmup_updates if wanted else 0  # type: ignore[arg-type]
         elif self.learning_starts == 0 and self.replay_buffer.size() * self.n_envs < self.batch_size:  # type: ignore[union-attr]
-            return  # until there is a batch
+            return  # wait until there is a whole batch
         if updates > 0 and self.gradient_steps != 0:
             if self.verbose >= 1:
                 print(f"Making {updates} updates before the next step (warmup_updates).")
@@ -172,7 +172,7 @@ class CuRe(CuReBase):
         return batch
 
     def _plan(self) -> tuple[bool, bool, int]:
-        """Whether the next update trains the representation, whether actors and critics, and its number of batches."""
+        """Whether the next update trains the representation, whether it trains agents, and its number of batches."""
         learns_srl = self._has_trainable_head
         learns_rl = self.task or self._has_curious_agent
         if not (learns_srl and learns_rl):
@@ -205,10 +205,10 @@ class CuRe(CuReBase):
         self._metrics = {}
         rewarded = "task" if self.curiosity == "bonus" else "curious"
         srl = rewards = None
-        if rewarded in learners:  # rewards are those before the steps of head and encoder
+        if rewarded in learners:  # computed before head and encoder step
             reward: Any = policy.intrinsic
             reward_steps_encoder = reward.trains_encoder and encoder.mode == "sequential"
-            # The head's loss must see the encoder as this step leaves it.
+            # If the reward steps the encoder, the head's loss must be computed after that step.
             srl = self._srl_loss(batch) if learns_srl and not reward_steps_encoder else None
             rewards = self._intrinsic_rewards(batch, srl)
         if learns_srl:
@@ -223,7 +223,7 @@ class CuRe(CuReBase):
         return self._metrics | encoder.metrics
 
     def _views(self, batch: Samples) -> dict[str, Callable[[], Any]]:
-        """Makers of all that the encoder may see in an update: random views and, for rewards, centred ones."""
+        """Functions that make what the encoder may see in an update: random views and, for rewards, centred ones."""
         policy, n_step = self.policy, batch.n_step
         return {
             "observations": lambda: batch.views,
@@ -281,7 +281,7 @@ class CuRe(CuReBase):
         srl.after_step()
 
     def _intrinsic_rewards(self, batch: Samples, srl: SRLOutput | None) -> th.Tensor:
-        """Step the reward's own loss, and return the batch's scaled reward, [B, 1]: never stored, so never stale."""
+        """Train the reward's own networks, and return the scaled reward, [B, 1]: never stored, so never stale."""
         reward: Any = self.policy.intrinsic
         loss, raw = reward.loss(self._reward_inputs(batch, srl))
         if raw.shape != (len(batch.actions),):
@@ -315,7 +315,8 @@ class CuRe(CuReBase):
     def _update_curious(self, batch: Samples, rewards: Any) -> None:
         """UpdateCuriousAC: unless ``curiosity_episodic``, returns go on in the next episode where one terminates.
 
-        As in RND (Burda et al., 2019): a terminal observation is never acted on, so that no loss corrects its value.
+        As in RND (Burda et al., 2019). They go on from the first observation of the next episode if the buffer has it:
+        no action is ever taken in a terminal observation, so no loss would correct its value.
         """
         continues = 1 - batch.dones if self.curiosity_episodic else th.ones_like(batch.dones)
         discounts = continues * self.curiosity_gamma
@@ -358,7 +359,7 @@ class CuRe(CuReBase):
             self._note({f"{prefix}ent_coef_loss": ent_coef_loss})
 
     def _update_targets(self, learners: list[str]) -> None:
-        """Polyak steps: of the target encoder in every phase, of target critics with their critics."""
+        """Make the Polyak steps: the target encoder's in every phase, the target critics' when their critics learn."""
         policy = self.policy
         if self._is_due(self._n_batches, self.target_update_interval):
             _polyak_step(policy.encoder, policy.encoder_target, self.encoder_tau)
@@ -371,7 +372,7 @@ class CuRe(CuReBase):
         self._metrics |= {name: value.detach() for name, value in metrics.items()}
 
     def _step_with_encoder(self, source: str, name: str, loss: th.Tensor, optimizer: th.optim.Optimizer | None) -> None:
-        """Step the loss's own parameters, and give the encoder its gradient at the latents."""
+        """Step the loss's own parameters, and pass its gradient at the latents on to the encoder update."""
         self._optimize(name, loss, optimizer, self.policy.encoder_update.leaves(source))
         self.policy.encoder_update.collect(source)
 

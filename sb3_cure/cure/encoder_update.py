@@ -1,7 +1,7 @@
 """How several losses train one encoder.
 
-The SRL loss and the critics' losses all send gradients to the encoder, whose sizes differ by factors of 1e3 to 1e5. A
-plain sum under one Adam would let the critics drown the autoencoder: Adam divides by the running size of the sum.
+The SRL loss and the critics' losses all send gradients to the encoder, and their sizes differ by factors of 1e3 to 1e5.
+A plain sum under one Adam would let the critics drown the autoencoder: Adam divides by the running size of the sum.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import update_learning_rate
 from sb3_cure.networks.encoders import Encoder
 
 #: Joint updates between two measurements of each source's share, which costs a backward pass for each source. A prime,
-#: so that a source that learns in every k-th update alone is neither always nor never measured
+#: so that a source that learns only in every k-th update is neither always nor never measured
 MEASURE_INTERVAL = 101
 
 #: Takes the name of a step and the gradients that it follows; raises if one is not finite
@@ -26,8 +26,8 @@ class EncoderUpdate:
 
     A loss reads ``latents(source)``, a copy of the latents without their graph, and ``collect(source)`` takes its
     gradient there. ``"sequential"`` (Algorithm 1 of the paper) then steps at once, with an optimiser for each source.
-    ``"joint"`` steps once, in ``finish``: the gradient of each source is divided by its running root-mean-square norm,
-    for each image of a dictionary by its own, and their sum goes back through the encoder in one pass. Its learning
+    ``"joint"`` steps once, in ``finish``: the gradient of each source is divided by its running root-mean-square norm
+    (for each image of a dictionary separately), and the sum goes back through the encoder in one pass. The learning
     rate is multiplied by the square root of the number of sources of this update: Adam divides by the size of the sum,
     which for uncorrelated gradients of equal size is that root times the size of each.
 
@@ -35,7 +35,7 @@ class EncoderUpdate:
 
     :param encoder: The shared encoder; it may have no parameters
     :param target: Its moving average
-    :param sources: Names of the losses that train it, e.g. ``("srl", "task", "curious")``
+    :param sources: Names of the losses that train the encoder, e.g. ``("srl", "task", "curious")``
     :param mode: ``"sequential"`` or ``"joint"``
     :param optimizer_class: Class of the optimisers
     :param lr: Learning rate
@@ -57,7 +57,7 @@ class EncoderUpdate:
     ):
         self.encoder, self.target, self.mode, self.learning_rate = encoder, target, mode, lr
         self._parameters = list(encoder.parameters())
-        #: Parts of the latents that have a scale of their own
+        #: Parts of the latents whose gradients are scaled separately
         self._parts = list(getattr(encoder, "slices", {"": slice(None)}).values())
         self._make_optimizer = partial(optimizer_class, self._parameters, lr=lr, **optimizer_kwargs)  # type: ignore[call-arg]
         self.optimizers: dict[str, th.optim.Optimizer] = {}
@@ -85,7 +85,7 @@ class EncoderUpdate:
     def begin(self, views: Mapping[str, Callable[[], Any]], check: Check) -> None:
         """Begin an update.
 
-        :param views: Makers of the encoder's inputs by name, of which ``"observations"`` is one, [B, *view shape] each
+        :param views: Functions that make the encoder's inputs, [B, *view shape], by name; one is ``"observations"``
         :param check: Looks at gradients before each step
         """
         self._reset(views)
@@ -98,7 +98,7 @@ class EncoderUpdate:
         """Features of the trunk without their graph, which actors read.
 
         :param name: Name of the views
-        :return: [B, trunk_dim]; of dictionaries a tuple of such parts
+        :return: [B, trunk_dim]; for dictionaries, a tuple of these
         """
         if name not in self._features:
             with th.no_grad():
@@ -106,7 +106,7 @@ class EncoderUpdate:
         return self._features[name]
 
     def latents(self, source: str, name: str = "observations", graph: bool = True) -> th.Tensor:
-        """Latents for a loss: a copy in which its gradient stops, until it is collected.
+        """Latents for a loss: a copy that holds the gradient of the loss until ``collect`` takes it.
 
         :param source: Name of the loss; latents of a loss that does not train the encoder carry no gradient
         :param name: Name of the views
@@ -187,7 +187,7 @@ class EncoderUpdate:
         self._forget()
 
     def _backward(self, gradients: Sequence[dict[str, th.Tensor]], retain_graph: bool = False) -> list[th.Tensor]:
-        """Send the sums of gradients at the latents back to the encoder, and return those of its parameters."""
+        """Send the sums of gradients at the latents back to the encoder, and return its parameters' gradients."""
         for parameter in self._parameters:
             parameter.grad = None
         names = [name for name in self._latents if any(name in each for each in gradients)]
@@ -196,7 +196,7 @@ class EncoderUpdate:
         return [parameter.grad for parameter in self._parameters if parameter.grad is not None]
 
     def _measure_shares(self) -> None:
-        """Log the norm of each scaled source at the encoder's parameters, 0 without one, and its share of their sum."""
+        """Log the norm of each source's scaled gradient at the encoder's parameters (0 without one), and its share."""
         norms = {
             source: _norm(self._backward([gradients], retain_graph=True))
             for source, gradients in self._gradients.items()
@@ -214,7 +214,7 @@ class EncoderUpdate:
         self._gradients: dict[str, dict[str, th.Tensor]] = {}
 
     def _reset(self, views: Mapping[str, Callable[[], Any]]) -> None:
-        """Set the views of an update, and none after it: tensors with a graph cannot be deep-copied."""
+        """Set the views of an update; after it there are none, because tensors with a graph cannot be deep-copied."""
         self._views = {name: cache(make) for name, make in views.items()}
         self._target_latents: dict[str, th.Tensor] = {}
         self._forget()
@@ -243,7 +243,7 @@ class EncoderUpdate:
         if any(state[part].keys() != getattr(self, part).keys() for part in ("optimizers", "mean_squares")):
             if not strict:
                 return
-            # As torch's own load_state_dict; SB3's `load` takes a ValueError for an archive of an old DQN.
+            # As torch's own load_state_dict; SB3's `load` takes a ValueError as the sign of an archive of an old DQN.
             raise RuntimeError(
                 f"the saved encoder was trained by {sorted(state['mean_squares'])} with optimisers "
                 f"{sorted(state['optimizers'])}, this one by {sorted(self.mean_squares)} with "

@@ -1,4 +1,4 @@
-"""Training metrics: tensors while training, Python floats once, when ``train`` ends; pictures of reconstructions."""
+"""Training metrics, kept as tensors until ``train`` ends and then averaged, and pictures of reconstructions."""
 
 import torch as th
 from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
@@ -32,7 +32,7 @@ def means(updates: list[Metrics]) -> dict[str, float]:
 
 
 def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: int) -> None:
-    """Log pictures after the first update and then every ``RECONSTRUCTION_INTERVAL``, where loggers keep them.
+    """Log pictures after the first update and then every ``RECONSTRUCTION_INTERVAL``, if a logger keeps them.
 
     :param model: The model
     :param batch: The samples of the latest update
@@ -40,7 +40,7 @@ def log_reconstructions(model: OffPolicyAlgorithm, batch: Samples, n_updates: in
     """
     keeps = any(isinstance(output, TensorBoardOutputFormat) for output in model.logger.output_formats)
     if keeps and (model._n_updates - 1) % RECONSTRUCTION_INTERVAL < n_updates:
-        # Not asked of the environments: overlapped updates are made while these make a step.
+        # The environments cannot be asked for the frame stack: overlapped updates run while they step.
         strips = reconstruction_strips(model.policy, batch, model._frame_stack)  # type: ignore[arg-type, attr-defined]
         for key, strip in strips.items():
             name = f"srl/reconstructions_{key}" if key else "srl/reconstructions"

@@ -15,7 +15,7 @@ class CuriousMixer:
     in every other step. L = 1 is the paper's coin. A curious stretch lasts L / (1 - p_c) steps on average, unless the
     episode ends.
 
-    :param seed: Seed of the mixer's own random stream, so that runs of one seed draw alike whatever else they draw
+    :param seed: Seed of the mixer's own random stream, so that other draws in a run do not change who acts
     """
 
     def __init__(self, seed: int | None = None):
@@ -66,7 +66,7 @@ class CuriousMixer:
         """Get the actions of a random second actor: drawn where a bout begins, and held until it ends.
 
         :param sample: Draws an action
-        :return: Where it acts, [n, *action shape]
+        :return: Its actions in the environments where it acts, [n, *action shape]
         """
         for i in np.flatnonzero(self.begins):
             action = sample()
@@ -76,7 +76,7 @@ class CuriousMixer:
         return self.held[self.curious]
 
     def pop_metrics(self) -> dict[str, float]:
-        """Get what happened since the last call.
+        """Get the metrics since the last call.
 
         :return: Share of curious steps in [0, 1], and mean length of curious stretches in agent steps, by their logged
             names; empty if there were no steps
@@ -90,7 +90,7 @@ class CuriousMixer:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """Get all that the draws to come depend on.
+        """Get everything that future draws depend on.
 
         :return: Arrays and numbers by name
         """

@@ -45,7 +45,7 @@ class CuRePolicy(BasePolicy):
         ``BaseFeaturesExtractor``
     :param features_extractor_kwargs: Its arguments
     :param optimizer_class: Optimiser of all networks, ``th.optim.Adam`` by default; temperatures always use Adam
-    :param optimizer_kwargs: Its arguments but for the learning rate
+    :param optimizer_kwargs: Its arguments except the learning rate
     :param n_critics: Number of critics
     :param n_quantiles: Quantiles of each critic (TQC; 25 by default)
     :param critic_arch: ``"mlp"`` or ``"residual"``, see ``LatentCritic``
@@ -103,7 +103,7 @@ class CuRePolicy(BasePolicy):
         curiosity_encoder_grad: bool = True,
         update: str = "joint",
     ):
-        # First of all, while `locals()` has the arguments alone: `_get_constructor_parameters` returns them
+        # This comes first, while `locals()` holds only the arguments, which `_get_constructor_parameters` returns.
         arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         super().__init__(
             observation_space,
@@ -157,12 +157,12 @@ class CuRePolicy(BasePolicy):
 
     @classmethod
     def _choose_encoder(cls, observation_space: spaces.Space) -> type[BaseFeaturesExtractor]:
-        """Return the default encoder, or ``VectorEncoder`` for dictionaries without images, which act as one vector."""
+        """Return the default encoder; dictionaries without images count as one vector and get a ``VectorEncoder``."""
         is_vector = cls.default_encoder is DictEncoder and not image_spaces(observation_space)
         return VectorEncoder if is_vector else cls.default_encoder
 
     def _encoder_kwargs(self, srl_class: type[SRLHead] | None) -> dict[str, Any]:
-        """Head defaults, overridden by the user's kwargs."""
+        """Arguments of the encoder: the head's defaults, overridden by the user's."""
         kwargs = dict(self.features_extractor_kwargs)
         if srl_class is not None and issubclass(self.features_extractor_class, PixelEncoder | VectorEncoder):
             return {**srl_class.configure_encoder(self.augmentation), **kwargs}
@@ -185,7 +185,7 @@ class CuRePolicy(BasePolicy):
         with _forked_rng(self._head_seed):
             self.srl = self._build_head(srl_class, srl_kwargs)
         self.srl.bind(self.encoder_target, self.augmentation)
-        # A head may register the encoder as a part of its own; the encoder's optimiser trains it.
+        # A head may have registered the encoder as a submodule, but the encoder has its own optimiser.
         shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))
         parameters = [parameter for parameter in self.srl.parameters() if id(parameter) not in shared]
         self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None
@@ -304,10 +304,10 @@ class CuRePolicy(BasePolicy):
         return {path: each for path, each in modules.items() if each is not None and each.optimizer is not None}
 
     def set_learning_rate(self, learning_rate: float, temperature_factor: float) -> None:
-        """Set one rate for everything; those of the temperatures are a multiple of it, so that zero freezes all.
+        """Set all learning rates; the temperatures' rate is a multiple of the others', so that zero freezes everything.
 
-        :param learning_rate: Of everything but the temperatures
-        :param temperature_factor: Theirs as a multiple of it
+        :param learning_rate: Learning rate of everything except the temperatures
+        :param temperature_factor: Learning rate of the temperatures, as a multiple of ``learning_rate``
         """
         self.encoder_update.learning_rate = learning_rate
         for module in self._with_optimizer().values():
@@ -334,7 +334,7 @@ class CuRePolicy(BasePolicy):
     def sense(self, observations: Any) -> Any:
         """Join a dictionary without images to one vector; other observations stay as they are.
 
-        :param observations: As stored, [B, *shape], or a dictionary of such
+        :param observations: As stored, [B, *shape], or a dictionary of these
         :return: As encoder, head and rewards get them
         """
         if self.sensed_space is self.observation_space or not isinstance(observations, dict):
@@ -344,8 +344,8 @@ class CuRePolicy(BasePolicy):
     def prepare(self, observations: Any) -> Any:
         """Convert observations of the replay buffer to those of ``Samples``: vectors in float32, images in NHWC order.
 
-        :param observations: As stored, [B, *shape], a dictionary of such, or None
-        :return: As ``sense`` gives them; None as it is
+        :param observations: As stored, [B, *shape], a dictionary of these, or None
+        :return: As ``sense`` returns them; None stays None
         """
         return _prepared(self.sense(observations))
 
@@ -401,7 +401,7 @@ class CuRePolicy(BasePolicy):
         return self.srl is not None or (self.intrinsic is not None and self.intrinsic.measures)
 
     def error(self, batch: Samples) -> th.Tensor:
-        """Compute the noise-free error by which policies are compared: the intrinsic reward's, or else the head's.
+        """Compute the noise-free error by which policies are compared: the reward's if it has one, else the head's.
 
         :param batch: Samples whose ``views`` are the centred ones
         :return: [B]
@@ -456,7 +456,7 @@ class CuRePolicy(BasePolicy):
             self.default_agent = previous
 
     def set_training_mode(self, mode: bool) -> None:
-        """Switch layers that differ between training and evaluation; those of targets never train.
+        """Switch layers that differ between training and evaluation; targets stay in evaluation mode.
 
         :param mode: Whether to train
         """
@@ -467,7 +467,7 @@ class CuRePolicy(BasePolicy):
             set_mode(still, False)
 
     def freeze_representation(self, frozen: bool = True) -> None:
-        """Keep encoder and head as they are; the target encoder, which would follow, becomes the encoder.
+        """Keep encoder and head as they are; the target encoder becomes a copy, or it would go on moving.
 
         :param frozen: False: let them learn again
         """
@@ -496,20 +496,20 @@ class MlpPolicy(CuRePolicy):
 
 
 class MultiInputPolicy(CuRePolicy):
-    """``CuRePolicy`` for dictionaries of images and vectors; one without images acts as one vector."""
+    """``CuRePolicy`` for dictionaries of images and vectors; a dictionary without images counts as one vector."""
 
     default_encoder = DictEncoder
 
 
 def _kinds(space: spaces.Space) -> Any:
-    """Kind and shape of an observation, of dictionaries of each part in their order."""
+    """Kind and shape of an observation; for dictionaries, of each part in order."""
     if isinstance(space, spaces.Dict):
         return [f"{key}: {_kinds(part)}" for key, part in space.spaces.items()]
     return f"{'image' if is_image_space(space) else type(space).__name__} {space.shape}"
 
 
 def _prepared(observations: Any) -> Any:
-    """Images in NHWC memory order, vectors in float32; None as it is."""
+    """Images in NHWC memory order, vectors in float32; None stays None."""
     if observations is None:
         return None
     if isinstance(observations, dict):

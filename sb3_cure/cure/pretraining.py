@@ -1,7 +1,7 @@
 """Train the representation before the task.
 
-While collecting without task reward (paper, "Effect of Pretraining"), from episodes on disk, or by transfer from a
-model of another task (the paper's outlook).
+It can learn while collecting without task reward (paper, "Effect of Pretraining"), from episodes on disk, or by
+transfer from a model of another task (the paper's outlook).
 """
 
 import functools
@@ -50,17 +50,17 @@ class Pretraining(CuRe):
     def load_transitions(self, source: str | Path | Iterable[Any]) -> int:
         """Fill the replay buffer from episodes on disk, see ``sb3_cure.datasets``.
 
-        ``learn`` then begins with them and adds what it collects; ``learning_starts=0`` leaves its random warm-up out.
+        ``learn`` then begins with them and adds what it collects; ``learning_starts=0`` skips the random warm-up.
 
-        :param source: A folder of ``.npz`` files, one such file, or episodes with their attributes, such as
-            ``minari.load_dataset(...)``
+        :param source: A folder of ``.npz`` files, one such file, or episodes (objects with the attributes of
+            ``RecordedEpisode``), such as ``minari.load_dataset(...)``
         :return: Number of transitions that were added
-        :raises ValueError: if the episodes are of other observations or actions
+        :raises ValueError: if the episodes have other observations or actions than the model
         """
         if self._vec_normalize_env is not None and self._vec_normalize_env.training:
             raise ValueError(
-                "load_transitions stores what is on disk, but VecNormalize has no statistics of that: load its own "
-                "(VecNormalize.load) and set training=False, or leave it out."
+                "load_transitions stores what is on disk, but VecNormalize has no statistics of it: load saved ones "
+                "(VecNormalize.load) and set training=False, or leave VecNormalize out."
             )
         return fill(self.replay_buffer, source, self.policy.scale_action)  # type: ignore[arg-type]
 
@@ -97,7 +97,7 @@ class Pretraining(CuRe):
         return self
 
     def transfer_from(self: Self, path: str | Path, freeze: bool = False) -> Self:
-        """Begin with encoder, head and, where both models have one, the curious agent of a model of a sibling task.
+        """Start from the encoder, the head and, if both models have one, the curious agent of another task's model.
 
         The models may have different augmentations: both act on centred views.
 
@@ -170,8 +170,8 @@ class Pretraining(CuRe):
         Keeps encoder, target encoder, head and their optimisers (and the curious agent, if curiosity is on), empties
         the replay buffer and starts counting anew. If the model has a seed, the ``learn`` that follows begins with the
         same seeds of environments and random numbers as without pretraining, so that both have the same random warm-up.
-        Pretraining with ``"random"`` therefore begins with the same actions as that warm-up. Where the replay buffer is
-        kept, which would then hold these twice, random numbers go on.
+        Pretraining with ``"random"`` therefore begins with the same actions as that warm-up. If the replay buffer is
+        kept, it would then hold these transitions twice, so in that case the random numbers continue.
 
         :param total_timesteps: Agent steps
         :param collector: Who collects: ``"curious"``, a policy trained by the intrinsic reward alone (built for the
@@ -179,8 +179,8 @@ class Pretraining(CuRe):
         :param callback: SB3 callback(s)
         :param log_interval: Episodes between two dumps of the logger
         :param tb_log_name: Name of the run in TensorBoard
-        :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was taken, with the
-            arguments of before
+        :param reset_num_timesteps: False: continue the pretraining in which a loaded checkpoint was written, with
+            the same arguments as before
         :param progress_bar: Show a progress bar (needs tqdm and rich)
         :param keep_replay_buffer: Let the task learn from what was collected, too: the environment's rewards are stored
             with it
@@ -213,7 +213,7 @@ class Pretraining(CuRe):
 
     @property
     def is_pretraining(self) -> bool:
-        """Whether ``pretrain`` runs, or ran when the checkpoint was written that this model was resumed from."""
+        """Whether ``pretrain`` is running, or was running when the checkpoint of this resumed model was written."""
         return self._before_pretraining is not None
 
     def learn(

@@ -19,7 +19,7 @@ def reconstruction_strips(
 
     :param policy: The policy
     :param batch: Samples
-    :param frame_stack: Frames per observation, as of ``FrameStackReplayBuffer``
+    :param frame_stack: Frames per observation, as for ``FrameStackReplayBuffer``
     :param columns: How many observations
     :return: For each reconstructed image, by its key (``""`` if observations are images), an image uint8
         (C, 2 * H, columns * W) with C = 1 or 3

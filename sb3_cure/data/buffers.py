@@ -43,11 +43,11 @@ class FrameStackReplayBuffer(ReplayBuffer):
     :param handle_timeout_termination: Handle timeout termination (due to timelimit) separately and treat the task
         as an infinite horizon task
     :param frame_stack: Frames per observation, which cannot be inferred from the channels: by key (1 for images
-        that are not named), or one number for all (in dictionaries 1 for images whose channels it does not divide)
+        that are not named), or one number for all (in dictionaries, 1 for images whose channels it does not divide)
     :param info_shapes: What to keep of each step's ``info``, for rewards and heads of your own: shapes by key, such as
         ``{"contacts": (4,)}``; ``rows["infos/contacts"]`` has it as float32
-    :param frames_dir: Keep the frames in an unnamed file in this directory, mapped into memory, instead of in memory:
-        a million transitions of 84x84 take 22 GB. The last directory of the path is created if it is missing. The
+    :param frames_dir: Keep the frames in an unnamed, memory-mapped file in this directory instead of in memory: a
+        million transitions of 84x84 take 22 GB. The last directory of the path is created if it is missing. The
         first ``add`` reserves the room on the disk (``OSError`` if there is too little)
     """
 
@@ -117,7 +117,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the full buffer; the system commits them as it fills."""
+        """Bytes that the full buffer takes; the system provides them as it fills."""
         return sum(array.nbytes for array in self.rows.values()) + sum(ring.nbytes for ring in self.rings.values())
 
     def reset(self) -> None:
@@ -142,14 +142,14 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self._breaks = True
 
     def add(self, obs: Any, next_obs: Any, action: ndarray, reward: ndarray, done: ndarray, infos: Infos) -> None:
-        """Store copies of one transition per environment: all of it or, with any exception, nothing of it.
+        """Store copies of one transition per environment: if an exception is raised, nothing is stored.
 
-        :param obs: Observations, [n_envs, *shape], or such by key
-        :param next_obs: Successors of the same shape; of an episode's last step the terminal observation
+        :param obs: Observations, [n_envs, *shape], or these by key
+        :param next_obs: Successors of the same shape; for an episode's last step, the terminal observation
         :param action: Actions, [n_envs, ...]
         :param reward: Rewards, [n_envs]
         :param done: Whether the episode ended, [n_envs]
-        :param infos: One dictionary per environment, of which ``TimeLimit.truncated`` and ``info_shapes`` are read
+        :param infos: One dictionary per environment; ``TimeLimit.truncated`` and the keys of ``info_shapes`` are read
         :raises ValueError: If an observation has another shape, or numbers that a uint8 space cannot hold
         """
         obs, next_obs = self._checked(obs), self._checked(next_obs)
@@ -210,8 +210,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         if n_valid < 0.9 * (super().size() - 1):
             warnings.warn(
                 "Frames do not slide: fewer than 9 of 10 rows fit into the replay buffer, because "
-                f"observations are seldom frame_stack={self.frame_stack} frames of which all but the newest repeat the "
-                "ones before (give the right number in replay_buffer_kwargs=dict(frame_stack=...), by key in "
+                f"consecutive observations seldom share all but the newest of frame_stack={self.frame_stack} "
+                "frames (give the right number in replay_buffer_kwargs=dict(frame_stack=...), by key in "
                 "dictionaries), or because many episodes have fewer than 25 steps: choose a larger buffer_size.",
                 stacklevel=3,
             )
@@ -239,14 +239,14 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param rows: Row positions, [n]
         :param env_inds: Environment of each, [n]
         :param which: ``slice(1, None)`` for the successors alone
-        :return: Observations, and successors, [n, *shape] or such by key
+        :return: Observations, and successors, [n, *shape] or these by key
         :raises IndexError: If a row is empty, or its frames have been overwritten
         """
         if np.any((self.pos - 1 - rows) % self.buffer_size >= self._n_valid):
             raise IndexError(f"Only the {self._n_valid} rows before pos={self.pos} hold transitions: use sample().")
         parts: dict[str, Any] = {}
         for key in self._spaces:
-            if key in self.rings:  # of both at once
+            if key in self.rings:  # observations and successors together
                 parts[key] = self.rings[key].stacks(self.rows[f"slots/{key}"][rows, env_inds].swapaxes(0, 1)[which])
             else:
                 names = ("observations", "next_observations")[which]
@@ -256,9 +256,9 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return [dict(zip(parts, each, strict=True)) for each in zip(*parts.values(), strict=True)]
 
     def n_step(self, n_steps: int, gamma: float, env: VecNormalize | None = None) -> NStep:
-        """Returns of n steps for the batch sampled last, with the numbers of SB3's ``NStepReplayBuffer``.
+        """Compute n-step returns for the batch sampled last, with the same values as SB3's ``NStepReplayBuffer``.
 
-        A sum ends with the episode, with the newest row, and where the stored stream breaks without an end (another
+        A sum ends with the episode, with the newest row, and where the stored stream breaks within an episode (another
         ``learn()``, ``set_env``, a step that was not stored).
 
         :param n_steps: Rewards per sum, at most
@@ -266,7 +266,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param env: VecEnv to normalize the observations and rewards with
         :return: The returns on ``device``
         """
-        assert self.last_sampled is not None, "n_step is of the batch sampled last: call sample() before it"
+        assert self.last_sampled is not None, "n_step uses the batch sampled last: call sample() before it"
         rows, env_inds = self.last_sampled
         steps = np.arange(n_steps, dtype=np.float32)
         window, envs = (rows[:, None] + np.arange(n_steps)) % self.buffer_size, env_inds[:, None]
@@ -293,7 +293,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param env: VecEnv to normalize the observations with
         :return: Observations on ``device``; None if they are those of ``sample``
         """
-        assert self.last_sampled is not None, "restarts is of the batch sampled last: call sample() before it"
+        assert self.last_sampled is not None, "restarts uses the batch sampled last: call sample() before it"
         rows, env_inds = self.last_sampled
         terminated = self.dones[rows, env_inds] * (1 - self.timeouts[rows, env_inds]) > 0
         terminated &= rows != (self.pos - 1) % self.buffer_size
@@ -319,10 +319,10 @@ class FrameStackReplayBuffer(ReplayBuffer):
         return {"size": self.buffer_size, "n_envs": self.n_envs, "counters": counters, "arrays": arrays}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over the state of another buffer; frames that are not among its arrays are left to be written.
+        """Take over the state of another buffer; frames that are not among its arrays must be filled in later.
 
         :param state: From ``state_dict`` of a buffer with equal arguments
-        :raises ValueError: If it is of another buffer
+        :raises ValueError: If the state does not fit this buffer
         """
         self.reset()
         vars(self).update({name: state["counters"][name] for name in _COUNTERS})
@@ -364,7 +364,7 @@ def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
     """
     size = buffer.size()
     if buffer.full and buffer.optimize_memory_usage:
-        size -= 1  # the oldest one's observation is the newest one's successor now
+        size -= 1  # the newest one's successor has replaced the oldest one's observation
     ages, env_inds = np.divmod(np.arange(size * buffer.n_envs), buffer.n_envs)
     return (buffer.pos - 1 - ages) % buffer.buffer_size, env_inds, ages
 
@@ -372,7 +372,7 @@ def stored_places(buffer: ReplayBuffer) -> tuple[ndarray, ndarray, ndarray]:
 def transitions(
     buffer: ReplayBuffer, rows: ndarray, env_inds: ndarray, env: VecNormalize | None = None
 ) -> ReplayBufferSamples:
-    """Look up transitions by their place, where ``sample`` draws them.
+    """Look up the transitions at given places, as ``sample`` does for places that it draws.
 
     :param buffer: SB3's ``ReplayBuffer``, ``DictReplayBuffer`` or a ``FrameStackReplayBuffer``
     :param rows: Row positions in [0, buffer_size): the row that ``add`` wrote when ``pos`` had this value, [n]
@@ -386,7 +386,7 @@ def transitions(
         obs, next_obs = buffer.observations_at(*inds)
     else:
         obs = rows_of(buffer.observations, inds)
-        if buffer.optimize_memory_usage:  # SB3's: the next row's
+        if buffer.optimize_memory_usage:  # SB3 keeps it as the next row's observation
             next_obs = rows_of(buffer.observations, ((rows + 1) % buffer.buffer_size, env_inds))
         else:
             next_obs = rows_of(buffer.next_observations, inds)
@@ -403,7 +403,7 @@ def transitions(
 
 
 def _to_torch(buffer: ReplayBuffer, array: Any) -> Any:
-    """Fresh arrays, or a dictionary of such, on the buffer's device; they need no copy."""
+    """Move fresh arrays, or a dictionary of these, to the buffer's device; being fresh, they need no copy."""
     if isinstance(array, dict):
         return {key: _to_torch(buffer, part) for key, part in array.items()}
     return buffer.to_torch(array, copy=False)
@@ -424,12 +424,12 @@ def stacks_by_key(space: spaces.Space, frame_stack: int | Mapping[str, int]) -> 
 
 
 def frame_stacks(model: OffPolicyAlgorithm) -> dict[str, int]:
-    """Frames per observation of each image: what the replay buffer is told or, without that, what environments say.
+    """Frames per observation of each image: the replay buffer's setting or, without it, what the environments say.
 
     :param model: A model
     :return: Frames by the keys of ``image_spaces``
     """
-    known = getattr(model, "_frame_stack", None)  # of our models, also without environments
+    known = getattr(model, "_frame_stack", None)  # our models keep it, even without environments
     told = known or model.replay_buffer_kwargs.get("frame_stack")
     return stacks_by_key(model.observation_space, told or infer_frame_stack(model.env))
 
@@ -438,12 +438,12 @@ def infer_frame_stack(env: VecEnv | None) -> int:
     """Frames per observation, as SB3's ``VecFrameStack`` or the attribute ``frame_stack`` of the environments says.
 
     :param env: Environments, channels first, or None
-    :return: The number; 1 where nothing says it, or the channels are no multiple of it
+    :return: The number; 1 if nothing says it, or if the channels are not a multiple of it
     """
     if env is None:
         return 1
     if (stacked := unwrap_vec_wrapper(env, VecFrameStack)) is not None:
-        return stacked.stacked_obs.n_stack  # these slide, whatever the environments in it stack
+        return stacked.stacked_obs.n_stack  # it slides these, whatever the environments inside stack
     frame_stack: Any = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else 1
     shape = env.observation_space.shape or ()
     fits = isinstance(frame_stack, int) and frame_stack > 0 and (len(shape) != 3 or shape[0] % frame_stack == 0)

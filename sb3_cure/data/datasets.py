@@ -1,4 +1,4 @@
-"""Episodes on disk: of an expert, of another agent, of a robot that was steered by hand.
+"""Episodes on disk, recorded from an expert, from another agent, or from a robot that was steered by hand.
 
 An episode of T steps is one ``.npz`` file of five arrays, named and shaped as Minari's ``EpisodeData``:
 ``observations`` [T + 1, ...] (one array per key of a dictionary, ``observations/<key>``), ``actions`` [T, ...],
@@ -30,7 +30,7 @@ Arrays = Any
 class RecordedEpisode(NamedTuple):
     """An episode of T steps; anything with these attributes is read as well, such as Minari's ``EpisodeData``.
 
-    :param observations: [T + 1, ...], or a dictionary of such arrays
+    :param observations: [T + 1, ...], or a dictionary of these
     :param actions: In the bounds of the action space, [T, ...]
     :param rewards: [T]
     :param terminations: [T]
@@ -45,7 +45,7 @@ class RecordedEpisode(NamedTuple):
 
 
 def save_episode(path: str | Path, episode: RecordedEpisode) -> None:
-    """Write an episode to a file, which is there when all of it is written.
+    """Write an episode to a file, which appears only once it is complete.
 
     :param path: The ``.npz`` file to write
     :param episode: The episode
@@ -102,8 +102,8 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self._observations: list[Any] = []
         self._steps: list[Any] = []
-        # Names sort in the order of recording, and differ between environments. A resumed run writes the episodes that
-        # it plays again over those of before.
+        # Names sort in the order of recording, and differ between environments. A resumed run overwrites
+        # the episodes that it plays again.
         self._number, self._token = len(list(Path(folder).glob("*.npz"))), uuid.uuid4().hex[:8]
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -148,12 +148,12 @@ class RecordEpisodes(gym.Wrapper, RecordConstructorArgs):
 def fill(
     buffer: ReplayBuffer, source: str | Path | Iterable[Any], scale_action: Callable[[np.ndarray], np.ndarray]
 ) -> int:
-    """Add episodes to a replay buffer as if they had been collected, those of several environments side by side.
+    """Add episodes to a replay buffer as if its environments had collected them, side by side.
 
-    Where no episode is left for an environment, it goes on with the first ones again until the others have ended.
+    An environment for which no episode is left repeats the first episodes until the others have finished theirs.
 
     :param buffer: A replay buffer
-    :param source: As of ``episodes_of``
+    :param source: As for ``episodes_of``
     :param scale_action: Scales actions to [-1, 1], as they are stored
     :return: Number of transitions in the episodes
     :raises ValueError: If episodes do not fit the spaces
@@ -189,8 +189,8 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
         lengths |= {name or "observations": len(each) - 1 for name, each in by_key(observations).items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(
-                "an episode of T steps has T actions, rewards, terminations and truncations, T + 1 observations, but "
-                f"one has for T {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
+                "an episode of T steps has T actions, rewards, terminations and truncations, and T + 1 observations, "
+                f"but in one T is {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
             )
         actions = scale_action(np.asarray(episode.actions))
         if actions.shape[1:] != buffer.action_space.shape or not (np.abs(actions) <= 1 + 1e-6).all():

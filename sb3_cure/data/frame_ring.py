@@ -51,7 +51,7 @@ class FrameRing:
         return self.capacity * math.prod(self.frame_shape)
 
     def reserve(self) -> None:
-        """Make the file for the frames, if there is to be one; it ends with the ring."""
+        """Make the file for the frames, if there is to be one; it is gone when the ring is."""
         if len(self.frames) > 0:
             return
         assert self.frames_dir is not None
@@ -93,7 +93,7 @@ class FrameRing:
         return slots, continues, count
 
     def _put(self, frames: ndarray, count: int) -> tuple[list[int], int]:
-        """Store frames, of which those that repeat the one before (as after a reset) are stored once."""
+        """Store frames; one that repeats the frame before it (as after a reset) is not stored again."""
         slots: list[int] = []
         for i, frame in enumerate(frames):
             if i == 0 or not np.array_equal(frame, frames[i - 1]):

@@ -8,7 +8,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 
-#: [B, *shape], or such by key
+#: [B, *shape], or these by key
 Observations = th.Tensor | dict[str, th.Tensor]
 
 
@@ -32,7 +32,7 @@ def images_of(observations: Any, space: spaces.Space) -> dict[str, Any]:
 
 
 def check_images(observations: Any, space: spaces.Space) -> None:
-    """Refuse images that networks would scale in another way than those of the replay buffer, which are uint8.
+    """Refuse images that are not uint8: networks would not scale them like those of the replay buffer.
 
     :param observations: Tensor, or a dictionary of tensors
     :param space: Their space
@@ -56,7 +56,7 @@ def stacked(observations: Sequence[Any]) -> Any:
     """Stack observations along a new first axis.
 
     :param observations: n observations
-    :return: [n, *shape], or a dictionary of such
+    :return: [n, *shape], or a dictionary of these
     """
     first = observations[0]
     if isinstance(first, dict):
@@ -67,7 +67,7 @@ def stacked(observations: Sequence[Any]) -> Any:
 def rows_of(observations: Any, rows: Any) -> Any:
     """Index observations along their first axis.
 
-    :param observations: [n, *shape], or a dictionary of such
+    :param observations: [n, *shape], or a dictionary of these
     :param rows: An index, a slice or a mask
     :return: These rows, as a dictionary if the observations are one
     """
@@ -79,7 +79,7 @@ def rows_of(observations: Any, rows: Any) -> Any:
 def first_not_finite(observations: Any) -> tuple[int, str, float] | None:
     """Find the first number that is not finite in float32, in which numbers are stored and networks compute.
 
-    :param observations: [n, *shape], or a dictionary of such
+    :param observations: [n, *shape], or a dictionary of these
     :return: Its place along the first axis, its key or ``""``, and the number; None if all are finite
     """
     for key, part in by_key(observations).items():

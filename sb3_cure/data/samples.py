@@ -9,7 +9,7 @@ class NStep(NamedTuple):
     """Returns of n steps for the transitions of a batch, under the names that ``Samples`` has for one step.
 
     :param rewards: Discounted sum of n rewards, fewer where the episode or the stored stream ends, float32 [B, 1]
-    :param next_observations: What the agent saw after these, [B, *shape]
+    :param next_observations: What the agent saw after these rewards, [B, *shape]
     :param dones: 1 where the episode terminated there, 0 elsewhere, timeouts included, float32 [B, 1]
     :param discounts: gamma to the power of the number of rewards, float32 [B, 1]
     """

@@ -29,8 +29,8 @@ class Background:
         each episode, cut to a square
     :param physics: The physics of a dm_control environment
     :param size: Height and width of frames in pixels
-    :param seed: Of what is drawn, until an episode begins with another; apart from the task's random numbers, which are
-        the same with every background
+    :param seed: Seed of the backgrounds, until an episode begins with another one. The task's random numbers are
+        separate, and the same with every background
     :raises ValueError: if it is neither ``"noise"`` nor a folder with images
     """
 
@@ -54,7 +54,7 @@ class Background:
     def begin(self, seed: Seed) -> None:
         """Draw what is seen behind an episode.
 
-        :param seed: As of ``reset``
+        :param seed: As for ``reset``
         """
         if seed is not None:
             self.rng = np.random.default_rng(seed)

@@ -71,7 +71,7 @@ class SumRewards(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class TaskReward(gym.Wrapper[Any, Any, Any, Any]):
-    """Puts the task's reward into ``info[TASK_REWARD]``, whatever wrappers within make of it, or pays it.
+    """Puts the task's reward into ``info[TASK_REWARD]``, whatever inner wrappers turn it into, and may return it.
 
     :param env: Wrappers of any kind around ``task``
     :param task: The environment that gives the task's reward
@@ -88,7 +88,7 @@ class TaskReward(gym.Wrapper[Any, Any, Any, Any]):
         :param action: The action
         :return: What the environment returns, with the task's reward in the info
         """
-        self.task.take_sum()  # of steps that wrappers make while they reset
+        self.task.take_sum()  # discards those of steps that wrappers make while they reset
         observation, reward, terminated, truncated, info = self.env.step(action)
         met = self.task.take_sum()
         return observation, met if self.pays else reward, terminated, truncated, {**info, TASK_REWARD: met}
@@ -100,8 +100,8 @@ class CountReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):
     Counts of Strehl and Littman (2008), MBIE-EB. They start with the environment and continue over its episodes and
     through exact resume. Each environment counts for itself.
 
-    :param env: As of ``CellInfo``
-    :param widths: As of ``CellInfo``
+    :param env: As for ``CellInfo``
+    :param widths: As for ``CellInfo``
     """
 
     def __init__(self, env: gym.Env, widths: Mapping[str, float]) -> None:

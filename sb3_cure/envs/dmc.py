@@ -127,7 +127,7 @@ class DMCPixels(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
         return seen if self._joints is None else {**seen, "proprioception": self._joints()}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copies make cameras of their own with their first frame."""
+        """Leave out the cameras: a copy makes its own with its first frame."""
         return {**self.__dict__, "_cameras": {}}
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ def make_dmc_env(
     [-1, 1]. Episodes last 1000 environment steps and end by truncation. ``unwrapped`` is shimmy's
     ``DmControlCompatibilityV0``.
 
-    With ``cameras`` or ``proprioception`` observations are dictionaries, for ``"MultiInputPolicy"``: such images under
+    With ``cameras`` or ``proprioception`` observations are dictionaries, for ``"MultiInputPolicy"``: these images under
     ``"image"``, or ``"camera0"``, ``"camera1"``, ... (by their indices), and the robot's own joints under
     ``"proprioception"``.
 
@@ -250,10 +250,10 @@ def _make_shimmy_env(domain: str, task: str, seed: int | None, **kwargs: Any) ->
     )
     base: Any = env.unwrapped
     base.np_random = np.random.RandomState(seed)
-    # Its own observations, which nobody sees, would be computed in every step: a tenth of cartpole's time at 36 px.
+    # Otherwise the task's own observations, which nobody sees, cost a tenth of cartpole's time at 36 px.
     base.task.get_observation = _no_observation
     base.observation_space = spaces.Dict()
-    # shimmy's own, shared by all of its environments, has other modes and control_timestep x 1000 for its rate.
+    # shimmy's metadata, shared by all its environments, has other modes, and control_timestep x 1000 as the rate.
     base.metadata = {"render_modes": ["rgb_array"], "render_fps": 1 / base.control_timestep()}
     return env
 

@@ -73,7 +73,7 @@ def physics_state_names(env: gym.Env) -> list[str]:
 def physics_state_units(env: gym.Env) -> list[str]:
     """Give the unit of each coordinate of ``physics_state``.
 
-    :param env: As of ``physics_state_names``
+    :param env: As for ``physics_state_names``
     :return: Unit of each coordinate: ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"``, or ``""`` for parts of quaternions
     :raises ValueError: if the environment is not one of dm_control
     """
@@ -85,7 +85,7 @@ def physics_state(env: gym.Env) -> np.ndarray:
 
     Angles of joints that can turn all around are wrapped to (-pi, pi].
 
-    :param env: As of ``physics_state_names``
+    :param env: As for ``physics_state_names``
     :return: A copy, float64 [d], in the order of ``physics_state_names``
     :raises ValueError: if the environment is not one of dm_control
     """
@@ -105,7 +105,7 @@ class Proprioception:
     ``rooty``, ``rootz``) are left out. Slides are in metres, hinges in radians, or as cosine and sine where
     they turn all around; velocities are in metres or radians per second.
 
-    :param env: As of ``physics_state_names``
+    :param env: As for ``physics_state_names``
     :raises ValueError: if the environment is not one of dm_control
     """
 
@@ -143,7 +143,7 @@ def _is_own(model: Any, joint: int) -> bool:
 def map_coordinates(names: Sequence[str], chosen: Sequence[str] | None = None) -> tuple[str, str]:
     """Return the two coordinates of a map.
 
-    :param names: Names of the state's coordinates, as of ``physics_state_names``
+    :param names: Names of the state's coordinates, as for ``physics_state_names``
     :param chosen: The two to show; by default those that show best what a task is about, else the first two
     :return: Their names
     :raises ValueError: unless they are two of the names
@@ -213,7 +213,7 @@ def load_integration_state(control: Any, state: dict[str, Any]) -> None:
     physics.set_state(state["physics"], int(mujoco.mjtState.mjSTATE_INTEGRATION))
     # dm_control ends a step with this, and the next begins in the middle of one; it leaves the warm start alone.
     mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
-    physics.data.sensordata[:] = state["sensors"]  # those of forces are measured in the other half
+    physics.data.sensordata[:] = state["sensors"]  # mj_step1 leaves out the sensors of forces
     vars(task).update(copy.deepcopy(state["task"]))
     task.random.set_state(state["random"])
     control._step_count = state["step_count"]

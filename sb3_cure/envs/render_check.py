@@ -16,7 +16,7 @@ import torch as th
 from sb3_cure.envs.dmc import make_dmc_env
 from sb3_cure.envs.rendering import check_gl
 
-#: What Mesa's renderers that compute on the CPU call themselves
+#: Names of Mesa's renderers that compute on the CPU
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "lavapipe")
 NVIDIA_GL = (
     "install the EGL library of NVIDIA's driver (Debian: `apt-get install libegl-nvidia0`, Ubuntu: `apt-get install "
@@ -28,7 +28,7 @@ MESA_GL = (
 )
 #: Vendors, by their PCI numbers, whose GPUs Mesa draws with
 MESA_VENDORS = {"0x1002": "AMD", "0x8086": "Intel"}
-#: Where Linux lists what can draw
+#: Where Linux lists graphics devices
 DRM = Path("/sys/class/drm")
 TIMEOUT_SECONDS = 180
 

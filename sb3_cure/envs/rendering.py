@@ -112,21 +112,21 @@ def mujoco_renderer_of(env: gym.Env) -> Any:
     """Look for what draws Gymnasium's MuJoCo environments.
 
     :param env: Any environment
-    :return: Its ``MujocoRenderer``, or None. Of the mazes of Gymnasium-Robotics it belongs to an environment inside
+    :return: Its ``MujocoRenderer``, or None. In the mazes of Gymnasium-Robotics it belongs to an environment inside
     """
     base: Any = env.unwrapped
     inner = getattr(base, "point_env", None) or getattr(base, "ant_env", base)
     return getattr(inner.unwrapped, "mujoco_renderer", None)
 
 
-#: Renderers of environments that were dropped without being closed, which is also done in the middle of a frame
+#: Renderers of environments that were dropped without being closed, which may happen in the middle of a frame
 _dropped: list[Any] = []
 #: Viewers that only another thread could free
 _lost: list[Any] = []
 
 
 def free_when_dropped(env: gym.Env) -> None:
-    """Let what an environment's ``MujocoRenderer`` draws with be freed before the next frame after it is dropped.
+    """Once an environment is dropped, free what its ``MujocoRenderer`` draws with before the next frame.
 
     :param env: Any environment
     """
@@ -175,7 +175,7 @@ def render_in_own_context(env: gym.Env) -> Any:
 
 
 def _forget_context_of_dm_control() -> None:
-    """Let dm_control make its own current again: it remembers which one is, and does not notice other libraries."""
+    """Let dm_control make its context current again: it does not notice when another library makes its own current."""
     if (dm_control := sys.modules.get("dm_control._render.base")) is not None:
         last = dm_control._CURRENT_CONTEXT_FOR_THREAD.pop(threading.current_thread(), None)
         dm_control._CURRENT_THREAD_FOR_CONTEXT.pop(last, None)

@@ -1,4 +1,4 @@
-"""Refuse spaces that would be read as something else without a word, such as images as vectors."""
+"""Refuse spaces that would silently be read as something else, such as images as vectors."""
 
 import numpy as np
 from gymnasium import spaces
@@ -45,8 +45,8 @@ def check_action_space(space: spaces.Space) -> None:
         )
     if not ((space.low > -UNBOUNDED) & (space.high < UNBOUNDED) & (space.low < space.high)).all():
         raise ValueError(
-            f"actions are {space}, where some have no bounds, or but one value: wrap the environment in "
-            "NormalizeActions of sb3_cure.envs, which takes these for actions in [-1, 1], or holds them."
+            f"actions are {space}, where some have no bounds, or only one value: wrap the environment in "
+            "NormalizeActions of sb3_cure.envs, which takes [-1, 1] for the former, and holds the latter."
         )
 
 

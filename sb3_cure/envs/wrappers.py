@@ -1,4 +1,4 @@
-"""Wrappers from an environment that can render itself, or returns images, to one that an agent sees through pixels."""
+"""Wrappers that turn an environment which renders itself or returns images into one seen through pixels."""
 
 import copy
 from collections import deque
@@ -45,7 +45,7 @@ def _is_positive_integer(value: Any) -> bool:
 
 
 def to_image(frame: np.ndarray, image_size: int, grayscale: bool = False) -> np.ndarray:
-    """Make an observation of a rendered frame.
+    """Make an observation from a rendered frame.
 
     :param frame: uint8 [height, width, 3]
     :param image_size: Height and width of the observation
@@ -82,7 +82,7 @@ def draw_fast(env: gym.Env, image_size: int) -> None:
     if renderer is None:
         raise ValueError(f"renderer='fast' is for Gymnasium's MuJoCo environments, which {env} is not: use 'env'.")
     choose_backend()
-    free_mujoco_contexts(renderer)  # All of this takes effect when the next frame makes a new one.
+    free_mujoco_contexts(renderer)  # What follows takes effect when the next frame makes new ones.
     visual, size = renderer.model.vis, OVERSAMPLING * image_size
     visual.quality.shadowsize = visual.quality.offsamples = 0
     renderer.model.mat_reflectance[:] = 0
@@ -113,7 +113,7 @@ class NormalizeActions(gym.ActionWrapper[Any, np.ndarray, np.ndarray], RecordCon
         has_low, has_high = low > -UNBOUNDED, high < UNBOUNDED
         low = np.where(has_low, low, np.where(has_high, high - 2.0, -1.0))
         high = np.where(has_high, high, low + 2.0)
-        # As centre and half width, symmetric bounds of 1 leave each action bit-equal.
+        # Scaled by centre and half width: bounds of -1 and 1 then leave each action bit-equal.
         self._center, self._half_width = (high + low) / 2, (high - low) / 2
         self.action_space = spaces.Box(-1.0, 1.0, bounds.shape, np.float32)
 
@@ -230,7 +230,7 @@ class PixelObservation(gym.ObservationWrapper[np.ndarray, Any, Any], RecordConst
 class ResizeImages(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Averages areas of images, so that networks and replay buffer need less memory.
 
-    Images are uint8, with the channels first or last, which stays as it is. Of dictionaries the images are resized.
+    Images are uint8, with the channels first or last, which stays as it is. In dictionaries, only images are resized.
 
     :param env: An environment whose observations are an image, or a dictionary with images
     :param image_size: New height and width in pixels, one number or two
@@ -288,8 +288,8 @@ def channel_axis(shape: tuple[int, ...]) -> int:
 class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Joins the last observations along their first axis, oldest first.
 
-    Images with the channels last (as in SB3, the smallest dimension) are joined along the last axis. Of dictionaries
-    the images are stacked; the rest stays as it is.
+    Images with the channels last (as in SB3, the smallest dimension) are joined along the last axis. In dictionaries,
+    only images are stacked; the rest stays as it is.
 
     :param env: An environment whose observations are arrays, such as images, or dictionaries with images
     :param frame_stack: Number of observations in a stack
@@ -363,7 +363,7 @@ def make_pixel_env(
     renderer: str = "env",
     source: str = "render",
 ) -> gym.Env:
-    """Make a Gymnasium environment one that an agent sees through small, stacked images.
+    """Turn a Gymnasium environment into one that an agent sees through small, stacked images.
 
     With ``source="render"`` observations are uint8 of shape (channels x frame_stack, image_size, image_size), oldest
     frame first, of what the environment renders, once per agent step; its own observations are dropped. With

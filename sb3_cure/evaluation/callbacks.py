@@ -1,7 +1,7 @@
 """Callbacks for ``learn``: evaluation, videos, pictures and warnings.
 
 All work with any SB3 algorithm (``DiagnosticsCallback``, ``ReconstructionCallback``: any off-policy one); SRL errors
-are those of the head or of a reward that draws, and without either there are none.
+are those of the head or of a reward that reconstructs; without either there are none.
 """
 
 import contextlib
@@ -54,7 +54,7 @@ __all__ = [
 
 #: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
 PRINTED_NAME = 33
-#: Most rows of a picture of reconstructions; further times are left out evenly
+#: Most rows of a picture of reconstructions; if there are more, rows are left out evenly
 MAX_ROWS = 12
 
 
@@ -172,7 +172,7 @@ class RolloutCallback(PeriodicCallback):
         return run_episodes(self.model, self.eval_env, self.n_episodes, actor, **arguments)
 
     def _log(self, values: dict[str, float]) -> None:
-        """Log what was measured in a row of its own, as SB3 writes none between two episodes."""
+        """Log what was measured in a row of its own, because SB3 writes no row between two episodes."""
         for name, value in values.items():
             is_long = len(name.partition("/")[2]) > PRINTED_NAME
             self.logger.record(name, value, exclude=("stdout", "log") if is_long else ())
@@ -229,7 +229,7 @@ class EvalBothCallback(RolloutCallback):
 class PolicyVideoCallback(RolloutCallback):
     """Film an episode of each policy: ``<actor>_policy_<steps>_steps.mp4``, steps being agent steps of training.
 
-    Below the camera's picture stand the return so far and, if the model measures one, the SRL error of the
+    Below the camera's picture are the return so far and, if the model measures one, the SRL error of the
     observation as a number and as a curve.
 
     :param eval_env: One (not vectorised) environment made with ``render_mode="rgb_array"``, not the training one
@@ -265,7 +265,7 @@ class ReconstructionCallback(PeriodicCallback):
 
     Each image of dictionaries has a picture ``reconstructions_<key>.png``. If neither head nor intrinsic reward
     reconstructs, and for SB3's own off-policy algorithms, a new decoder is fitted to latents of the replay buffer for
-    each row, from which the agent does not learn. The file is rewritten with each row.
+    each row; the agent does not learn from it. The file is rewritten with each row.
 
     :param folder: Where to write
     :param every: Agent steps between two rows
@@ -354,7 +354,7 @@ class ReconstructionCallback(PeriodicCallback):
         return "What a decoder fitted afterwards draws from the latents", seen, drawn
 
     def _sample(self, n: int) -> Any:
-        """Draw random observations of the replay buffer, [n, *shape] or such by key, normalized."""
+        """Draw random observations of the replay buffer, [n, *shape] or these by key, normalized."""
         buffer: Any = self.model.replay_buffer  # type: ignore[attr-defined]
         return buffer.sample(n, env=self.model.get_vec_normalize_env()).observations
 

@@ -1,4 +1,4 @@
-"""Decoders fitted afterwards to the latents of a frozen encoder, to see what these hold of the image."""
+"""Decoders fitted afterwards to the latents of a frozen encoder, to see how much of the image they hold."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ def fit_decoder(model: BaseAlgorithm, sample: Callable[[int], Any], updates: int
     """Fit a decoder of the encoder's inputs to its latents; the encoder is not trained.
 
     :param model: A model of any SB3 algorithm that learns from images with an encoder (``encoder_of``)
-    :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W] or such by key, on the
+    :param sample: Function of a number n that returns as many observations, uint8 [n, C, H, W] or these by key, on the
         model's device
     :param updates: Updates of the decoder, of 64 observations each
     :param key: Key of the image to reconstruct, if observations are dictionaries
@@ -48,7 +48,7 @@ def draw_latents(
 
     :param model: The model that makes the latents
     :param decoder: Its decoder, of ``fit_decoder``
-    :param observations: Observations as stored, 0-255, [B, C, H, W] or such by key
+    :param observations: Observations as stored, 0-255, [B, C, H, W] or these by key
     :param key: As for ``fit_decoder``
     :return: What the encoder sees of them (a crop, say) and its reconstruction, both 0-255, [B, C, h, w]
     """

@@ -14,7 +14,7 @@ from sb3_cure.evaluation.rollouts import trained_actors
 class DeterministicActor(nn.Module):
     """The deterministic policy of a model, from a batch of observations to actions of the environment.
 
-    Computes what ``predict(observation, deterministic=True)`` does without random numbers and branches, so that
+    Computes the same as ``predict(observation, deterministic=True)``, without random numbers and branches, so that
     ``torch.onnx.export``, ``torch.export`` and ``torch.jit.trace`` can follow it. It shares the model's networks, and
     changes with them in further training.
 

@@ -19,10 +19,10 @@ from sb3_cure.srl import RAE, DictHead
 
 #: Observations of the replay buffer that are looked at
 SAMPLES = 128
-#: Updates before networks, temperatures and the curious reward are judged: in the first hundreds latents may collapse
-#: and recover
+#: Updates before networks, temperatures and the curious reward are judged: in the first few hundred, latents may
+#: collapse and recover
 MIN_UPDATES = 2000
-#: Updates before an autoencoder is judged: before a few thousand it is no better than the mean image, also in good
+#: Updates before an autoencoder is judged: before a few thousand it is no better than the mean image, even in good
 #: runs
 AUTOENCODER_UPDATES = 5000
 #: Least and greatest temperature that can still weigh entropy against reward

@@ -10,14 +10,14 @@ from stable_baselines3.common.policies import BaseModel, BasePolicy
 
 from sb3_cure.cure.policies import CuRePolicy
 
-#: Parts of a policy that may own the features extractor, the one that trains it first
+#: Parts of a policy that may own the features extractor, starting with the part that trains it
 _OWNERS = ("critic", "q_net", "quantile_net", "actor")
 
 
 def encoder_of(policy: BasePolicy) -> Callable[[th.Tensor], th.Tensor] | None:
     """Find the encoder of a policy of any SB3 algorithm.
 
-    Of other policies than ``CuRePolicy`` it is the features extractor of the critic, else of DQN's networks, of the
+    In policies other than ``CuRePolicy`` it is the features extractor of the critic, else of DQN's networks, of the
     actor, or of the policy itself (PPO, A2C).
 
     :param policy: A policy
@@ -32,7 +32,7 @@ def encoder_of(policy: BasePolicy) -> Callable[[th.Tensor], th.Tensor] | None:
     for owner in owners:
         extractor = getattr(owner, "features_extractor", None)
         if extractor is not None:
-            # BaseModel's, as an actor-critic's own returns features of both where these are not shared.
+            # BaseModel's method: an actor-critic's own returns two sets of features where extractors are not shared.
             encode = functools.partial(BaseModel.extract_features, owner, features_extractor=extractor)
             return encode if any(True for _ in extractor.parameters()) else None
     return None

@@ -31,12 +31,12 @@ COLORS = {
     **{"curl": "#2ca02c", "drq": "#ff7f0e", "per_pixel": "#9467bd", "oracle": "#8c564b"},
 }
 _BASELINE_COLOR = "#222222"
-#: Of lines across, the same in all pictures
+#: Dashes of horizontal lines, the same in all pictures
 _DASHES = {"always drawing grey": "--", "always drawing the mean image": ":"}
 #: Colours of other arms
 _ARM_COLORS = ["#2ca02c", "#ff7f0e", "#9467bd", "#17becf", "#e377c2", "#8c564b", "#bcbd22"]
 _ARM_COLORS += ["#12126b", "#f5b7a5", "#0b4f2a", "#a6cee3"]
-#: By colour, so that policies differ in print, too
+#: Markers and dashes by colour, so that policies also differ in black and white
 _LOOKS = {COLORS["random"]: {"marker": "s", "linestyle": "--"}, COLORS["curious"]: {"marker": "^"}}
 
 #: By title of a panel: values to compare with, one or several, by name

@@ -21,7 +21,7 @@ _DEPENDENCIES = ("stable_baselines3", "sb3_contrib", "torch", "numpy", "gymnasiu
 
 
 def describe_run() -> dict[str, Any]:
-    """Describe what makes a result.
+    """Describe the conditions under which a result is made.
 
     :return: Versions, machine, GPU and commit
     """

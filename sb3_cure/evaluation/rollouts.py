@@ -33,7 +33,7 @@ class Episode:
 
     :param rewards: Reward of each step, [T]
     :param srl_errors: Noise-free SRL error of the observation before each step, [T]; empty if the model measures none
-    :param observations: Observations before each step, [T, *shape], or such by key; images channels first, as the
+    :param observations: Observations before each step, [T, *shape], or these by key; images channels first, as the
         model gets them
     :param frames: ``env.render()`` before each step and after the last one, [T + 1], if requested; else empty
     :param states: True state of the environment before each step, [T, d], if requested; else empty
@@ -62,7 +62,7 @@ def states_and_errors(episodes: Iterable[Episode]) -> tuple[np.ndarray, np.ndarr
 
 
 def chunks(n: int) -> list[slice]:
-    """Split observations into parts of ``CHUNK``, of which one at a time is encoded.
+    """Split observations into parts of ``CHUNK``, which are encoded one at a time.
 
     :param n: Number of observations
     :return: Where each part is, in order
@@ -169,7 +169,7 @@ def run_episodes(
     agent: Any = model
     predict = agent.predict_curious if actor == "curious" else agent.predict
     state_of = physics_state if states is True else states
-    space = copy.deepcopy(env.action_space)  # as an attribute of the class, it is that of the training environment, too
+    space = copy.deepcopy(env.action_space)  # as a class attribute, it is also the training environment's
     space.seed(seed)
     for index in range(n_episodes):
         observation, _ = env.reset(seed=seed if index == 0 else None)
@@ -188,7 +188,7 @@ def run_episodes(
             if state_of:
                 true_states.append(np.array(state_of(env)))
             if render:
-                frames.append(np.array(env.render()))  # which the environment may write into again
+                frames.append(np.array(env.render()))  # a copy: the environment may write into its own
             actions.append(np.array(action))
             observation, reward, terminated, truncated, _ = env.step(action)
             finished = terminated or truncated
@@ -231,7 +231,7 @@ def _as_batch(
 class HighestErrors(NamedTuple):
     """Observations with the highest SRL error.
 
-    :param observations: The observations, highest error first, [k, *shape], or such by key
+    :param observations: The observations, highest error first, [k, *shape], or these by key
     :param errors: Their SRL errors, [k]
     :param ages: How many agent steps ago they were stored, [k]
     :param mean_error: Mean SRL error of the whole replay buffer
@@ -246,7 +246,7 @@ class HighestErrors(NamedTuple):
 def as_arrays(observations: Any) -> Any:
     """Convert tensors to arrays.
 
-    :param observations: Tensor, or a dictionary of such
+    :param observations: Tensor, or a dictionary of these
     :return: NumPy arrays
     """
     if isinstance(observations, dict):
@@ -289,7 +289,7 @@ def binned_errors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Visits and mean SRL error on a grid over two coordinates of the state.
 
-    :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count to its border
+    :param states: The two coordinates of each visited state, [n, 2]; those outside of the grid count in its outer bins
     :param errors: SRL error of each visited state, [n], or empty
     :param edges: Edges of the bins of both coordinates, increasing, [a + 1] and [b + 1]
     :return: Visits, [a, b], which add up to n; and the mean error of each bin, [a, b], NaN without visits
@@ -311,15 +311,15 @@ def state_probe(
 ) -> dict[str, float]:
     """R² of each coordinate of the true state, predicted from the latents by ridge regression.
 
-    Each episode is predicted by the regression on all others, as its neighbours in time would give it away. An angle
-    is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect
+    Each episode is predicted by the regression on all other episodes: neighbouring steps would give the answer away. An
+    angle is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect
     predictions, 0 for the mean of all states, and below 0 for worse.
 
-    :param model: A model of any SB3 algorithm with an encoder (``encoding.encoder_of``); compare models on the same
+    :param model: A model of any SB3 algorithm with an encoder (``encoders.encoder_of``); compare models on the same
         episodes, such as those of random actions with a seed
     :param episodes: Two or more, of ``run_episodes(..., states=True)``
-    :param names: Names of the state's coordinates, [d], as of ``sb3_cure.envs.physics_state_names``
-    :param units: Their units, [d], as of ``physics_state_units``: ``"rad"`` marks angles. None: no angles
+    :param names: Names of the state's coordinates, [d], as for ``sb3_cure.envs.physics_state_names``
+    :param units: Their units, [d], as for ``physics_state_units``: ``"rad"`` marks angles. None: no angles
     :param ridge: Penalty of the squared weights for latents of variance 1, as a share of the number of observations
     :return: R² by name; NaN for coordinates that never change
     :raises ValueError: if the model has no encoder, episodes have no states, or there are fewer than two

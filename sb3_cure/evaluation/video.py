@@ -29,7 +29,7 @@ def frame_rate(env: gym.Env) -> int:
 
 
 def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_repeat: int = 1) -> None:
-    """Write episodes side by side as MP4: above the camera's pictures, below the SRL errors so far, with one scale.
+    """Write episodes side by side as MP4: the camera's pictures above, the SRL errors so far below, on one scale.
 
     :param path: File to write, ``*.mp4``
     :param episodes: Episodes with ``frames`` (rendered with ``render=True``) by title; all end with the shortest.

@@ -95,7 +95,7 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
 
 def _run(cell: Cell, folder: Path, checkpoint_minutes: float, pictures: bool) -> None:
     """Make an attempt at a cell."""
-    # By a function: SB3 passes render_mode="rgb_array" to an id, which not every environment accepts.
+    # A function and no id: SB3 would pass render_mode="rgb_array" with an id, which not every environment accepts.
     with (
         contextlib.closing(cell.make_eval_env()) as eval_env,
         contextlib.closing(make_vec_env(cell.make_env, n_envs=cell.n_envs)) as env,
@@ -169,7 +169,7 @@ class _TimedCheckpoint(ExactCheckpoint):
 
 
 class _Record(BaseCallback):
-    """Evaluate between two agent steps, when all updates are made, and keep times and conditions.
+    """Evaluate between two agent steps, once all updates are made, and keep times and conditions.
 
     A resumed cell continues from its records.
 

@@ -30,7 +30,7 @@ from sb3_cure.evaluation.video import frame_rate, write_gif, write_video
 
 @dataclass(frozen=True)
 class LateFall:
-    """Learning rate that is held for two thirds of training, then falls: without that, the return jumps in the end.
+    """Learning rate that is held for two thirds of training, then falls: otherwise the return jumps towards the end.
 
     :param rate: At first
     :param last: In the end

@@ -82,8 +82,8 @@ class Pretraining:
 class Coverage:
     """Cells of the true state to count, and when, in ``coverage.csv``.
 
-    :param widths: Width of a cell along each coordinate, by the names of ``physics_state_names``; other ones than those
-        by which an arm is rewarded
+    :param widths: Width of a cell along each coordinate, by the names of ``physics_state_names``; they should
+        differ from the widths that an arm is rewarded by
     :param at: Environment steps after which they are counted
     """
 
@@ -116,7 +116,7 @@ class Method(_Part):
     """An arm of the comparison.
 
     :param config: Zoo file: by name, such as ``fast/cure_sac_ae``, or by its path relative to the grid's
-    :param overrides: Changes of the file's entry; of ``env_kwargs`` and ``policy_kwargs`` key by key
+    :param overrides: Changes to the file's entry; ``env_kwargs`` and ``policy_kwargs`` are changed key by key
     :param algo: A key of ``ALGORITHMS``
     :param pretrain: The phase before training, if any
     :param keep_replay_buffer: Whether the task learns from what pretraining has collected, too
@@ -239,7 +239,7 @@ class Cell:
         return env if self.coverage is None else CellInfo(env, self.coverage.widths)
 
     def make_eval_env(self, **env_kwargs: Any) -> gym.Env:
-        """Make an environment to measure policies in: the same, but it pays the task's reward.
+        """Make an environment to measure policies in: the same, but its steps return the task's reward.
 
         :param env_kwargs: Arguments of ``gymnasium.make`` instead of its own
         :return: The environment
@@ -495,8 +495,8 @@ def _choose(names: Sequence[str] | None, known: dict[str, str], path: Path) -> s
 def check_arms(cells: Iterable[Cell]) -> None:
     """Build the model of each arm on each task once, before the first of them is trained.
 
-    On the CPU, as the cells may run on another machine, and with the smallest replay buffer, as theirs may fill the
-    memory.
+    They are built on the CPU, as the cells may run on another machine, and with the smallest replay buffer, as the
+    cells' own may fill the memory.
 
     :param cells: Cells that are to be run
     :raises UsageError: for the first that cannot be built

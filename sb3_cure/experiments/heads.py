@@ -1,4 +1,4 @@
-"""Common heads: they judge all policies of a seed alike, as own heads differ from run to run.
+"""Common heads: they judge all policies of a seed alike, whereas each run's own head differs.
 
 The common head of a seed is an autoencoder that is fitted to an even mix of the observations of the random, task and
 curious policies of the task's *other* seeds. The heads of a task are a unit of work like a cell, with their own folder.

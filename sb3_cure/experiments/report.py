@@ -179,7 +179,7 @@ def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[P
 
 
 def _one_unit_each(experiment: Experiment, curves: Curves) -> Curves:
-    """Panels of errors of one unit each."""
+    """Split panels of errors so that each has one unit."""
     panels: Curves = {}
     for task, arms in curves.items():
         names = _panels_of_errors(experiment, task, arms)

@@ -7,14 +7,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_cure.envs.counting import TASK_REWARD
 
-#: Columns of ``eval.csv``: all rewards; those where the task policy and where the curious (or random) second actor
-#: acted (the rest is the random warm-up's); and those after the first two fifths of an episode, of episodes that have
-#: ended, as a start may lie in the goal
+#: Columns of ``eval.csv``, sums of rewards: of all steps; of those in which the task policy acted, and those in which
+#: the curious (or random) second actor did (the rest is the random warm-up's); and of those after the first two fifths
+#: of episodes that have ended, as an episode may start in the goal
 COLUMNS = ("rewards_met", "rewards_met_task", "rewards_met_curious", "rewards_met_late")
 
 
 class RewardsMet(BaseCallback):
-    """Sum the task's rewards of all transitions that training collects, also where an oracle's reward replaces them.
+    """Sum the task's rewards of all transitions that training collects, even where an oracle's reward replaces them.
 
     The sums are plain attributes, which checkpoints keep.
     """

@@ -55,13 +55,13 @@ def stack_curves(experiment: Experiment, column: str = "return_mean") -> Curves:
     """Interpolate the curves of the seeds of each arm to common steps, within what all of them span.
 
     :param experiment: An experiment
-    :param column: As of ``CellResult.curve``
+    :param column: As for ``CellResult.curve``
     :return: By task and arm, of those with a value in the column: environment steps [n], and values [seeds, n]
     """
     found: Curves = {}
     for task, method in experiment.arms:
         curves = [cell.curve(column) for cell in experiment.finished_cells(task, method).values()]
-        # Of steps that were counted twice the last one
+        # Where a step was evaluated twice, the last value counts
         seeds = [pd.Series(values, steps).groupby(level=0).last() for steps, values in curves if len(steps)]
         if seeds:
             table = pd.concat(seeds, axis=1).sort_index().interpolate("index", limit_area="inside").dropna()
@@ -171,7 +171,7 @@ def cells_ratio(experiment: Experiment, task: str, method: str) -> Estimate:
 
 
 def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Estimate:
-    """log(1 + c), c the sum of rewards that training met, minus that of the arm's baseline.
+    """log(1 + c), where c is the sum of rewards that training met, minus the same of the arm's baseline.
 
     :param experiment: An experiment
     :param task: Short name of a task
@@ -198,7 +198,7 @@ def final_values(experiment: Experiment, task: str, method: str, column: str) ->
     :param experiment: An experiment
     :param task: Short name of a task
     :param method: Name of an arm
-    :param column: As of ``CellResult.curve``
+    :param column: As for ``CellResult.curve``
     :return: The last value of each finished cell that has one
     """
     curves = {seed: cell.curve(column)[1] for seed, cell in experiment.finished_cells(task, method).items()}
@@ -224,7 +224,7 @@ def sign_flip_p(groups: Sequence[np.ndarray]) -> float:
 
 
 def holm(p_values: Sequence[float]) -> np.ndarray:
-    """Correct p values for their number by Holm's step-down method.
+    """Correct p values for multiple comparisons by Holm's step-down method.
 
     :param p_values: Of all comparisons, [n]
     :return: Corrected values in the same order, [n]

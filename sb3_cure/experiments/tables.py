@@ -115,7 +115,7 @@ def number_text(value: float, digits: int = 0) -> str:
     """Format a number with a true minus sign; a dash for one that is not finite.
 
     :param value: A number
-    :param digits: Behind the point
+    :param digits: Digits after the point
     :return: Its text
     """
     if not math.isfinite(value):
@@ -124,7 +124,7 @@ def number_text(value: float, digits: int = 0) -> str:
 
 
 def return_digits(experiment: Experiment, task: str | None = None) -> int:
-    """Digits behind the point that returns need: none from 10 on, else three significant ones.
+    """Decimal places that returns need: none from 10 on, else three significant ones.
 
     :param experiment: An experiment
     :param task: Short name, or None for all tasks
@@ -153,7 +153,7 @@ def interval_text(estimate: Estimate, digits: int = 0) -> str:
     """Format an interval, or say why there is none.
 
     :param estimate: A number
-    :param digits: Behind the point
+    :param digits: Digits after the point
     :return: The text
     """
     if estimate.low is None or estimate.high is None:
@@ -310,7 +310,7 @@ def compared_with(rows: Sequence[PairedDifference], experiment: Experiment) -> s
 
 
 def difference_digits(row: PairedDifference, experiment: Experiment) -> int:
-    """Digits behind the point that a difference in return needs, at least one.
+    """Decimal places that a difference in return needs, at least one.
 
     :param row: A paired difference
     :param experiment: Of which experiment

@@ -67,7 +67,7 @@ class ErrorSummary(Measured):
 class Occupancy(Measured):
     """Occupied cells of a grid over two coordinates of the true state, averaged over all pairs of them.
 
-    :param steps: States counted, of each seed and actor alike
+    :param steps: Number of states that are counted, the same for each seed and actor
     :param dimensions: Dimension of the state
     """
 
@@ -126,8 +126,8 @@ def state_coverage(experiment: Experiment) -> list[Occupancy]:
     States are counted on grids over two coordinates at a time: a grid over all of them has either a few cells per
     coordinate or so many that each step has its own. ``GRID_INTERVALS`` cells span the range between the 1st and the
     99th percentile of each coordinate over the random policy's episodes of all seeds (of an angle, the circle), and
-    cells of that size continue without end, so that no arm's cells depend on the other arms. Of every actor and seed
-    equally many states are counted (drawn at random): else the longer run covers more.
+    cells of that size continue without end, so that no arm's cells depend on the other arms. For every actor and seed
+    the same number of states is counted (drawn at random): else the longer run would cover more.
 
     :param experiment: An experiment
     :return: One row per task, arm and actor

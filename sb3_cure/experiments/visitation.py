@@ -22,7 +22,7 @@ from sb3_cure.experiments.grid import Cell
 from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE
 
-#: Plus the cell's seed: the arms of a seed start from the same states, another seed from others
+#: Added to a cell's seed for its rollouts: the arms of a seed start from the same states, other seeds from others
 VISIT_SEED = 20_000
 COLUMNS = ("actor", "head", "episode", "error_min", "error_mean", "error_max", "return")
 

@@ -18,7 +18,7 @@ class RewardInputs:
     """What an intrinsic reward may read in one update; latents are computed when they are first read.
 
     :param batch: The true transitions
-    :param srl_error: Returns the SRL error of each sample; None unless the reward says ``needs_srl``
+    :param srl_error: Returns the SRL error of each sample; None unless the reward sets ``needs_srl``
     :param read: Returns the latents of the batch's ``"observations"`` or ``"next_observations"``
     :param replay_buffer: The replay buffer, which has just drawn the batch
     :param look_up: Returns stored transitions by rows and environments, [n] each
@@ -38,7 +38,7 @@ class RewardInputs:
 
     @cached_property
     def srl_error(self) -> th.Tensor:
-        """SRL error of each sample, before the head's step, detached, [B]; only for rewards that say ``needs_srl``."""
+        """SRL error of each sample, before the head's step, detached, [B]; only for rewards that set ``needs_srl``."""
         if self._srl_error is None:
             raise ValueError("inputs.srl_error is for rewards that set needs_srl = True.")
         return self._srl_error()
@@ -50,7 +50,7 @@ class RewardInputs:
 
     @cached_property
     def next_latents(self) -> th.Tensor:
-        """The same of the next observations, [B, features_dim]."""
+        """The same latents for the next observations, [B, features_dim]."""
         return self._read("next_observations")
 
     def info(self, key: str) -> th.Tensor:
@@ -82,9 +82,10 @@ class IntrinsicReward(nn.Module):
     """Base class of intrinsic rewards. Subclass it, implement ``loss``, and pass the class as ``intrinsic=``.
 
     Rewards are computed anew for each sampled batch, so they are never stale. Keep targets, statistics and memories in
-    buffers, which are saved, and draw random numbers from an ``OwnGenerator``, so that runs of one seed with different
-    rewards draw alike elsewhere. A constructor that names ``frame_stack`` (frames per image), ``curiosity_target`` or
-    ``srl`` (the head; keep it in a tuple, so that it is not registered twice) gets that setting of the agent.
+    buffers, which are saved, and draw random numbers from an ``OwnGenerator``, so that runs with the same
+    seed and different rewards draw the same numbers elsewhere. A constructor that names ``frame_stack`` (frames per
+    image), ``curiosity_target`` or ``srl`` (the head; keep it in a tuple, so that it is not registered twice) gets that
+    setting of the agent.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
@@ -114,7 +115,7 @@ class IntrinsicReward(nn.Module):
         return False
 
     def loss(self, inputs: RewardInputs) -> tuple[th.Tensor | None, th.Tensor]:
-        """Compute the rewards of a batch, as they are before the step that the loss then makes.
+        """Compute the rewards of a batch, and the loss for the step that follows.
 
         :param inputs: The batch, its latents and its SRL error, and a look-up of stored transitions
         :return: Loss of the reward's own parameters (None if it has none), and the reward of each sample, detached, [B]
@@ -143,14 +144,14 @@ class IntrinsicReward(nn.Module):
 
 
 class OwnGenerator(nn.Module):
-    """Random numbers of a reward's own; their state is saved with its parameters.
+    """A random number generator for one reward; its state is saved with the reward's parameters.
 
     :param stream: Number of the stream, so that two rewards that work together draw differently
     """
 
     def __init__(self, stream: int = 0):
         super().__init__()
-        # While a reward is built, torch's seed is the same under every reward.
+        # While a reward is built, torch's seed is the same, whichever reward it is.
         self.generator = th.Generator().manual_seed(th.initial_seed() + stream)
 
     def get_extra_state(self) -> th.Tensor:

@@ -29,7 +29,7 @@ def make_reward(
     :param features_dim: Size of the latents
     :param settings: ``frame_stack``, ``curiosity_target`` and ``srl`` (the head or None) of the agent
     :param kwargs: The reward's arguments, which override the settings
-    :return: The reward; of a dictionary one for each image, if its class says so (``is_per_image``)
+    :return: The reward; for a dictionary, one for each image if its class says so (``is_per_image``)
     :raises ValueError: if the reward needs a head, and there is none
     """
     if reward_class.needs_srl and settings.get("srl") is None:
@@ -48,12 +48,12 @@ def make_reward(
 class DictReward(IntrinsicReward):
     """A reward of one class for each image of a dictionary: their mean, each divided by its running size.
 
-    All of them read the joint latents; those that are computed from the SRL head read their own image's, as its head
-    does.
+    All of them read the joint latents, except those that are computed from the SRL head: they read the latents of
+    their own image, as its head does.
 
     :param reward_class: Class of the rewards
-    :param args: As of ``IntrinsicReward``
-    :param settings: As of ``make_reward``
+    :param args: As for ``IntrinsicReward``
+    :param settings: As for ``make_reward``
     :param kwargs: Arguments of each reward
     """
 

@@ -18,7 +18,7 @@ class Disagreement(IntrinsicReward):
     differently, and each learns from a random part of all transitions, chosen by a hash of their places in the replay
     buffer. (If a replay buffer of your own has no ``last_sampled``: from a random part of each batch.)
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param n_members: Number of models
     :param hidden_dim: Width of their hidden layer
     :param share: Share of the transitions that each member learns from
@@ -31,7 +31,7 @@ class Disagreement(IntrinsicReward):
         self.n_members, self.share = n_members, share
 
     def loss(self, inputs: RewardInputs) -> tuple[th.Tensor, th.Tensor]:
-        """Predict the next latents by each member.
+        """Predict the next latents with each member.
 
         :param inputs: Its latents and actions are read
         :return: Mean squared error of each member on its part of the transitions, summed; and the variance over

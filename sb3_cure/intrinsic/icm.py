@@ -16,9 +16,9 @@ class ICM(IntrinsicReward):
     The forward model's own loss does not reach the features: it would make them constant, hence easy to predict (Burda
     et al., 2019, section 2.1).
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param encoder: ``"shared"``: the features are the agent's latents, and the inverse model trains their encoder, too;
-        ``"own"``: they come from a network of the reward's own (of a dictionary one for each image)
+        ``"own"``: they come from a network of the reward's own (for a dictionary, one for each image)
     :param n_filters: Channels of its convolutions
     :param hidden_dim: Width of the models' hidden layer
     :raises ValueError: for another encoder

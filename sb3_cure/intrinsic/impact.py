@@ -9,12 +9,12 @@ from sb3_cure.intrinsic.icm import ICM
 
 
 class Impact(ICM):
-    """Distance of a step's two latents, which ICM's models train (RIDE; Raileanu and Rocktäschel, 2020, section 4).
+    """Distance between a step's two latents, which ICM's models train (RIDE; Raileanu & Rocktäschel, 2020, section 4).
 
     Unlike ICM's own reward it does not fade as the models learn. The paper divides it by the square root of the state's
     visits in the episode, which is left out here: batches of a replay buffer hold no whole episodes.
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param hidden_dim: Width of the models' hidden layer
     """
 

@@ -23,7 +23,7 @@ class Particle(IntrinsicReward):
     them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends
     where the stored stream breaks, as in another ``learn()``.
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param n_neighbours: k
     :param memory: Number of transitions to remember, by their places in the replay buffer
     :param n_filters: Channels of the random network
@@ -40,8 +40,8 @@ class Particle(IntrinsicReward):
         # The memory, [memory, 2]: number of the row among all that were ever added (-1: none), and environment
         self.places = np.full((memory, 2), -1)
         self.cursor = 0
-        # Number of each stored transition's episode, unique among environments, [buffer_size, n_envs]; how many rows
-        # had been added when they were numbered; and their buffer's `starts`: the array, as a later one may have its id
+        # Episode number of each stored transition, unique across environments, [buffer_size, n_envs]; how many rows had
+        # been added by then; and the buffer's `starts`, to notice another buffer (the array, as an id may be reused)
         self._episodes: ndarray | None = None
         self._n_numbered = 0
         self._starts: ndarray | None = None
@@ -92,7 +92,7 @@ class Particle(IntrinsicReward):
         self._episodes = None
 
     def _reward(self, features: th.Tensor, candidates: th.Tensor, is_candidate: th.Tensor) -> th.Tensor:
-        # By differences: the products that torch prefers lose small distances.
+        # Computed from differences: the matrix products that torch prefers lose small distances to rounding.
         distances = th.cdist(features, candidates, compute_mode="donot_use_mm_for_euclid_dist")
         distances[~is_candidate] = math.inf
         nearest = distances.topk(min(self.n_neighbours, len(candidates)), largest=False).values
@@ -111,7 +111,7 @@ class Particle(IntrinsicReward):
     def _remember(self, buffer: Any, features: th.Tensor) -> None:
         """Put the batch in place of what has been remembered longest."""
         rows, env_inds = buffer.last_sampled
-        # Rows are counted from the first one that was ever added: positions come again after a round of the buffer.
+        # Rows are counted from the first one that was ever added: positions recur once the buffer has wrapped around.
         numbers = buffer.n_added - 1 - (buffer.pos - 1 - rows) % buffer.buffer_size
         n = min(len(rows), len(self.places))
         where = (self.cursor + np.arange(n)) % len(self.places)

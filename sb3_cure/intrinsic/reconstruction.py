@@ -1,4 +1,4 @@
-"""What the latents do not hold of the image: the paper's idea for heads that do not decode."""
+"""What the latents miss of the image: the paper's idea for heads that do not decode."""
 
 from typing import Any
 
@@ -13,12 +13,12 @@ from sb3_cure.networks.layers import RunningStandardize, most_layers, small_mlp
 
 
 class Reconstruction(IntrinsicReward):
-    """Squared error of a decoder, trained on detached latents, of where the step leads; vectors are standardised.
+    """Error with which a decoder, trained on detached latents, draws the next observation; vectors are standardised.
 
     This is an autoencoder's error for an encoder with another head, such as a contrastive one, whose own error falls
     with novelty. The decoder's pictures show what the latents hold.
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param n_filters: Channels of the decoder's hidden layers (images)
     :param n_layers: Its transposed convolutions; small images allow fewer
     """

@@ -32,7 +32,7 @@ def get_intrinsic_class(
 
     :param intrinsic: Name of a built-in reward, a subclass of ``IntrinsicReward``, or ``"auto"``: the SRL error of a
         head whose error tells novelty, else ``"rnd"``
-    :param head: The agent's SRL head, its class, or None; ``"auto"`` asks it
+    :param head: The agent's SRL head, its class, or None; ``"auto"`` depends on it
     :return: The class
     :raises ValueError: if it is none of these
     """

@@ -71,7 +71,7 @@ def make_network(space: spaces.Space, sizes: Iterable[int], n_filters: int = 16)
 def init(network: nn.Sequential) -> nn.Sequential:
     """Initialise layers in place: orthogonal weights of gain sqrt(2), as in RND's code, and biases of 0.
 
-    Unlike with ``init_weights`` all taps of a kernel count.
+    Unlike ``init_weights``, this initialises all taps of a kernel, not only the central one.
 
     :param network: Linear maps and convolutions
     :return: The same network

@@ -14,7 +14,7 @@ from sb3_cure.intrinsic.reward_networks import DITHER, make_network, scaled
 
 #: Least and largest number of observations for the statistics, and how many are looked up at a time
 ENOUGH, OBSERVATIONS, CHUNK = 256, 1000, 100
-#: Entries of vectors whose variance is below count as constant
+#: Entries of vectors whose variance is below this count as constant
 SMALLEST = 1e-6
 
 
@@ -26,7 +26,7 @@ class RND(IntrinsicReward):
     warm-up of less than ``ENOUGH`` transitions they are computed anew in each update, until there are as many
     or the buffer is full.
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param frame_stack: Frames per image, of which the newest is read
     :param n_filters: Channels of the convolutions
     :param n_outputs: Size of the prediction

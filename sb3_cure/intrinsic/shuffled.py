@@ -12,8 +12,8 @@ from sb3_cure.intrinsic.registry import get_intrinsic_class
 class Shuffled(IntrinsicReward):
     """Another reward's numbers, given to the wrong samples: the same networks, gradients, mean and spread.
 
-    :param args: As of ``IntrinsicReward``
-    :param settings: As of ``make_reward``
+    :param args: As for ``IntrinsicReward``
+    :param settings: As for ``make_reward``
     :param of: Name or class of the other reward; ``"auto"``: the one that ``intrinsic="auto"`` takes with this head
     :param kwargs: Its arguments
     """

@@ -14,12 +14,12 @@ from sb3_cure.srl import SRLHead
 class SRLError(IntrinsicReward):
     """r_cure = L_SRL: states that the SRL head represents badly are worth visiting.
 
-    :param args: As of ``IntrinsicReward``
+    :param args: As for ``IntrinsicReward``
     :param per_pixel: Divide the squared error of each pixel by its running variance plus that of the dither, so that a
         ball of few pixels counts; for heads that decode, in views without noise. It costs a pass of the decoder
     :param decay: Weight of the past in the running variances, per update
-    :param curiosity_target: Whether that error is the observation's or the next one's
-    :param srl: The SRL head, of dictionaries that of one image
+    :param curiosity_target: Whose error it is: ``"observation"`` or ``"next_observation"``
+    :param srl: The SRL head; for dictionaries, the head of one image
     :raises ValueError: if pixels are to be compared, and the head does not decode
     """
 
@@ -73,7 +73,7 @@ class SRLError(IntrinsicReward):
 
     @th.no_grad()
     def error(self, observations: th.Tensor, latents: th.Tensor) -> th.Tensor:
-        """Compute the error per pixel of each observation, without a change of the variances.
+        """Compute the error per pixel of each observation, without updating the variances.
 
         :param observations: As stored, [B, *shape]
         :param latents: Their latents, [B, features_dim]

@@ -27,7 +27,7 @@ from sb3_cure.networks.layers import (
     scale_images,
 )
 
-#: Parameters of one projection from which on ``PixelEncoder`` warns; 84x84 pixels give 2 million
+#: ``PixelEncoder`` warns if its projection has more parameters; 84x84 pixels give 2 million
 MANY_PARAMETERS = 20_000_000
 
 
@@ -166,7 +166,7 @@ class VectorEncoder(Encoder):
         self.trunk[0].update(views)  # type: ignore[index, operator]
 
     def vector_target(self, views: Any) -> th.Tensor:
-        """Flatten and standardise views: forces of 100 N would drown joints in an error of raw units.
+        """Flatten and standardise views: in raw units, forces of 100 N would drown joint angles in the error.
 
         :param views: [B, *shape], or a dictionary of them
         :return: fp32, [B, n]
@@ -222,11 +222,11 @@ class DictProjection(nn.Module):
 class DictEncoder(Encoder):
     """Encoder of dictionaries of images and vectors: one encoder per image; vectors are joined to their latents.
 
-    Vectors need no network of their own: standardised, they are of the same size as the latents.
+    Vectors need no network of their own: once standardised, their entries are about as large as those of latents.
 
     :param observation_space: Dictionary with at least one image
     :param by_key: Further arguments of the encoders of some images, by key
-    :param kwargs: Arguments of all encoders, as of ``PixelEncoder``; ``features_dim`` is that of each
+    :param kwargs: Arguments of all encoders, as for ``PixelEncoder``; ``features_dim`` is that of each
     :raises ValueError: If ``by_key`` names something that is no image
     """
 
@@ -247,7 +247,7 @@ class DictEncoder(Encoder):
         self.vector_dim = vector_dim
         #: Encoders of the images by key. Their modules are registered in trunk and projection
         self.images = encoders
-        #: Where their latents are among all
+        #: Part of the joint latents that belongs to each image, by key
         self.slices = {key: slice(sum(sizes[:i]), sum(sizes[: i + 1])) for i, key in enumerate(encoders)}
         self.trunk = DictTrunk({key: encoder.trunk for key, encoder in encoders.items()}, vectors)
         self.projection = DictProjection([encoder.projection for encoder in encoders.values()])

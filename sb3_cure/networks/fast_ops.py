@@ -17,7 +17,7 @@ def _convolve(images: th.Tensor, weight: th.Tensor, bias: th.Tensor | None, stri
     if images.device.type != "cpu" or images.shape[1] > FEW_CHANNELS:
         return F.conv_transpose2d(images, weight, bias)
     border = weight.shape[-1] - 1
-    # With the argument `padding` oneDNN is as slow as for the transposed convolution.
+    # Padded beforehand: with conv2d's `padding`, oneDNN is as slow as for the transposed convolution.
     return F.conv2d(F.pad(images, (border,) * 4), weight.flip(2, 3).transpose(0, 1), bias)
 
 
@@ -51,8 +51,8 @@ def relu_backward(gradient: th.Tensor, result: th.Tensor) -> th.Tensor:
 class Convolution(th.autograd.Function):
     """Convolution, or its transpose with stride 1, followed by an optional ReLU.
 
-    The gradient of one with respect to the images is the other one, so that backward passes use the fast variant too:
-    for few channels in bf16, oneDNN needs 1.5 times as long for a transposed convolution.
+    The gradient of either with respect to the images is the other, so backward passes use the fast variant too: for
+    few channels in bf16, oneDNN needs 1.5 times as long for a transposed convolution.
     """
 
     @staticmethod
@@ -169,7 +169,7 @@ class SquaredError(th.autograd.Function):
         """Compute the errors.
 
         :param drawn: Images, [B, C, H, W]; only they get a gradient
-        :param target: The same in fp32; it is overwritten
+        :param target: Images to compare with, fp32, of the same shape; overwritten
         :return: [B]
         """
         difference = th.sub(drawn, target, out=target) if target.stride() == drawn.stride() else drawn - target

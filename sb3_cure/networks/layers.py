@@ -14,8 +14,8 @@ from sb3_cure.networks.fast_ops import convolve
 
 ModuleT = TypeVar("ModuleT", bound=nn.Module)
 
-#: Number of weights from which on a hidden layer of an actor or a critic may compute in bf16: below, casting costs more
-#: than bf16 gains
+#: Hidden layers of actors and critics with at least this many weights may compute in bf16: with fewer, casting costs
+#: more than bf16 gains
 WIDE = 2**16
 
 
@@ -100,7 +100,7 @@ def scale_images(images: th.Tensor, dtype: th.dtype = th.float32) -> th.Tensor:
 
 
 def flatten_vectors(observations: Any, observation_space: spaces.Space) -> th.Tensor:
-    """Make one vector of an observation without images, discrete values one-hot.
+    """Flatten an observation without images into one vector, with discrete values one-hot.
 
     :param observations: As stored, [B, *shape], or a dictionary of them
     :param observation_space: Their space; of a dictionary only its keys are read
@@ -326,7 +326,7 @@ class Projection(nn.Module):
 
 @th.no_grad()
 def move_average(average: th.Tensor, weight: th.Tensor, value: th.Tensor, decay: float) -> None:
-    """Move an exponential average that starts at zero; divided by its total weight it has no bias, as Adam's moments.
+    """Update an exponential average that starts at zero: divided by its total weight it is unbiased, as in Adam.
 
     A value that is not finite changes nothing.
 
@@ -389,7 +389,7 @@ class RunningStandardize(nn.Module):
         :return: fp32, [B, n]
         """
         deviation = self.variance.sqrt()
-        # A deviation below 1e-6 of an entry's size is rounding, of which float32 has 6e-8.
+        # A deviation below 1e-6 of an entry's size is rounding (float32 rounds at 6e-8 of it).
         scale = th.where(deviation > 1e-6 * self.mean.abs(), 1 / deviation, 0.0)
         vectors = flatten_vectors(observations, self.observation_space)
         return ((vectors - self.mean) * scale).clamp(-self.clip, self.clip)
@@ -420,7 +420,7 @@ class MeanError(nn.Module):
         """Average the errors.
 
         :param errors: Of each sensor, [B]
-        :param learns: Whether the running sizes follow
+        :param learns: Whether to update the running sizes
         :return: [B]
         """
         if len(errors) == 1:

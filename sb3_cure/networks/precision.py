@@ -48,7 +48,7 @@ def compute_in(module: nn.Module, precision: str) -> Iterator[None]:
     :param module: Usually the whole policy
     :param precision: ``"fp32"`` or ``"bf16"``
     """
-    # In fp32, the default, there is nothing to walk through.
+    # All parts compute in fp32 by default: then there is nothing to switch.
     parts = list(_mixed_parts(module)) if precision == "bf16" else []
     before = [part.compute_dtype for part in parts]
     for part in parts:

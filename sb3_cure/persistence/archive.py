@@ -1,7 +1,7 @@
 """Models as a ``.zip`` of JSON and safetensors, which can be loaded from strangers.
 
 ``data`` holds settings and states as JSON, which refers to the tensors in ``tensors.safetensors`` by name. An object
-that is no data (a function, a user's class) is replaced by a placeholder with its name, and ``load`` needs it in
+that is not data (a function, a user's class) is replaced by a placeholder with its name, and ``load`` needs it in
 ``custom_objects``.
 """
 
@@ -64,7 +64,7 @@ class ModelArchive:
             if sum(member.file_size for member in members) > file.seek(0, os.SEEK_END):
                 raise ArchiveError(f"{name} declares more bytes than it has: it is damaged, or hostile.")
             self.content = json.loads(archive.read(_DATA))
-            self.is_pickled = "format" not in self.content  # but attributes of the model, as SB3 writes them
+            self.is_pickled = "format" not in self.content  # SB3's own archives have no format
             if not self.is_pickled:
                 check_version(self.content["format"], name)
                 self._tensors = load_tensors(archive.read(_TENSORS))
@@ -100,8 +100,8 @@ class ModelArchive:
             if needed := {key: what for key, what in missing.items() if key not in not_needed}:
                 objects = ", ".join(f"{key!r}: ..." for key in needed)
                 raise ArchiveError(
-                    f"{self.name} was saved with objects that no archive holds ({'; '.join(needed.values())}): give "
-                    f"load custom_objects={{{objects}}}."
+                    f"{self.name} was saved with objects that no archive holds ({'; '.join(needed.values())}): pass "
+                    f"custom_objects={{{objects}}} to load."
                 )
             return settings
 
@@ -133,17 +133,17 @@ class SavesModels(OffPolicyAlgorithm):
         """Finish what is under way, and refuse to save what is broken."""
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "lr_schedule"]  # which set-up makes of learning_rate
+        return [*super()._excluded_save_params(), "lr_schedule"]  # set-up makes it from learning_rate
 
     def save(
         self, path: PathOrFile, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None
     ) -> None:
-        """Save networks, optimisers and settings, without pickle; a file at the path is replaced once this is whole.
+        """Save networks, optimisers and settings, without pickle; an old file is replaced once the new one is complete.
 
         A function as ``learning_rate`` or a class of your own is saved as a placeholder with its name, and ``load``
         needs it in ``custom_objects``.
 
-        :param path: Path, whose folder is made and which gets the suffix ``.zip`` if it has none, or a binary file
+        :param path: Path (its folder is made, and ``.zip`` added if it has no suffix), or a binary file
         :param exclude: Names of settings that are not to be saved
         :param include: Names of settings that are saved although they are in ``exclude``
         :raises ValueError: if ``include`` names parts of the running model
@@ -170,7 +170,7 @@ class SavesModels(OffPolicyAlgorithm):
             "parameters": {name: dict(state) for name, state in self.get_parameters().items()},
             "variables": {name: recursive_getattr(self, name) for name in variables},
             "parts": {name: part.state_dict() for name, part in self._stateful_parts().items()},
-            "architecture": getattr(self.policy, "architecture", {}),  # of SB3's own policies: none
+            "architecture": getattr(self.policy, "architecture", {}),  # SB3's own policies have none
         }
         data = {"format": VERSION, "settings": settings}
         data |= {name: encode(part, name, tensors) for name, part in content.items()}
@@ -194,7 +194,7 @@ class SavesModels(OffPolicyAlgorithm):
         trusted: bool = False,
         **kwargs: Any,
     ) -> Self:
-        """Load a model, also one from a stranger.
+        """Load a model, even one from a stranger.
 
         No code that an archive holds is run, and nothing that it names is imported. (Its settings may still need
         more memory than there is.) A temperature that is given replaces the saved one, whether fixed or learned.
@@ -205,7 +205,7 @@ class SavesModels(OffPolicyAlgorithm):
         :param custom_objects: Settings to replace by name; needed for what archives do not hold, for example
             ``{"srl": MyHead}``, or ``{"policy_kwargs": {...}}`` where something in it is not data. Names that the
             archive does not have are ignored
-        :param print_system_info: Whether to print of which system the model was saved, and of this one
+        :param print_system_info: Whether to print the system on which the model was saved, and this one
         :param force_reset: Whether to reset the environment before learning
         :param trusted: Also load what SB3's ``save`` has pickled, which runs any code in it
         :param kwargs: Settings to change
@@ -311,7 +311,7 @@ def _lay_out_moments(optimizer: th.optim.Optimizer) -> None:
             if not isinstance(value, th.Tensor):
                 continue
             is_count, fits = key in _COUNTS and value.dim() == 0, value.shape == parameter.shape
-            if is_count or not (fits or has_moments):  # the latter as Adafactor's sums of rows and columns
+            if is_count or not (fits or has_moments):  # such as Adafactor's sums of rows and columns
                 state[key] = value.clone()  # steps change it in place, and it may be another model's
                 continue
             if not fits:

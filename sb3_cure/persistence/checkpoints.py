@@ -94,7 +94,7 @@ class CheckpointFolder:
         :param model: Model
         :param folder: Folder of the checkpoint
         :return: Training state
-        :raises ArchiveError: if it is of another number of environments
+        :raises ArchiveError: if it was written with another number of environments
         """
         state = read_state(folder / STATE)
         buffer = model.replay_buffer = buffer_from_state(model, state.pop("buffer"), str(folder))
@@ -115,13 +115,13 @@ class ExactCheckpoint(BaseCallback):
 
     A checkpoint holds networks, optimizers, temperatures, running statistics, schedules, counters, the replay buffer,
     all random streams, the state of the environments, and plain attributes of callbacks or their ``state_dict()``.
-    Frames are written once: a checkpoint adds the new ones. It is written aside, flushed to the disk, checksummed and
-    renamed; until then the former ones count. One is written when training starts and one when it ends, unless a
-    callback ends it.
+    Frames are written once: a checkpoint adds the new ones. It is written under another name, flushed to the disk,
+    checksummed and renamed; until then the former checkpoints stay in place. One is written when training starts and
+    one when it ends, unless a callback ends it.
 
     On the CPU with ``precision="fp32"`` the resumed training equals one without interruption bit for bit (with
     ``overlap=True``, whose updates lag behind, it does not). Environments whose state cannot be kept begin a new
-    episode instead, which a warning says.
+    episode instead, with a warning.
 
     :param save_freq: Agent steps between two checkpoints (of all environments together)
     :param path: Folder for the checkpoints of this training, made if missing
@@ -157,7 +157,7 @@ class ExactCheckpoint(BaseCallback):
     def save_if_due(self) -> None:
         """Write a checkpoint if one is due; called before each rollout, between an update and the next step.
 
-        ``_on_rollout_start`` would be too late: other callbacks may have been called, and would be again when resumed.
+        ``_on_rollout_start`` would be too late: other callbacks may have run already, and would run again when resumed.
         """
         if self.is_due():
             self._save()
@@ -172,7 +172,7 @@ class ExactCheckpoint(BaseCallback):
             raise ValueError(f"ExactCheckpoint needs an algorithm that can resume, not {name}: use CheckpointCallback.")
         if type(self.model.replay_buffer) is not FrameStackReplayBuffer:  # type: ignore[attr-defined]
             raise ValueError(
-                f"ExactCheckpoint saves a FrameStackReplayBuffer alone: give {name} "
+                f"ExactCheckpoint can only save a FrameStackReplayBuffer: give {name} "
                 "replay_buffer_class=FrameStackReplayBuffer, replay_buffer_kwargs=dict(frame_stack=1)."
             )
         path = self.path.resolve()

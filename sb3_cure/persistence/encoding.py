@@ -170,7 +170,7 @@ def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[
         return str(value)
     if isinstance(value, np.ndarray) and (dtype := value.dtype.newbyteorder("=")).type in NUMBERS:
         array = np.ascontiguousarray(value, dtype).reshape(value.shape)
-        # What torch does not take: single elements may keep a negative stride.
+        # torch takes neither read-only arrays nor negative strides, which even single elements may have.
         array = array if array.flags.writeable and min(array.strides, default=0) >= 0 else array.copy()
         return {"!array": _keep(th.from_numpy(array), path, tensors)}
     if isinstance(value, th.Tensor) and value.layout is th.strided and value.dtype in _DTYPES:
@@ -285,7 +285,7 @@ _TAGS = {kind: tag for tag, (kind, *_) in _KINDS.items()} | dict.fromkeys(NUMBER
 # -------------------------------------------------------------------- files
 
 
-#: Bytes of values that are no arrays: the library reads headers of 100 MB
+#: Most bytes that all values but arrays may take: safetensors reads headers of up to 100 MB
 LARGEST_HEADER = 95_000_000
 
 
@@ -318,7 +318,7 @@ def write_state(file: str | Path | BinaryIO, state: dict[str, Any]) -> None:
     :param file: Path to write to (not atomically: see ``replacing``), or a binary file
     :param state: What ``encode`` knows
     :raises TypeError: for anything else; the file is not touched then
-    :raises OSError: for more than could be read back, without arrays; the file is not touched then
+    :raises OSError: if the values that are not arrays are too large to be read back; the file is not touched then
     """
     tensors: dict[str, th.Tensor] = {}
     metadata = {"format": str(VERSION), "state": json.dumps(encode(state, "state", tensors))}

@@ -7,13 +7,13 @@ Each layer (environment, wrapper, vectorized environment) is saved by the first 
 2. DeepMind Control tasks of the suite: MuJoCo's integration state, what the task changed in the model, its random
    stream, the step count.
 3. Layers of Gymnasium, SB3, rl-zoo3 and this package: their plain attributes (numbers, strings, arrays, NumPy's
-   generators, and containers of these). Classes, spaces, and functions that keep nothing are those of the new
+   generators, and containers of these). Classes, spaces and stateless functions are taken from the new
    environment.
-4. Other wrappers without attributes of their own: nothing.
+4. Other wrappers without attributes of their own: nothing needs to be saved.
 
-Any other layer makes its environment begin a new episode, as nothing tells whether its attributes are all of its state;
-what the other layers keep, such as running statistics, is restored all the same. Layers are compared by their classes
-and the environment's id, not by their arguments.
+Any other layer makes its environment begin a new episode, because its attributes may not be all of its state; what
+the other layers keep, such as running statistics, is restored all the same. Layers are compared by their classes and
+the environment's id, not by their arguments.
 """
 
 import copy
@@ -215,13 +215,13 @@ def _layer_state(layer: Any, layers: list[Any]) -> dict[str, Any]:
     elif isinstance(layer, DummyVecEnv | SubprocVecEnv):
         attributes = {"_seeds": layer._seeds, "_options": layer._options}
     elif isinstance(layer, wrappers.PassiveEnvChecker):
-        # It compares the first observations and infos, which need not be plain, and is done with that when resumed.
+        # It compares the first observations and infos, which may not be plain data; a resumed one has done so already.
         attributes = dict.fromkeys(("checked_reset", "checked_step", "checked_data_reuse"), True)
     elif not (_is_known(layer) or (isinstance(layer, gym.Wrapper) and attributes.keys() <= _BARE)):
         raise NotKept(f"{name} has no state_dict() and load_state_dict(state)")
     no_state = set().union(*(names for kind, names in _NO_STATE.items() if isinstance(layer, kind)))
     no_state |= _RENDERERS if type(layer).__module__.startswith("gymnasium.envs.") else set()
-    values, arguments = {}, vars(layer).get("_saved_kwargs", ())  # of which the new environment's hold
+    values, arguments = {}, vars(layer).get("_saved_kwargs", ())  # the new environment has its own
     for key, value in attributes.items():
         is_built = isinstance(value, EnvSpec | gym.Space | np.dtype | np.ufunc) or _keeps_nothing(value)
         if key not in no_state and not is_built and not any(value is other for other in layers):
@@ -258,7 +258,7 @@ def _load_layer(layer: Any, state: dict[str, Any]) -> None:
 
 
 def has_state_dict(layer: Any) -> bool:
-    # Of the class: an instance of VecEnvWrapper also shows what it wraps.
+    # Asks the class: an instance of VecEnvWrapper also shows the attributes of what it wraps.
     return hasattr(type(layer), "state_dict") and hasattr(type(layer), "load_state_dict")
 
 

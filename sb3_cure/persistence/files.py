@@ -55,7 +55,7 @@ def locked(folder: Path, seconds: float) -> Iterator[None]:
 
     :param folder: A folder that exists
     :param seconds: How long to wait for another process that holds it; -1: for ever
-    :raises filelock.Timeout: (an ``OSError``) if it holds it still
+    :raises filelock.Timeout: (an ``OSError``) if that process still holds it then
     """
     # Where the file system has no locks, do not fall back to a lock file, which a kill would leave behind
     lock = filelock.FileLock(folder / ".lock", fallback_to_soft=False)
@@ -73,9 +73,9 @@ def locked(folder: Path, seconds: float) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(path: PathOrFile, suffix: str) -> Iterator[BinaryIO]:
-    """Open a file for writing; one at a path is replaced when the new one is whole.
+    """Open a file for writing; an old file is replaced once the new one is complete.
 
-    :param path: Path, whose folder is made and which gets the suffix if it has none, or a binary file
+    :param path: Path (its folder is made, and the suffix added if it has none), or a binary file
     :param suffix: ``"zip"`` or ``"pkl"``
     :return: The open file
     """

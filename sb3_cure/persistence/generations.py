@@ -132,7 +132,7 @@ class Generations:
 
     def _remove_all_but(self, keep: int) -> None:
         """Remove older generations and what no generation needs; what could not be removed is removed the next time."""
-        # Where the checksums of one cannot be read, it is not known which segments it needs.
+        # If the checksums of a generation cannot be read, nothing is removed: the segments that it needs are unknown.
         with contextlib.suppress(OSError, CheckpointError):
             numbers = self.numbers()
             for folder in (*map(self.folder, numbers[:-keep]), *self.path.glob(".unfinished-*")):
@@ -158,7 +158,7 @@ def _read_sums(folder: Path) -> dict[str, str]:
     matches = [_SUM.fullmatch(line) for line in lines]
     sums = {match[2]: match[1] for match in matches if match}
     own = {entry.name for entry in folder.iterdir()} - {_SUMS}
-    # The own files come last: where they are there, no line is missing.
+    # A generation's own files are listed last: if they are there, no line is missing.
     if not all(matches) or not own <= sums.keys() or not own:
         raise CheckpointError(f"{path} is damaged")
     return sums

@@ -37,7 +37,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
     def __deepcopy__(self: Self, memo: dict[int, Any]) -> Self:
         """Copy the model with its environments and replay buffer, for population-based training.
 
-        The logger is shared until the copy's next ``learn``: what it has opened cannot be copied.
+        The logger is shared until the copy's next ``learn``: its open files cannot be copied.
         """
         if "_logger" in vars(self):
             memo[id(self._logger)] = self._logger
@@ -62,7 +62,7 @@ class Persistence(SavesModels, SavesReplayBuffers):
     ) -> Self:
         """Continue a killed training from the newest whole checkpoint of ``ExactCheckpoint``.
 
-        The next ``learn(total)``, with the total and the callbacks of the interrupted call, does what was left of it;
+        The next ``learn(total)``, with the total and the callbacks of the interrupted call, completes that call;
         ``learn(n, reset_num_timesteps=False)`` makes n more steps, as everywhere in SB3. Environments whose state could
         not be kept begin a new episode, with a warning. Do not use them between ``resume`` and ``learn``.
 
@@ -71,8 +71,8 @@ class Persistence(SavesModels, SavesReplayBuffers):
             arguments are not
         :param device: Device of the networks
         :param custom_objects: What the checkpoint cannot hold (a head of your own, a schedule), as for ``load``
-        :param kwargs: Settings to change; training then no longer equals the one before. (``buffer_size``, which the
-            replay buffer has kept, stays)
+        :param kwargs: Settings to change; training then no longer equals the one before. (``buffer_size`` cannot be
+            changed, as the saved replay buffer keeps its size)
         :return: The model
         :raises ArchiveError: if there is no whole checkpoint, or another number of environments
         :raises ValueError: if the environments have other layers, or another id

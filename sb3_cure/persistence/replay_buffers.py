@@ -1,6 +1,6 @@
 """Save and load replay buffers without pickle: the used part alone, and without a copy in memory.
 
-This holds for ``FrameStackReplayBuffer``, which all models of this package have and any algorithm of SB3 can use; all
+This applies to ``FrameStackReplayBuffer``, which all models of this package have and any algorithm of SB3 can use; all
 other replay buffers are pickled, as in SB3.
 """
 
@@ -20,7 +20,7 @@ def buffer_from_state(model: OffPolicyAlgorithm, state: dict[str, Any], name: st
     :param model: The model that the replay buffer is for
     :param state: Of ``FrameStackReplayBuffer.state_dict``, with frames or without
     :param name: Name of its file in messages
-    :return: A replay buffer of the size that was saved; without frames, they have to follow
+    :return: A replay buffer of the size that was saved; frames that the state lacks have to be read into it
     :raises ArchiveError: If it does not fit the model or is damaged
     """
     with refusing(name):
@@ -54,7 +54,7 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
 
         Buffers of other classes than ``FrameStackReplayBuffer`` are pickled, as SB3 does.
 
-        :param path: Path, with a folder that is made and the suffix ``.pkl`` if it has none, or a binary file
+        :param path: Path (its folder is made, and ``.pkl`` added if it has no suffix), or a binary file
         """
         buffer = self.replay_buffer
         if type(buffer) is not FrameStackReplayBuffer:
@@ -64,7 +64,7 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
             write_state(file, buffer.state_dict())
 
     def load_replay_buffer(self, path: PathOrFile, truncate_last_traj: bool = True, *, trusted: bool = False) -> None:
-        """Load a replay buffer, also one from a stranger.
+        """Load a replay buffer, even one from a stranger.
 
         :param path: Path with or without its suffix ``.pkl``, or a binary file
         :param truncate_last_traj: For ``HerReplayBuffer``, as in SB3
@@ -73,7 +73,7 @@ class SavesReplayBuffers(OffPolicyAlgorithm):
         """
         with reading(path, "pkl") as (file, name):
             if is_state(file):
-                # Of a path, arrays stay in the file until they are copied.
+                # Given a path, arrays stay in the file until they are copied.
                 source = Path(file.name) if isinstance(path, str | Path) else file
                 self.replay_buffer = buffer_from_state(self, read_state(source, copy=False), name)
             elif trusted:

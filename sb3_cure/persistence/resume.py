@@ -39,7 +39,7 @@ def training_state(model: OffPolicyAlgorithm, run: Run) -> dict[str, Any]:
     """
     assert model.env is not None
     return {
-        # Before the random streams, from which a worker may draw that is replaced meanwhile
+        # Before the random streams, because this may replace a dead worker, which may draw from them
         "environments": vec_env_state(model.env),
         "callbacks": [callback_state(callback) for callback in run.callbacks],
         "recorded": _recorded(model.logger),
@@ -91,17 +91,17 @@ class Resumption:
         # What SB3's set-up of `learn` changes
         self.num_timesteps_at_start = model._num_timesteps_at_start
         self._action_noise = copy.deepcopy(model.action_noise)
-        #: Whether a ``learn`` came that had nothing left to do
+        #: Whether the resumed ``learn`` had nothing left to do
         self.is_over = False
         #: Why a new episode begins, or None
         self.restore_error = load_vec_env_state(model.env, state["environments"])
         if self.restore_error is not None:
             model._last_obs = None
-            # Other first states than those that this training has begun with
+            # A new seed, or the episodes would start from the same states as at the beginning of this training.
             model.env.seed(None if model.seed is None else (model.seed + model.num_timesteps) % 2**31)
 
     def set_up(self, model: OffPolicyAlgorithm, callbacks: list[BaseCallback], continues: bool) -> None:
-        """Restore callbacks, and what SB3's set-up has begun anew.
+        """Restore callbacks, and what SB3's set-up has reset.
 
         :param model: Model at the end of its ``_setup_learn``
         :param callbacks: All callbacks
@@ -110,7 +110,7 @@ class Resumption:
         model.action_noise = copy.deepcopy(self._action_noise)
         if continues:
             model._num_timesteps_at_start = self.num_timesteps_at_start
-            model.start_time -= self.state["elapsed"]  # else SB3 divides the steps of both parts by the time of one
+            model.start_time -= self.state["elapsed"]  # SB3's fps also counts the earlier steps
         for name, values in self.state["recorded"].items():
             getattr(model.logger, name).update(values)
         saved = list(self.state["callbacks"])

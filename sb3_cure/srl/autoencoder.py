@@ -63,7 +63,7 @@ class RAE(SRLHead):
         """Compute the decoder's target.
 
         :param views: Centred views, [B, *view shape], images in 0-255
-        :param dither: Uniform noise within a quantisation step (training), or its mean (measuring)
+        :param dither: Whether to add uniform noise within a quantisation step (training), or its mean (measuring)
         :return: Images in [-0.5, 0.5], [B, C, H, W]; vectors as ``encoder.vector_target`` gives them, [B, out_dim]
         """
         if not self.pixels:

@@ -39,8 +39,8 @@ class SRLHead(nn.Module):
     error_tells_novelty: ClassVar[bool] = True
     #: Whether ``loss`` gets the latents of the next observations, with their gradient, as a third argument
     needs_next_latents: ClassVar[bool] = False
-    #: Whether the error is one of the transition (s, a, s'), whatever ``curiosity_target`` is. The constructor gets the
-    #: action space, too, as ``action_space=``
+    #: Whether the error belongs to the transition (s, a, s'), whatever ``curiosity_target`` is. The constructor then
+    #: gets ``action_space=``, too
     models_transitions: ClassVar[bool] = False
     #: Optimizer of the head's own parameters, set by the policy; None if it has none
     optimizer: th.optim.Optimizer | None = None
@@ -88,7 +88,7 @@ class SRLHead(nn.Module):
         """Set target encoder and augmentation; called once by the policy.
 
         :param target_encoder: The moving average of the encoder
-        :param augmentation: The policy's
+        :param augmentation: The policy's augmentation
         """
         self._target_encoder = (target_encoder,)
         self.augment = augmentation
@@ -96,8 +96,8 @@ class SRLHead(nn.Module):
     def loss(self, batch: Samples, latents: th.Tensor, next_latents: th.Tensor | None = None) -> SRLOutput:
         """Compute the training loss, which may be noisy and may use the other samples of the batch.
 
-        Without gradients, only the error is needed (in phases of RL, for a frozen head, for the next observations):
-        update statistics only ``if th.is_grad_enabled()``.
+        Where gradients are disabled, only the error is used (in phases of RL, for a frozen head, for the next
+        observations): update statistics only ``if th.is_grad_enabled()``.
 
         :param batch: Samples of the replay buffer; ``batch.views`` is what the encoder saw
         :param latents: The encoder's output for ``batch.views``, fp32, [B, encoder.features_dim]

@@ -82,7 +82,7 @@ class CURL(SRLHead):
         """Set target encoder and augmentation.
 
         :param target_encoder: The moving average of the encoder
-        :param augmentation: The policy's
+        :param augmentation: The policy's augmentation
         :raises ValueError: if there is no augmentation
         """
         if not augmentation.is_random:
@@ -131,7 +131,7 @@ class CURL(SRLHead):
     def set_bank(self, observations: th.Tensor) -> None:
         """Set the negatives of ``error``, which otherwise are the first observations of training.
 
-        Observations that look like many of the bank have a high error. To compare policies, take an even mix of what
+        Observations that resemble many in the bank have a high error. To compare policies, take an even mix of what
         they see (``sb3_cure.evaluation.rollouts.balanced_negatives``).
 
         :param observations: 1 to ``bank_size`` observations as stored, [n, *shape], 0-255

@@ -46,7 +46,7 @@ class DictHead(SRLHead):
         """Set target encoder and augmentation of each head.
 
         :param target_encoder: The moving average of the encoder
-        :param augmentation: The policy's
+        :param augmentation: The policy's augmentation
         """
         super().bind(target_encoder, augmentation)
         images: Any = target_encoder.images
@@ -99,7 +99,7 @@ class DictHead(SRLHead):
 
 
 def heads_by_key(head: SRLHead | None) -> dict[str, Any]:
-    """Return a policy's heads.
+    """Return a policy's heads by the image that they represent.
 
     :param head: A policy's head, or None
     :return: The head of each image of a dictionary by key, or the head itself under the key ``""``

@@ -30,7 +30,7 @@ class NextLatents(SRLHead):
         super().__init__(encoder, observation_space)
         #: Size of latents and action together
         self.n_inputs = encoder.features_dim + get_action_dim(action_space)
-        # Running statistics of the target, for `error`: those of a batch would change with it
+        # Running statistics of the target: `error` must not depend on the rest of its batch
         self.register_buffer("mean", th.zeros(encoder.features_dim))
         self.register_buffer("variance", th.ones(encoder.features_dim))
 
@@ -78,7 +78,7 @@ class NextLatents(SRLHead):
         return self.distance(th.cat([latents, batch.actions], dim=1), target)
 
     def _standardise(self, target: th.Tensor, learns: bool) -> th.Tensor:
-        """Standardise by the batch's statistics, which update the running ones; or else by the running ones."""
+        """Standardise by the batch's statistics and update the running ones; if not learning, by the running ones."""
         mean: th.Tensor = self.mean  # type: ignore[assignment]
         variance: th.Tensor = self.variance  # type: ignore[assignment]
         if learns:
@@ -109,7 +109,7 @@ class Forward(NextLatents):
 
         :param inputs: Latents and action, [B, n_inputs]
         :param target: The next latents, standardised, [B, features_dim]
-        :return: Errors; predicting the mean has 1, [B]
+        :return: Errors, [B]; always predicting the mean would give 1
         """
         return (self.model(inputs) - target).square().mean(dim=1)
 

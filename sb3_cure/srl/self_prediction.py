@@ -20,8 +20,8 @@ class SPR(NextLatents):
     As in the paper, prediction and target are compared after a projection, and the prediction goes through a predictor
     after it; the target's projection is a moving average. There are three differences. K = 1, as the replay buffer
     gives single transitions (their Atari agents predict 5 steps). The transition model is an MLP, as latents are
-    vectors. The target is standardised (see ``NextLatents``), because without critics all latents became one vector
-    within 100 updates. With ``augmentation="auto"`` images are shifted.
+    vectors. The target is standardised (see ``NextLatents``), because otherwise, without critics, all latents
+    collapsed to one vector within 100 updates. With ``augmentation="auto"`` images are shifted.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations

@@ -1,4 +1,4 @@
-"""Variational autoencoder (Kingma and Welling, 2014), as SAC-AE compares itself with (Yarats et al., 2019)."""
+"""Variational autoencoder (Kingma and Welling, 2014), with which SAC-AE (Yarats et al., 2019) is compared."""
 
 from typing import Any
 
@@ -16,10 +16,10 @@ class VAE(RAE):
     """``RAE`` with noisy latents, which a Kullback-Leibler divergence keeps near N(0, 1).
 
     The posterior is N(z, diag(sigma(z)^2)): its mean is the encoder's latents, which actors and critics read without
-    noise, and sigma is a linear map of them that the head owns. Loss: mean squared error per pixel + ``beta`` KL. The
-    mean's share of the KL is the latent penalty of ``RAE``, and ``beta`` has its default. With ``beta`` = 2 s^2 / n the
-    loss is the evidence bound for n pixels with noise of deviation s. The posterior's noise comes from torch's stream,
-    as ``RAE``'s dither.
+    noise, and log sigma(z)^2 is a linear map of them that the head owns. Loss: mean squared error per pixel + ``beta``
+    KL. The mean's share of the KL is the latent penalty of ``RAE``, and ``beta`` has the same default. With ``beta`` =
+    2 s^2 / n the loss is the evidence bound for n pixels with noise of standard deviation s. The posterior's noise
+    comes from torch's stream, like ``RAE``'s dither.
 
     :param encoder: The shared encoder
     :param observation_space: Space of the stored observations: images, or anything that SB3 can flatten

@@ -32,7 +32,7 @@ class OverlappedVecEnv(VecEnvWrapper):
         self._work.append(work)
 
     def finish(self) -> None:
-        """Do now what is left."""
+        """Do the deferred work now, if it is not done yet."""
         work, self._work = self._work, []
         for each in work:
             each()

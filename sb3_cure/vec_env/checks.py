@@ -1,4 +1,4 @@
-"""Put environments into the checks that every training needs."""
+"""Wrap environments in the checks that every training needs."""
 
 import numpy as np
 from stable_baselines3.common.preprocessing import get_obs_shape
@@ -12,8 +12,8 @@ from sb3_cure.vec_env.finite_check import FiniteCheck
 def check_environments(venv: VecEnv) -> FiniteCheck:
     """Copy and check what environments return.
 
-    Environments of this process are put into ``CopyObservations``, and ``venv`` into ``FiniteCheck``. In workers of
-    SB3's ``SubprocVecEnv`` only you can do the former, see :class:`~sb3_cure.envs.CopyObservations`.
+    Environments of this process are put into ``CopyObservations``, and ``venv`` into ``FiniteCheck``. For workers of
+    SB3's ``SubprocVecEnv`` you have to do the former yourself, see :class:`~sb3_cure.envs.CopyObservations`.
 
     :param venv: Environments, wrapped as SB3 does
     :return: The environments in a ``FiniteCheck``

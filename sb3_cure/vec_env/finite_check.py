@@ -19,9 +19,9 @@ class BadTransitionError(ValueError):
 class FiniteCheck(VecEnvWrapper):
     """Raises an error for numbers that are not finite in float32, in which rewards are stored and networks compute.
 
-    It checks observations of resets and steps, rewards, terminal observations and actions, and under ``VecNormalize``
-    the values before it, too, which it may clip. Returned observations are copies, as environments may reuse their
-    arrays.
+    It checks observations of resets and steps, rewards, terminal observations and actions, and with
+    ``VecNormalize`` also the values that it normalizes, as it may clip them. Returned observations are copies, as
+    environments may reuse their arrays.
 
     :param venv: Environments
     """
@@ -67,11 +67,11 @@ class FiniteCheck(VecEnvWrapper):
 
     @contextlib.contextmanager
     def _checking_originals(self) -> Iterator[None]:
-        """Let ``VecNormalize`` get what it normalizes through the same checks."""
+        """Apply the same checks to what ``VecNormalize`` normalizes."""
         if self._normalizer is None:
             yield
             return
-        # Not for good: SB3 compares the wrappers of training and evaluation one by one.
+        # Only for this call: SB3 compares the wrappers of training and evaluation one by one.
         venv = self._normalizer.venv
         self._normalizer.venv = _Originals(venv, self)  # type: ignore[assignment]
         try:
@@ -120,7 +120,7 @@ class _Originals:
         self._venv, self._finite_check = venv, check
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # asked while it is copied, before it has anything
+        if name.startswith("__"):  # looked up while it is copied, before it has attributes
             raise AttributeError(name)
         return getattr(self._venv, name)
 

@@ -32,7 +32,7 @@ class FrameWatch(CopyObservations):
     It looks at the newest frame of uint8 images, also of each image in a dictionary.
 
     :param env: The environment
-    :param allow_black_frames: Whether frames of zeros are right
+    :param allow_black_frames: Whether frames of zeros are allowed
     :param frozen_steps: Environment steps (agent steps times ``action_repeat``) with equal pixels and moving physics
         that raise an error; None: never. In the DeepMind Control suite a cartpole that leaves the view of its camera
         shows equal pixels for up to 100 environment steps
@@ -102,7 +102,7 @@ class FrameWatch(CopyObservations):
         return {"frames": self._frames, "n_frozen": self._n_frozen, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what was seen.
+        """Continue from what was seen.
 
         :param state: Result of ``state_dict``
         """

@@ -54,7 +54,7 @@ def _work(remote: Connection, parent_remote: Connection, make_env: CloudpickleWr
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     if again:
-        # Or its Monitor would empty the file with the episodes before the fault.
+        # Otherwise its Monitor would empty the file with the episodes before the fault.
         Monitor.__init__ = partialmethod(Monitor.__init__, override_existing=False)  # type: ignore[assignment]
     try:
         sb3_worker(remote, parent_remote, make_env)
@@ -99,7 +99,7 @@ class _Worker:
             self.process.start()
         finally:
             remote.close()
-        # At exit multiprocessing sends SIGTERM to daemons, which they ignore, and waits for them.
+        # At exit multiprocessing sends SIGTERM to daemons, which these workers ignore, and waits for them.
         self._kill_at_exit = Finalize(self, self.process.kill, exitpriority=0)
         self.fault: EnvFaultError | None = None
         self._n_unread = 0
@@ -155,7 +155,7 @@ class _Worker:
             answer = self.answer()
         except EnvFaultError as error:
             fault = error
-        if fault is not None:  # not in `except`, as forked processes repeat in their tracebacks what is handled there
+        if fault is not None:  # outside `except`: forked processes would show this error in their tracebacks
             if command not in ("step", "reset"):
                 raise fault
             first, reset_info = answer = self._restart(fault)
@@ -234,7 +234,7 @@ class _Worker:
     def _begin_again(self) -> Any:
         seed = self.seed
         if seed is not None:
-            # Not the same again, which would repeat the episode and whatever made it fail.
+            # Not the same seed again: it would repeat the episode and whatever made it fail.
             seed = int(np.random.SeedSequence([seed, self.restarts]).generate_state(1)[0])
         self.start()
         answer = None
@@ -248,8 +248,8 @@ class _Worker:
 class FaultTolerantSubprocVecEnv(SubprocVecEnv):
     """SB3's ``SubprocVecEnv`` for environments that may fail. Without faults it returns the same, bit for bit.
 
-    It notices a worker that raises, dies or does not answer in time (it hangs in a driver, for example), and by
-    ``FrameWatch``, which each environment is put into, black and frozen frames of uint8 images.
+    It notices a worker that raises, dies or does not answer in time (because it hangs in a driver, for example). Each
+    environment is wrapped in a ``FrameWatch``, which notices black and frozen frames of uint8 images.
 
     ``on_env_fault="raise"`` stops with an ``EnvFaultError``. ``"restart"`` warns and replaces the worker by one from
     the same function (with the attributes that were set, the options of the last reset, and a new seed that derives
@@ -357,7 +357,7 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
         for worker in self.remotes:
             if worker.connection not in owing:
                 worker.send(("close", None))
-        # The others, in a step that Ctrl-C has left, are heard once they have answered
+        # Workers still in a step that Ctrl-C interrupted here are asked to close once they have answered.
         while owing and (answering := wait(list(owing), max(0.0, deadline - time.monotonic()))):
             for connection in answering:
                 owing.pop(connection).send(("close", None))  # type: ignore[call-overload]

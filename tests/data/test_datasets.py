@@ -127,9 +127,7 @@ def test_lengths_of_an_episode_must_agree() -> None:
     model, n = tiny_model("MlpPolicy", VectorBox()), 5
     ends = np.zeros(n, bool)
     twice = RecordedEpisode(np.zeros((2 * n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ends, ends)
-    with pytest.raises(
-        ValueError, match=r"T \+ 1 observations, but one has for T 5 \(actions\), .* 10 \(observations\)"
-    ):
+    with pytest.raises(ValueError, match=r"T \+ 1 observations, but in one T is 5 \(actions\), .* 10 \(observations\)"):
         model.load_transitions([twice])
     assert model.replay_buffer.size() == 0
 

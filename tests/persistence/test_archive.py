@@ -129,7 +129,7 @@ def test_functions_and_own_classes_are_asked_for() -> None:
     file = saved(model)
     with pytest.raises(ArchiveError, match=r"Unknown.*custom_objects=\{('learning_rate|'policy_kwargs)'"):
         CuReSAC.load(file)
-    with pytest.raises(ArchiveError, match=r"give load custom_objects=\{'policy_kwargs': ...\}"):
+    with pytest.raises(ArchiveError, match=r"pass custom_objects=\{'policy_kwargs': ...\}"):
         CuReSAC.load(file, learning_rate=0.1)
     given = {"learning_rate": lambda _: 1e-3, "policy_kwargs": model.policy_kwargs}
     assert differences(state_of(model), state_of(CuReSAC.load(file, custom_objects=given))) == []
