@@ -83,12 +83,13 @@ class ExperimentManager(exp_manager.ExperimentManager):
         return experiment
 
     def create_log_folder(self) -> None:
+        number = get_latest_run_id(self.log_path, self.env_name)  # 0 in folders with characters of a pattern, as [
         while True:
             try:
                 os.makedirs(self.save_path)
                 break
             except FileExistsError:  # of a training that was started at the same time
-                number = get_latest_run_id(self.log_path, self.env_name) + 1
+                number += 1
                 self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
                 self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()

@@ -125,9 +125,9 @@ def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict
 def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Change settings; another head, reward or augmentation does not inherit the arguments of the former one.
 
-    :param settings: As read from a file
+    :param settings: As read from a file; a part that it does not name is compared as None, not as its default
     :param changes: Settings that take their place
-    :return: Both
+    :return: Both, without the ``..._kwargs`` of parts that changed
     """
     parts = [part for part in ("srl", "intrinsic", "augmentation") if part in changes]
     stale = {f"{part}_kwargs" for part in parts if changes[part] != settings.get(part)}

@@ -107,7 +107,8 @@ class Pretraining(CuRe):
         :return: self
         :raises ArchiveError: if the file is damaged or pickled
         :raises ValueError: if networks of the two models differ in their shapes, or would mean something else: other
-            kinds or another order of observations, latents with and without tanh, another head or intrinsic reward
+            kinds or another order of observations, latents with and without tanh, another head or intrinsic reward;
+            or if there is nothing to transfer
         """
         networks, temperature, their_architecture = archived_networks(path)
         parts = ["encoder.", "encoder_target."] + (["srl."] if self.srl is not None else [])

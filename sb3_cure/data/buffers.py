@@ -150,7 +150,8 @@ class FrameStackReplayBuffer(ReplayBuffer):
         :param reward: Rewards, [n_envs]
         :param done: Whether the episode ended, [n_envs]
         :param infos: One dictionary per environment; ``TimeLimit.truncated`` and the keys of ``info_shapes`` are read
-        :raises ValueError: If an observation has another shape, or numbers that a uint8 space cannot hold
+        :raises ValueError: If an observation has another shape, or numbers that a uint8 space cannot hold, or
+            an info lacks a key of ``info_shapes``
         """
         obs, next_obs = self._checked(obs), self._checked(next_obs)
         before = (self.pos - 1) % self.buffer_size

@@ -43,10 +43,11 @@ def check_action_space(space: spaces.Space) -> None:
             f"actions are {space}, but policies output real numbers: wrap the environment in an ActionWrapper that "
             "maps a Box of floats to these actions."
         )
-    if not ((space.low > -UNBOUNDED) & (space.high < UNBOUNDED) & (space.low < space.high)).all():
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    if not ((low > -UNBOUNDED) & (high < UNBOUNDED) & (low < high)).all():
         raise ValueError(
-            f"actions are {space}, where some have no bounds, or only one value: wrap the environment in "
-            "NormalizeActions of sb3_cure.envs, which takes [-1, 1] for the former, and holds the latter."
+            f"actions are {space}, where some lack a bound, or have only one value: wrap the environment in "
+            "NormalizeActions of sb3_cure.envs, which chooses bounds for the former, and holds the latter."
         )
 
 

@@ -170,7 +170,7 @@ def encode(value: Any, path: str, tensors: dict[str, th.Tensor], named: Mapping[
         return str(value)
     if isinstance(value, np.ndarray) and (dtype := value.dtype.newbyteorder("=")).type in NUMBERS:
         array = np.ascontiguousarray(value, dtype).reshape(value.shape)
-        # torch takes neither read-only arrays nor negative strides, which even single elements may have.
+        # torch warns of read-only arrays and refuses negative strides, which even single elements may have.
         array = array if array.flags.writeable and min(array.strides, default=0) >= 0 else array.copy()
         return {"!array": _keep(th.from_numpy(array), path, tensors)}
     if isinstance(value, th.Tensor) and value.layout is th.strided and value.dtype in _DTYPES:

@@ -132,7 +132,7 @@ class Generations:
 
     def _remove_all_but(self, keep: int) -> None:
         """Remove older generations and what no generation needs; what could not be removed is removed the next time."""
-        # If the checksums of a generation cannot be read, nothing is removed: the segments that it needs are unknown.
+        # If the checksums of a generation cannot be read, no segment is removed: which ones it needs is unknown.
         with contextlib.suppress(OSError, CheckpointError):
             numbers = self.numbers()
             for folder in (*map(self.folder, numbers[:-keep]), *self.path.glob(".unfinished-*")):

@@ -160,7 +160,10 @@ def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
     assert yaml.safe_load("1e-3") == "1e-3", "that of others is as it was"
 
 
-def test_trainings_started_together_have_a_folder_each(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("logs", ["logs", "logs[lr=1e-3]"])  # rl-zoo3 finds no folder in the second
+def test_trainings_started_together_have_a_folder_each(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, logs: str
+) -> None:
     """Both count the folders before either makes its own."""
     read = zoo.ExperimentManager.read_hyperparameters
 
@@ -169,8 +172,8 @@ def test_trainings_started_together_have_a_folder_each(folder: Path, monkeypatch
         return read(manager)
 
     monkeypatch.setattr(zoo.ExperimentManager, "read_hyperparameters", read_while_others_start)
-    train("--eval-freq", "-1")
-    theirs, ours = sorted(Path("logs/cure_sac").iterdir())
+    train("--eval-freq", "-1", "-f", logs)
+    theirs, ours = sorted(Path(logs, "cure_sac").iterdir())
     assert not list(theirs.iterdir())
     assert {f"{RUN}.zip", "0.monitor.csv", RUN} <= {path.name for path in ours.iterdir()}
 
