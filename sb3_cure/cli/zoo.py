@@ -14,7 +14,7 @@ import optuna
 import rl_zoo3.train
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import SimpleLinearSchedule, StoreDict, get_latest_run_id
+from rl_zoo3.utils import SimpleLinearSchedule, StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
@@ -83,15 +83,14 @@ class ExperimentManager(exp_manager.ExperimentManager):
         return experiment
 
     def create_log_folder(self) -> None:
-        number = get_latest_run_id(self.log_path, self.env_name)  # 0 in folders with characters of a pattern, as [
         while True:
             try:
                 os.makedirs(self.save_path)
                 break
             except FileExistsError:  # of a training that was started at the same time
-                number += 1
-                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
-                self.params_path = f"{self.save_path}/{self.env_name}"
+                stem, _, number = self.save_path.rpartition("_")
+                self.save_path = f"{stem}_{int(number) + 1}"
+        self.params_path = f"{self.save_path}/{self.env_name}"
         super().create_log_folder()
 
     def create_callbacks(self) -> None:

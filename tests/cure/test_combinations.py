@@ -139,7 +139,8 @@ def test_update_stays_on_its_device(cell: tuple[Any, ...], mode: str, meta_devic
     model.replay_buffer = collector.replay_buffer
     model.replay_buffer.device = meta_device
     for part in model.policy.modules():  # what rewards and banks read once, when they begin
-        vars(part).update({name: 0 for name in ("_is_measured",) if hasattr(part, name)})
+        if hasattr(part, "_is_measured"):
+            part._is_measured = 0
     for _ in range(2):
         learns_srl, learns_rl, _ = model._plan()
         learners = model._learners() if learns_rl else []

@@ -148,7 +148,7 @@ def test_arguments_given_to_load_apply(tmp_path: Path) -> None:
     # A learning rate of zero moves nothing but the targets, towards the networks.
     moved = differences(before, dict(loaded.policy.named_parameters()))
     assert moved and all("target" in name for name in moved)
-    with pytest.raises(TypeError, match="'batchsize', which is no setting of CuReSAC"):
+    with pytest.raises(TypeError, match=r"load\(\) got 'batchsize', which is no setting of CuReSAC"):
         CuReSAC.load(tmp_path / "model", batchsize=8)
 
 
