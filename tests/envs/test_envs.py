@@ -617,6 +617,18 @@ def test_importing_needs_neither_gl_nor_dm_control():
     assert result.stdout.strip() == "[]", result.stderr
 
 
+def test_triton_is_loaded_before_opengl(tmp_path):
+    """triton 3.7.0, 3.7.1 and 3.8.0, 700 MB each and part of torch's CUDA builds, crash if they come after Mesa."""
+    (tmp_path / "triton.py").touch()
+    result = run_python(
+        "-c",
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "import sb3_cure.envs\n"
+        "print([name for name in ('triton', 'OpenGL') if name in sys.modules])",
+    )
+    assert result.stdout.strip() == "['triton']", result.stderr
+
+
 @pytest.mark.parametrize("missing", ["libEGL", "lib(OpenGL|GL|GLESv2|GLESv1_CM)[.]"])
 def test_missing_gl_is_one_sentence(missing):
     result = run_python(
