@@ -266,6 +266,7 @@ def interrupt(number: int, call: Callable[[], None]) -> bool:
             raise KeyboardInterrupt
         return trace
 
+    sys._getframe().f_trace_opcodes = True  # Python 3.12 asks `settrace` whether any frame wants these events
     sys.settrace(trace)
     try:
         call()
