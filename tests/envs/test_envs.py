@@ -618,7 +618,7 @@ def test_importing_needs_neither_gl_nor_dm_control():
 
 
 def test_triton_is_loaded_before_opengl(tmp_path):
-    """triton 3.7.0, 3.7.1 and 3.8.0, 700 MB each and part of torch's CUDA builds, crash if they come after Mesa."""
+    """triton 3.7.0, 3.7.1 and 3.8.0, 700 to 900 MB and part of torch's CUDA builds, crash if they come after Mesa."""
     (tmp_path / "triton.py").touch()
     result = run_python(
         "-c",
