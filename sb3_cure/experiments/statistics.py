@@ -278,7 +278,7 @@ def paired_differences(experiment: Experiment, measure: str = "area") -> list[Pa
 
     :param experiment: An experiment
     :param measure: ``"area"`` or ``"final"``
-    :return: Arm by arm, all tasks together first; arms without a single pair are left out
+    :return: Arm by arm, all tasks together first if two or more count; arms without a single pair are left out
     """
     arms = {arm: summarise_arm(experiment, *arm) for arm in experiment.arms}
     found = []
@@ -296,7 +296,7 @@ def paired_differences(experiment: Experiment, measure: str = "area") -> list[Pa
         # As t_interval does: count what the interval rests on
         judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
         rows: dict[str | None, dict[str, np.ndarray]] = {task: {task: values} for task, values in by_task.items()}
-        if len(rows) > 1:
+        if len(judged) > 1:
             rows = {None: judged, **rows}
         for name, values in rows.items():
             without = () if name else tuple(task for task in by_task if task not in judged)

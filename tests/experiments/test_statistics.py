@@ -132,6 +132,9 @@ def test_several_tasks_count_alike(tmp_path: Path) -> None:
     assert pooled.task is None and [row.task for row in rows] == ["x-y", "z-w"]
     assert pooled.t.value == pytest.approx(60) and pooled.t.n == 5
     assert (pooled.same_starts, rows[0].same_starts, rows[1].same_starts) == (1, 1, 0)
+    # With a single pair left, a task does not count: the other one's row would be there twice
+    (folder / "x-y" / "sac_ae" / "seed1" / "DONE").unlink()
+    assert [row.task for row in statistics.paired_differences(read_results(folder)[0])] == ["x-y", "z-w"]
 
 
 def test_t_interval_covers_truth_with_three_seeds() -> None:
