@@ -32,7 +32,6 @@ from sb3_cure.experiments.tables import (
     number_text,
     plural,
     render_text,
-    tasks_text,
     value_and_interval,
 )
 from sb3_cure.experiments.visit_statistics import HEADS, ErrorSummary, Measured, state_coverage, summarise_errors
@@ -285,13 +284,11 @@ def _comparison(
     differences = statistics.paired_differences(experiment)
     more = tables.reached_table(experiment, thresholds), tables.rewards_met_table(experiment)
     parts: list[Part] = [tables.curves_table(experiment), *(table for table in more if len(table.rows))]
-    several = {row.method for row in differences if row.task is None}
     headlines = []
     for row in differences:
-        if row.task is None or row.method not in several:
-            digits = tables.difference_digits(row, experiment)
-            value, interval = number_text(row.t.value, digits), interval_text(row.t, digits)
-            headlines.append(render_text("difference", row, value, interval, tasks_text(row)))
+        digits = tables.difference_digits(row, experiment)
+        value, interval = number_text(row.t.value, digits), interval_text(row.t, digits)
+        headlines.append(render_text("difference", row, value, interval))
     if differences:
         parts += _difference_parts(experiment, differences, colors)
     return headlines, parts
@@ -303,8 +300,8 @@ def _difference_parts(
     lines = [
         plots.Difference(
             row.method,
-            f"{tables.difference_label(row, experiment.baseline)}, {tasks_text(row)}",
-            np.concatenate(list(row.differences.values())),
+            f"{tables.difference_label(row, experiment.baseline)}, {row.task}",
+            row.differences,
             *(row.t.value, row.t.low, row.t.high),
         )
         for row in differences

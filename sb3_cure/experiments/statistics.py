@@ -1,11 +1,11 @@
 """Turn learning curves into numbers: areas, steps to a return, paired differences.
 
-Intervals are 95 %: each task's mean difference is drawn from Student's t around the mean of its pairs (seeds), tasks
-are averaged with equal weights, and the interval is the middle 95 % of the draws: a parametric bootstrap, stratified by
-task. With one task it is the paired t interval, exactly. It is wide with two or three seeds, as it should be.
+Intervals are 95 %, Student's t over the pairs (seeds) of one task: wide with two or three seeds, as they should be.
+Nothing is averaged over tasks, whose returns may have other scales: see rliable for that.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -15,8 +15,6 @@ from scipy import integrate, stats
 
 from sb3_cure.experiments.results import Experiment
 
-#: Draws of a mean over several tasks
-DRAWS = 100_000
 #: By task and arm: environment steps [n] and values [seeds, n]
 Curves: TypeAlias = dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]
 #: Columns of ``summarise_arm`` that are equal where the arms of a seed begin with equal weights
@@ -117,31 +115,20 @@ class Estimate:
         return "better" if self.low > 0 else "worse" if self.high < 0 else "inconclusive"
 
 
-def t_interval(groups: Sequence[np.ndarray]) -> Estimate:
-    """Mean of the groups' means, with the stratified t interval that this module's docstring describes.
+def t_interval(differences: Collection[float]) -> Estimate:
+    """Mean with its 95 % interval of Student's t.
 
-    Groups of one value have no spread: where others have more, only those count.
-
-    :param groups: Differences between the arms, seed by seed: one array per task
-    :return: The estimate; without an interval if every group has a single value
+    :param differences: Between two arms, one for each seed
+    :return: The estimate; nan of no value, and without an interval of a single one
     """
-    groups = [np.sort(group) for group in groups if len(group)]  # sorted: sums do not depend on the seeds' order
-    judged = [group for group in groups if len(group) > 1] or groups
-    value = float(np.mean([group.mean() for group in judged])) if judged else float("nan")
-    n = sum(len(group) for group in judged)
-    if n == len(judged):  # one value each
-        return Estimate(value, n=n)
-    # Of equal numbers, the standard error that is computed may not be 0.
-    errors = [stats.sem(group) if np.ptp(group) else 0.0 for group in judged]
-    if len(judged) == 1:
-        reach = float(stats.t.ppf(0.975, n - 1) * errors[0])
-    else:
-        rng = np.random.default_rng(0)
-        of_tasks = zip(errors, judged, strict=True)
-        drawn = np.mean([error * rng.standard_t(len(group) - 1, DRAWS) for error, group in of_tasks], axis=0)
-        # The distribution is symmetric: one quantile of the distance is steadier than two of the ends.
-        reach = float(np.percentile(np.abs(drawn), 95))
-    return Estimate(value, value - reach, value + reach, n)
+    values = np.sort(list(differences))  # sorted: sums do not depend on the seeds' order
+    n = len(values)
+    if n < 2:
+        return Estimate(float(values.sum()) if n else float("nan"), n=n)
+    # Of equal numbers, the standard error that is computed may not be 0
+    reach = float(stats.t.ppf(0.975, n - 1) * stats.sem(values)) if np.ptp(values) else 0.0
+    mean = float(values.mean())
+    return Estimate(mean, mean - reach, mean + reach, n)
 
 
 def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Estimate:
@@ -154,7 +141,7 @@ def paired_ratio(ours: Mapping[int, float], theirs: Mapping[int, float]) -> Esti
     pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
     if any(min(pair) <= 0 for pair in pairs):
         return Estimate(float("nan"))
-    found = t_interval([np.log([mine / other for mine, other in pairs])])
+    found = t_interval([np.log(mine / other) for mine, other in pairs])
     low, high = (None if end is None else float(np.exp(end)) for end in (found.low, found.high))
     return Estimate(float(np.exp(found.value)), low, high, found.n)
 
@@ -179,7 +166,7 @@ def rewards_met_difference(experiment: Experiment, task: str, method: str) -> Es
     :return: Mean over the seeds that both have done, with its t interval
     """
     ours, theirs = _at_common_end(experiment, task, method, "rewards_met")
-    return t_interval([np.array([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours])])
+    return t_interval([np.log1p(ours[seed]) - np.log1p(theirs[seed]) for seed in ours])
 
 
 def _at_common_end(experiment: Experiment, task: str, method: str, column: str) -> Iterator[dict[int, float]]:
@@ -205,20 +192,19 @@ def final_values(experiment: Experiment, task: str, method: str, column: str) ->
     return {seed: float(values[-1]) for seed, values in curves.items() if len(values)}
 
 
-def sign_flip_p(groups: Sequence[np.ndarray]) -> float:
+def sign_flip_p(differences: np.ndarray) -> float:
     """Two-sided sign-flip test of paired differences, whose mean is 0 if the arms can be exchanged in each pair.
 
     Exact up to 16 pairs: all signs are tried. With n pairs p is at least 2^(1-n). No distribution is assumed.
 
-    :param groups: Differences between the arms: one array per task; tasks are weighed evenly
+    :param differences: Between the arms, [pairs]
     :return: p value
     """
-    weighted = np.concatenate([group / len(group) for group in groups if len(group)] or [np.zeros(0)])
-    if len(weighted) < 2:  # which scipy refuses: with either sign it is as far from 0
+    if len(differences) < 2:  # which scipy refuses: with either sign it is as far from 0
         return 1.0
     # scipy compares with a relative tolerance, so that a sum's rounding does not decide
     found = stats.permutation_test(
-        (weighted,), np.sum, permutation_type="samples", n_resamples=2**16, vectorized=True, random_state=0
+        (differences,), np.sum, permutation_type="samples", n_resamples=2**16, vectorized=True, random_state=0
     )
     return float(found.pvalue)
 
@@ -238,68 +224,56 @@ def holm(p_values: Sequence[float]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Difference between two arms, seed by seed.
+    """Difference between two arms on a task, seed by seed.
 
     :param method: The arm
     :param other: The arm that is subtracted
-    :param task: Short name, or None for all tasks together
-    :param differences: By task, one value per seed that both arms have done
-    :param t: Mean difference with its t interval
+    :param task: Short name of the task
+    :param differences: One for each seed that both arms have done, [pairs]
     :param same_starts: In how many pairs both arms have the same return and, where both measure it, the same SRL error
         before training, as they do from equal weights
-    :param left_out: Tasks with a single pair, which do not count where others have more
     """
 
     method: str
     other: str
-    task: str | None
-    differences: dict[str, np.ndarray]
-    t: Estimate
+    task: str
+    differences: np.ndarray
     same_starts: int
-    left_out: tuple[str, ...] = ()
+
+    @property
+    def pairs(self) -> int:
+        return len(self.differences)
 
     @property
     def wins(self) -> int:
         """In how many pairs the arm is above the baseline."""
-        return int(sum((values > 0).sum() for values in self.differences.values()))
+        return int((self.differences > 0).sum())
+
+    @property
+    def t(self) -> Estimate:
+        """Mean difference with its t interval."""
+        return t_interval(self.differences)
 
     @property
     def p(self) -> float:
         """p value of ``sign_flip_p``, not corrected."""
-        return sign_flip_p(list(self.differences.values()))
-
-    @property
-    def pairs(self) -> int:
-        return sum(len(values) for values in self.differences.values())
+        return sign_flip_p(self.differences)
 
 
 def paired_differences(experiment: Experiment, measure: str = "area") -> list[PairedDifference]:
-    """Every arm minus its baseline: per task, and over all tasks where there are several.
+    """Every arm minus its baseline, task by task.
 
     :param experiment: An experiment
     :param measure: ``"area"`` or ``"final"``
-    :return: Arm by arm, all tasks together first if two or more count; arms without a single pair are left out
+    :return: Arm by arm; without those that share no seed with their baseline
     """
     arms = {arm: summarise_arm(experiment, *arm) for arm in experiment.arms}
     found = []
-    for method in experiment.methods:
+    for method, task in itertools.product(experiment.methods, experiment.tasks):
         other = experiment.baseline_of(method)
-        if method == other:
-            continue
-        by_task, same = {}, {}
-        for task in experiment.tasks:
-            change = (arms[task, method] - arms[task, other]).dropna(subset=[measure])  # of the seeds that both have
-            if len(change):
-                by_task[task] = change[measure].to_numpy()
-                # Returns of sparse tasks are all zero at first: there the SRL error tells equal weights
-                same[task] = int(change[_STARTS].fillna(0).eq(0).all(axis=1).sum())
-        # As t_interval does: count what the interval rests on
-        judged = {task: values for task, values in by_task.items() if len(values) > 1} or by_task
-        rows: dict[str | None, dict[str, np.ndarray]] = {task: {task: values} for task, values in by_task.items()}
-        if len(judged) > 1:
-            rows = {None: judged, **rows}
-        for name, values in rows.items():
-            without = () if name else tuple(task for task in by_task if task not in judged)
-            interval, starts_alike = t_interval(list(values.values())), sum(same[task] for task in values)
-            found.append(PairedDifference(method, other, name, values, interval, starts_alike, without))
+        change = (arms[task, method] - arms[task, other]).dropna(subset=[measure])  # of the seeds that both have
+        if method != other and len(change):
+            # Returns of sparse tasks are all zero at first: there the SRL error tells equal weights
+            same_starts = int(change[_STARTS].fillna(0).eq(0).all(axis=1).sum())
+            found.append(PairedDifference(method, other, task, change[measure].to_numpy(), same_starts))
     return found

@@ -123,14 +123,14 @@ def number_text(value: float, digits: int = 0) -> str:
     return f"{value:z,.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
-def return_digits(experiment: Experiment, task: str | None = None) -> int:
+def return_digits(experiment: Experiment, task: str) -> int:
     """Decimal places that returns need: none from 10 on, else three significant ones.
 
     :param experiment: An experiment
-    :param task: Short name, or None for all tasks
+    :param task: Short name of a task
     :return: Number of digits
     """
-    cells = [cell for cell in experiment.cells.values() if task in (None, cell.task)]
+    cells = [cell for cell in experiment.cells.values() if cell.task == task]
     return _digits(max((float(np.abs(cell.curve()[1]).max(initial=0)) for cell in cells), default=0.0))
 
 
@@ -279,7 +279,7 @@ def difference_table(
         digits = difference_digits(row, experiment)
         numbers = [str(row.pairs), str(row.same_starts), number_text(row.t.value, digits), interval_text(row.t, digits)]
         numbers += [str(row.wins), _p_text(p), _p_text(corrected)]
-        shown.append([difference_label(row, experiment.baseline), tasks_text(row), *numbers, row.t.verdict])
+        shown.append([difference_label(row, experiment.baseline), row.task, *numbers, row.t.verdict])
     title = f"Paired difference from {compared_with(rows, experiment)}: {measure}"
     return _table(title, columns, shown, render_text("differences") if note is None else note)
 
@@ -317,16 +317,6 @@ def difference_digits(row: PairedDifference, experiment: Experiment) -> int:
     :return: Number of digits
     """
     return max(1, return_digits(experiment, row.task))
-
-
-def tasks_text(row: PairedDifference) -> str:
-    """The task of a difference, or the number of its tasks.
-
-    :param row: A paired difference
-    :return: The text
-    """
-    left_out = f" (left out, with a single pair: {', '.join(row.left_out)})" if row.left_out else ""
-    return row.task or plural(len(row.differences), "task") + left_out
 
 
 def error_table(experiment: Experiment, summaries: Sequence[ErrorSummary]) -> Table:
