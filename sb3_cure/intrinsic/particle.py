@@ -6,22 +6,21 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy import ndarray
+from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from sb3_cure.intrinsic.base import IntrinsicReward, RewardInputs
 from sb3_cure.intrinsic.reward_networks import make_network, scaled
 
-#: Rows of the replay buffer that are compared at a time
-CHUNK = 1000
-
 
 class Particle(IntrinsicReward):
     """log(1 + mean distance to the k nearest neighbours) of where the step leads (Liu & Abbeel, 2021, eq. 5).
 
-    Distances are those of features of a random network that is never trained (RE3; Seo et al., 2021). Neighbours are
-    searched in the batch and in a memory of the latest samples. States of the same episode, the state itself among
-    them, are no neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends
-    where the stored stream breaks, as in another ``learn()``.
+    Distances are those of features of a random network that is never trained (RE3; Seo et al., 2021): of an image
+    normalised, as there; of a vector not, as a linear map's would be its direction alone. Neighbours are searched in
+    the batch and in a memory of the latest samples. States of the same episode, the state itself among them, are no
+    neighbours: otherwise most neighbours would be the steps before and after it. An episode also ends where the stored
+    stream breaks, as in another ``learn()``.
 
     :param args: As for ``IntrinsicReward``
     :param n_neighbours: k
@@ -34,17 +33,13 @@ class Particle(IntrinsicReward):
     def __init__(self, *args: Any, n_neighbours: int = 12, memory: int = 512, n_filters: int = 16):
         super().__init__(*args)
         self.n_neighbours = n_neighbours
-        self.encoder = make_network(self.observation_space, [self.features_dim], n_filters)
-        self.encoder.append(nn.LayerNorm(self.features_dim, elementwise_affine=False)).requires_grad_(False)
+        self.encoder = make_network(self.observation_space, [self.features_dim], n_filters).requires_grad_(False)
+        if is_image_space(self.observation_space):
+            self.encoder.append(nn.LayerNorm(self.features_dim, elementwise_affine=False))
         self.register_buffer("features", th.zeros(memory, self.features_dim))
         # The memory, [memory, 2]: number of the row among all that were ever added (-1: none), and environment
         self.places = np.full((memory, 2), -1)
         self.cursor = 0
-        # Episode number of each stored transition, unique across environments, [buffer_size, n_envs]; how many rows had
-        # been added by then; and the buffer's `starts`, to notice another buffer (the array, as an id may be reused)
-        self._episodes: ndarray | None = None
-        self._n_numbered = 0
-        self._starts: ndarray | None = None
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the memory."""
@@ -56,7 +51,6 @@ class Particle(IntrinsicReward):
         :param state: Result of ``get_extra_state``
         """
         self.places, self.cursor = state["places"].cpu().numpy().copy(), int(state["cursor"])
-        self._episodes = None
 
     @classmethod
     def is_per_image(cls, **kwargs: Any) -> bool:
@@ -78,18 +72,16 @@ class Particle(IntrinsicReward):
                 "remember which transitions it has drawn: leave out replay_buffer_class and optimize_memory_usage."
             )
         features = self.encoder(scaled(inputs.batch.next_observations, self.observation_space))
-        sampled, (known, remembered) = buffer.last_sampled, self._remembered(buffer)
+        known, remembered = self._remembered(buffer)
         candidates = th.cat([features, self.features[th.from_numpy(known).to(features.device)]])
-        episodes = self._number_episodes(buffer)
-        others = np.concatenate([episodes[sampled], episodes[remembered]])
-        is_candidate = th.from_numpy(episodes[sampled][:, None] != others).to(features.device)
+        episodes = _number_episodes(buffer, *np.concatenate([buffer.last_sampled, remembered], axis=1))
+        is_candidate = th.from_numpy(episodes[: len(features), None] != episodes).to(features.device)
         self._remember(buffer, features)
         return None, self._reward(features, candidates, is_candidate)
 
     def forget(self) -> None:
         """Forget the memory, which refers to the replay buffer."""
         self.places[:] = -1
-        self._episodes = None
 
     def _reward(self, features: th.Tensor, candidates: th.Tensor, is_candidate: th.Tensor) -> th.Tensor:
         # Computed from differences: the matrix products that torch prefers lose small distances to rounding.
@@ -119,16 +111,13 @@ class Particle(IntrinsicReward):
         self.features[th.from_numpy(where).to(features.device)] = features[-n:]
         self.cursor = (self.cursor + n) % len(self.places)
 
-    def _number_episodes(self, buffer: Any) -> ndarray:
-        """Number the episodes of the rows added since the last update; a new number wherever the stream breaks."""
-        size, n_envs = buffer.buffer_size, buffer.n_envs
-        n_new = min(buffer.n_added - self._n_numbered, buffer.size())
-        if self._episodes is None or self._starts is not buffer.starts:
-            self._episodes, n_new = np.tile(np.arange(n_envs), (size, 1)), buffer.size()
-        for start in range(0, n_new, CHUNK):
-            rows = (buffer.pos - n_new + np.arange(start, min(start + CHUNK, n_new))) % size
-            before = (rows - 1) % size
-            begins = buffer.starts[rows] | (buffer.dones[before] > 0)
-            self._episodes[rows] = self._episodes[before[:1]] + n_envs * begins.cumsum(axis=0)
-        self._n_numbered, self._starts = buffer.n_added, buffer.starts
-        return self._episodes
+
+def _number_episodes(buffer: Any, rows: ndarray, env_inds: ndarray) -> ndarray:
+    """Number the episodes of stored transitions, [n]; a new number wherever the stream breaks."""
+    size, oldest = buffer.buffer_size, buffer.pos - buffer.size()
+    begins = buffer.starts | (np.roll(buffer.dones, 1, axis=0) > 0)
+    begins[oldest % size] = True
+    first_rows, first_envs = begins.nonzero()
+    # Transitions in the order of environment and age: an episode's number is how many have begun by then
+    firsts = np.sort(first_envs * size + (first_rows - oldest) % size)
+    return firsts.searchsorted(env_inds * size + (rows - oldest) % size, side="right")

@@ -385,26 +385,11 @@ def test_particle_forgets_a_buffer_that_was_not_loaded(tmp_path: Path) -> None:
     assert len(found) == 4 and not th.stack(found).any()
 
 
-def test_particle_numbers_the_episodes_of_a_buffer_that_was_loaded(tmp_path: Path) -> None:
-    """Into a model that has trained with another one: it holds but one episode."""
-    kwargs: dict[str, Any] = dict(intrinsic="particle", srl=None, task=False)
-    tiny_model("CnnPolicy", PixelBox(episode_length=50), **kwargs).learn(30).save_replay_buffer(tmp_path / "buffer")
-    model = tiny_model("CnnPolicy", PixelBox(episode_length=7), **kwargs).learn(30)
-    model.load_replay_buffer(tmp_path / "buffer")
-    found = captured(model)
-    model.train(2)
-    assert len(found) == 2 and not th.stack(found).any()
-
-
-def test_particle_numbers_the_episodes_of_a_buffer_at_the_address_of_another() -> None:
-    """As of two loads in a row, of which the second may take the freed memory of the former buffer."""
-    kwargs: dict[str, Any] = dict(intrinsic="particle", srl=None, task=False)
-    other: Any = tiny_model("CnnPolicy", PixelBox(episode_length=50), **kwargs).learn(30).replay_buffer
-    model = tiny_model("CnnPolicy", PixelBox(episode_length=7), **kwargs).learn(30)
-    model.replay_buffer.__setstate__(other.__getstate__())  # type: ignore[union-attr]
-    found = captured(model)
-    model.train(2)
-    assert len(found) == 2 and not th.stack(found).any()
+def test_particle_of_vectors_is_their_distance() -> None:
+    """Farther out in a known direction is new; the random map keeps distances, times the gain of sqrt(2)."""
+    encoder = reward_of(tiny_model("MlpPolicy", VectorBox(), srl=None, intrinsic="particle")).encoder
+    near, far = encoder(th.tensor([[0.1, 0.2], [1.0, 2.0]]))
+    th.testing.assert_close((far - near).norm().item(), math.sqrt(2) * math.hypot(0.9, 1.8))
 
 
 def test_particle_of_a_single_episode_earns_nothing() -> None:
@@ -414,6 +399,16 @@ def test_particle_of_a_single_episode_earns_nothing() -> None:
     buffer.dones[:] = buffer.starts[1:] = 0
     train_once(model)
     assert not found[0].any()
+
+
+def test_particle_tells_environments_apart() -> None:
+    """Each has a single episode in the replay buffer, whose beginning was overwritten."""
+    env = DummyVecEnv([lambda: VectorBox(episode_length=50)] * 2)
+    model = tiny_model("MlpPolicy", env, srl=None, task=False, intrinsic="particle", buffer_size=20).learn(40)
+    found, buffer = captured(model), model.replay_buffer
+    assert buffer is not None and not buffer.dones.any()
+    train_once(model)
+    assert found[0].min() > 0
 
 
 def test_particle_needs_a_buffer_that_remembers_its_batch() -> None:
