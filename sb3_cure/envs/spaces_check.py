@@ -6,6 +6,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 #: Sides of fewer pixels are taken for those of tables and grids.
 MIN_SIDE = 8
+#: And in two dimensions, other than uint8, for those of matrices.
+MIN_MATRIX_SIDE = 32
 #: MuJoCo's mjMAXVAL: dm_control gives it as the bound of an actuator that has none.
 UNBOUNDED = 1e10
 
@@ -81,8 +83,9 @@ def _check_part(space: spaces.Space, name: str, is_image: bool) -> None:
                 f"{reads}: if it is an image, return the newest as [H, W, C] (StackFrames of sb3_cure.envs stacks "
                 "them), else flatten it."
             )
-    if rank == 3 and not is_image_space(space):
+    is_matrix_image = rank == 2 and min(space.shape) >= MIN_MATRIX_SIDE and is_image
+    if is_matrix_image or (rank == 3 and not is_image_space(space)):
         raise ValueError(
-            f"{reads}: if it is an image, return it as uint8 from 0 to 255, else flatten it (images are normalised "
-            "inside of the networks: VecNormalize with norm_obs=False, or with norm_obs_keys of vectors alone)."
+            f"{reads}: if it is an image, return it as uint8 from 0 to 255, [H, W, C], else flatten it (images are "
+            "normalised inside of the networks: VecNormalize with norm_obs=False, or norm_obs_keys of vectors alone)."
         )

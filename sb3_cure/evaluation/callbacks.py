@@ -151,7 +151,8 @@ class RolloutCallback(PeriodicCallback):
         if isinstance(self.eval_env, VecEnv):
             raise ValueError(
                 "eval_env must be one gymnasium.Env, not a VecEnv "
-                "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks frames as VecFrameStack does)."
+                "(sb3_cure.envs.StackFrames(env, n, padding='zeros') stacks images as VecFrameStack does; if you stack "
+                "those of a dictionary with vectors, use it in training, too, as it leaves vectors alone)."
             )
         # As SB3 wraps training environments: images channels first
         wrapped = model._wrap_env(self.eval_env, monitor_wrapper=False)

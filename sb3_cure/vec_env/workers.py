@@ -88,6 +88,7 @@ class _Worker:
         self.options: dict[str, Any] = {}
         self.restarts = self.faults_in_a_row = 0
         self.last_obs: Any = None
+        self.info_keys: set[str] = set()
         self.start()
 
     def start(self) -> None:
@@ -160,10 +161,11 @@ class _Worker:
                 raise fault
             first, reset_info = answer = self._restart(fault)
             if command == "step":
-                info = {"env_fault": str(fault), "TimeLimit.truncated": True, "terminal_observation": self.last_obs}
-                answer = first, 0.0, True, info, reset_info
+                info = dict.fromkeys(self.info_keys) | {"env_fault": str(fault), "TimeLimit.truncated": True}
+                answer = first, 0.0, True, info | {"terminal_observation": self.last_obs}, reset_info
         elif command == "step":
             self.faults_in_a_row = 0
+            self.info_keys = answer[3].keys() - {"episode"}
         if command == "set_attr":
             self.attributes[data[0]] = data[1]
         elif command in ("step", "reset"):
@@ -253,12 +255,13 @@ class FaultTolerantSubprocVecEnv(SubprocVecEnv):
 
     ``on_env_fault="raise"`` stops with an ``EnvFaultError``. ``"restart"`` warns and replaces the worker by one from
     the same function (with the attributes that were set, the options of the last reset, and a new seed that derives
-    from the last one given). The step then returns the first observation of the new episode, reward 0, done, and in
-    ``info``
+    from the last one given; what ``env_method`` has changed in it is lost). The step then returns the first observation
+    of the new episode, reward 0, done, and in ``info``
 
     - ``env_fault``: what happened, one sentence;
     - ``terminal_observation``: the last good observation, and ``TimeLimit.truncated``: the task did not end;
-    - no ``episode``: a ``Monitor`` in the worker forgets the episode.
+    - no ``episode``: a ``Monitor`` in the worker forgets the episode (``VecMonitor`` counts it, as far as it went);
+    - None for what else was in the ``info`` of the step before.
 
     ``CuReSAC`` stores nothing of such a step. SB3's own off-policy algorithms store one transition from the last
     observation to itself. Frozen frames always raise, since transitions before the error are wrong, too; and so does a

@@ -105,11 +105,12 @@ def test_attributes_that_are_set_are_the_environments(wrapper: Any) -> None:
         (spaces.Box(-1, 1, (0,)), "leave out what is empty"),
         (image(84, 84), r"return it as \[H, W, 1\]"),
         (image(1, 84, 84, 3), "StackFrames"),
-        (image(84, 84, 3, high=1, dtype=np.float32), "return it as uint8 from 0 to 255, else flatten it"),
+        (image(84, 84, 3, high=1, dtype=np.float32), r"return it as uint8 from 0 to 255, \[H, W, C\], else flatten it"),
         (image(3, 84, 84, low=-1, high=1, dtype=np.float32), "return it as uint8"),
         (image(3, 8, 8, dtype=np.float64), "float64 of shape .* vector of 192 numbers"),
         (image(64, 64, 1, high=10, dtype=np.float32), "return it as uint8"),  # depth in metres
         (image(64, 64, 1, high=65535, dtype=np.uint16), "return it as uint8"),  # and in millimetres
+        (image(64, 48, high=10, dtype=np.float32), r"return it as uint8 from 0 to 255, \[H, W, C\]"),
     ],
 )
 def test_part_that_would_be_read_otherwise_is_refused(part: spaces.Space, advice: str) -> None:

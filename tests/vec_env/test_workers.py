@@ -21,7 +21,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from sb3_cure import make_dmc_env
 from sb3_cure.persistence.env_state import load_vec_env_state, vec_env_state
@@ -189,6 +189,26 @@ def test_fault_is_named_and_reported(kind: str, on_env_fault: str) -> None:
         for call in (partial(step, env), env.reset):  # rather than hang, or answer with what is left of an older step
             with pytest.raises(EnvFaultError, match=re.escape(str(caught.value))):
                 call()
+    env.close()
+
+
+class FailingStep(VectorBox):
+    """Its second step fails, and its others tell whether they succeed."""
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, terminated, truncated, _ = super().step(action)
+        if self.n_steps == 2:
+            raise RuntimeError("no power")
+        return obs, reward, terminated, truncated, {"is_success": False}
+
+
+def test_fault_is_survived_where_episodes_are_monitored() -> None:
+    """VecMonitor reads its keywords at the end of each episode, as which a fault counts."""
+    env = VecMonitor(make([FailingStep]), info_keywords=("is_success",))
+    env.reset()
+    step(env)
+    (info,) = step(env)[3]
+    assert "no power" in info["env_fault"] and info["is_success"] is None and info["episode"]["l"] == 2
     env.close()
 
 
