@@ -100,6 +100,11 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     zoo = {"srl": "sb3_cure.srl.VAE", "train_freq": [1, "episode"], "frame_stack": 3, "normalize": True}
     own.write_text(yaml.safe_dump({"default": zoo}))
     assert recipe(own) == {"srl": VAE, "train_freq": (1, "episode")}
+    own.write_text("default: {learning_rate: lin_1e-3, curiosity_prob: lin_0.5, srl: null}")
+    falling = CuReSAC(
+        "CnnPolicy", FakeImageEnv(screen_height=32, screen_width=32, discrete=False), **recipe(own, buffer_size=10)
+    )
+    assert (falling.lr_schedule(0.5), falling.curiosity_prob(0.5)) == (5e-4, 0.25)
     own.write_text("default: {policy_kwargs: 'dict(net_arch=[8])'}")
     with pytest.raises(UsageError, match=r"policy_kwargs is the text 'dict\(net_arch=\[8\]\)': write a mapping"):
         recipe(own)

@@ -139,6 +139,11 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
             f"{folder / 'config.yml'} has {' and '.join(named)}, which can run any code: if you know where it comes "
             "from, add --trusted."
         )
+    if own := [name for name in CLASS_ARGUMENTS if "." in str(settings.get(name)) and not vars(args)[name]]:
+        raise UsageError(
+            f"{folder / 'config.yml'} names code of your own, which no saved model holds: add "
+            f"{' '.join(f'--{name} {settings[name]}' for name in own)}"
+        )
     env_kwargs = {**(arguments.get("env_kwargs") or settings.get("env_kwargs") or {}), **(args.env_kwargs or {})}
     if render_mode == "rgb_array" or (render_mode and "render_mode" not in env_kwargs):
         env_kwargs["render_mode"] = render_mode

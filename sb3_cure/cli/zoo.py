@@ -14,10 +14,9 @@ import optuna
 import rl_zoo3.train
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-from rl_zoo3.utils import SimpleLinearSchedule, StoreDict
+from rl_zoo3.utils import StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cli.progress import TimeLeft
@@ -28,6 +27,7 @@ from sb3_cure.cli.zoo_files import (
     changed,
     check_environment,
     import_module,
+    linear_schedules,
     named_classes,
     named_wrappers,
     zoo_entry,
@@ -45,7 +45,7 @@ class ExperimentManager(exp_manager.ExperimentManager):
     - ``--conf-file fast/cure_sac_ae`` is one of the package's files;
     - an entry ``dmc_pixels:`` of a YAML file applies to all tasks of this namespace without an entry of their own, and
       ``my_module:My-v0:`` to an environment that ``my_module`` registers;
-    - in a file 1e-3 is a number, as in grids;
+    - in a file 1e-3 is a number, as in grids; ``curiosity_prob: lin_0.5`` is a schedule, as of the learning rate;
     - ``env_kwargs`` of the file also apply to the environments of evaluations;
     - ``srl: my_module.MyHead`` names a class, as rl-zoo3's ``policy`` and ``callback`` do;
     - statistics in the folder of ``-i``, which are pickled, are loaded only if the settings have ``normalize``;
@@ -120,12 +120,15 @@ class ExperimentManager(exp_manager.ExperimentManager):
         for name in ("env_wrapper", "vec_env_wrapper"):
             list(named_wrappers(hyperparams.get(name)))  # or the nearest names
         processed = super()._preprocess_hyperparams(hyperparams)
-        rate = processed[0].get("learning_rate")
-        if isinstance(rate, SimpleLinearSchedule):  # which archives do not know
-            processed[0]["learning_rate"] = LinearSchedule(rate.initial_value, 0.0, 1.0)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         return processed
+
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        ours = linear_schedules(hyperparams)  # rl-zoo3's own class is none that archives know
+        rest = {name: value for name, value in hyperparams.items() if name not in ours}
+        return {**exp_manager.ExperimentManager._preprocess_schedules(rest), **ours}
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         return super()._maybe_normalize(env, eval_env) if self.normalize else env

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, one_sentence
 from sb3_cure.cure.algorithms import CuReSAC, CuReTQC
@@ -99,11 +100,10 @@ def zoo_entry(path: Path, task: str, modules: Sequence[str] = ()) -> dict[str, A
     raise UsageError(f"{path} has neither a mapping {task!r} nor 'default'.")
 
 
-#: Settings of a zoo file that are not arguments of the model: of training and, as in rl-zoo3, of environments
-_NOT_OF_MODEL = (
-    *("n_timesteps", "policy", "callback"),
-    *("n_envs", "env_kwargs", "env_wrapper", "vec_env_wrapper", "monitor_kwargs", "frame_stack", "normalize"),
-)
+#: Settings that rl-zoo3's programs use, and grids do not
+OF_ZOO_ALONE = ("callback", "vec_env_wrapper", "monitor_kwargs", "frame_stack", "normalize")
+#: Settings of a zoo file that are not arguments of the model: of training and environments
+_NOT_OF_MODEL = ("n_timesteps", "policy", "n_envs", "env_kwargs", "env_wrapper", *OF_ZOO_ALONE)
 
 
 def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
 
 
 def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert arguments of a model that YAML cannot write: pairs to tuples, and names to the user's classes.
+    """Convert arguments of a model that YAML cannot write: pairs to tuples, names to the user's classes, schedules.
 
     :param read: Arguments as read from a file
     :return: Arguments as the model takes them
@@ -145,10 +145,21 @@ def model_arguments(read: Mapping[str, Any]) -> dict[str, Any]:
         raise UsageError(
             f"policy_kwargs is the text {read['policy_kwargs']!r:.60}: write a mapping, such as {{net_arch: [256]}}."
         )
-    arguments = {**read, **named_classes(read)}
+    arguments = {**read, **named_classes(read), **linear_schedules(read)}
     if isinstance(arguments.get("train_freq"), list):  # as rl-zoo does
         arguments["train_freq"] = tuple(arguments["train_freq"])
     return arguments
+
+
+def linear_schedules(arguments: Mapping[str, Any]) -> dict[str, LinearSchedule]:
+    """Make the schedules that arguments of a model write as in rl-zoo3's files, ``lin_1e-3``: from there to 0.
+
+    :param arguments: Arguments by name
+    :return: The schedules, which archives of models keep, by argument
+    """
+    given = {name: arguments.get(name) for name in ("learning_rate", "curiosity_prob")}
+    texts = {name: text for name, text in given.items() if isinstance(text, str) and text.startswith("lin_")}
+    return {name: LinearSchedule(float(text.removeprefix("lin_")), 0.0, 1.0) for name, text in texts.items()}
 
 
 def check_environment(task: str) -> None:

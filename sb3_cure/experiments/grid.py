@@ -18,6 +18,7 @@ from sb3_cure.cli.usage import UsageError, nearest, one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
     GRIDS,
+    OF_ZOO_ALONE,
     ZOO,
     changed,
     check_environment,
@@ -447,6 +448,11 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
     }
     entry = changed(entry, overrides)
     entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
+    if foreign := [setting for setting in OF_ZOO_ALONE if setting in entry]:
+        raise UsageError(
+            f"method {name!r} of {path} has {foreign[0]}, which `train` knows and grids do not: env_wrapper stacks "
+            "frames (sb3_cure.envs.StackFrames) and wraps environments."
+        )
     return Cell(
         experiment=file.experiment,
         kind=file.kind,

@@ -134,9 +134,6 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
     parts: list[Part] = []
     if experiment.kind == "visitation":
         headlines, parts = _visitation(experiment)
-    updates = np.concatenate([cell.curve("updates")[1] for cell in experiment.finished])
-    if len(updates) and not updates.any():
-        headlines.insert(0, render_text("untrained"))
     parts += curve_parts(experiment, colors)
     headlines += _exploration_headlines(experiment)
     if experiment.kind != "visitation" and any(len(cell.curve()[0]) > 1 for cell in experiment.finished):
@@ -146,8 +143,16 @@ def describe(experiment: Experiment, thresholds: Sequence[float], media: str = "
             several = len(experiment.methods) > 1
             headlines = [render_text("nothing_shared", experiment.baseline) if several else render_text("one_arm")]
         parts += more
+    if untrained := [f"{arm} on {task}" for task, arm in experiment.arms if _is_untrained(experiment, task, arm)]:
+        place = 0 if len(untrained) == len(experiment.arms) else len(headlines)
+        headlines.insert(place, render_text("untrained", untrained))
     parts += [status, tables.conditions_table(experiment)]
     return Section(experiment, headlines, parts, list(media_of(experiment, media)))
+
+
+def _is_untrained(experiment: Experiment, task: str, method: str) -> bool:
+    updates = [cell.curve("updates")[1] for cell in experiment.finished_cells(task, method).values()]
+    return any(len(each) for each in updates) and not any(each.any() for each in updates)
 
 
 def curve_parts(experiment: Experiment, colors: Mapping[str, str]) -> Iterator[Part]:
@@ -189,17 +194,8 @@ def _one_unit_each(experiment: Experiment, curves: Curves) -> Curves:
 
 def _panels_of_errors(experiment: Experiment, task: str, arms: Iterable[str]) -> dict[str, str]:
     """Titles by arm: errors of different heads, and errors per pixel, differ in their unit, and share no axis."""
-    units = {arm: _unit_of_errors(experiment, task, arm) for arm in arms}
+    units = {arm: statistics.unit_of_errors(experiment, task, arm) for arm in arms}
     return {arm: f"{task}, {unit}" if len(set(units.values())) > 1 else task for arm, unit in units.items()}
-
-
-def _unit_of_errors(experiment: Experiment, task: str, arm: str) -> str:
-    """Whose error it is: the head's, or that of a reward which reconstructs what its own autoencoder sees."""
-    arguments = next(iter(experiment.finished_cells(task, arm).values())).config["arguments"]
-    options = arguments.get("intrinsic_kwargs") or {}
-    rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
-    own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")
-    return f"{own}{', per pixel' if options.get('per_pixel') else ''}"
 
 
 def _visitation(experiment: Experiment) -> tuple[list[str], list[Part]]:
@@ -225,7 +221,8 @@ def _by_unit(experiment: Experiment, errors: Sequence[ErrorSummary]) -> Iterator
         of_task = [row for row in errors if row.task == task]
         titles = _panels_of_errors(experiment, task, [row.method for row in of_task if row.head == "own"])
         for row in of_task:
-            if row.method in titles and (row.head == "own" or _unit_of_errors(experiment, task, row.method) == "rae"):
+            unit = statistics.unit_of_errors(experiment, task, row.method)
+            if row.method in titles and (row.head == "own" or unit == "rae"):
                 yield replace(row, task=titles[row.method])
 
 
@@ -377,7 +374,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("results", type=Path, help="folder that `sb3-cure experiment` wrote, or one experiment in it")
     parser.add_argument("--out", type=Path, help="HTML file (default: report.html in the folder)")
-    returns_help = "returns for which the steps to reach them are shown (default: 250,500,750)"
+    returns_help = "returns until which steps are counted (default: 250,500,750; below zero: --thresholds=-20,-10)"
     parser.add_argument("--thresholds", type=returns, default=THRESHOLDS, help=returns_help)
     media_help = "seeds with videos and pictures (default: of each arm the first that has some)"
     parser.add_argument("--media", choices=("first", "all", "none"), default="first", help=media_help)

@@ -87,6 +87,21 @@ def summarise_arm(experiment: Experiment, task: str, method: str) -> pd.DataFram
     return pd.DataFrame.from_dict(rows, orient="index", columns=columns, dtype=float)
 
 
+def unit_of_errors(experiment: Experiment, task: str, method: str) -> str:
+    """Say whose SRL error an arm measures, as errors of different heads cannot be compared.
+
+    :param experiment: An experiment
+    :param task: Short name of a task
+    :param method: Name of an arm with a finished cell
+    :return: The head, or ``"reconstruction"`` if the reward has an autoencoder of its own; and whether it is per pixel
+    """
+    arguments = next(iter(experiment.finished_cells(task, method).values())).config["arguments"]
+    options = arguments.get("intrinsic_kwargs") or {}
+    rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
+    own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")
+    return f"{own}{', per pixel' if options.get('per_pixel') else ''}"
+
+
 # Estimates with intervals
 
 
@@ -230,8 +245,8 @@ class PairedDifference:
     :param other: The arm that is subtracted
     :param task: Short name of the task
     :param differences: One for each seed that both arms have done, [pairs]
-    :param same_starts: In how many pairs both arms have the same return and, where both measure it, the same SRL error
-        before training, as they do from equal weights
+    :param same_starts: In how many pairs both arms have the same return and, where both measure that of the same head,
+        the same SRL error before training, as they do from equal weights
     """
 
     method: str
@@ -274,6 +289,8 @@ def paired_differences(experiment: Experiment, measure: str = "area") -> list[Pa
         change = (arms[task, method] - arms[task, other]).dropna(subset=[measure])  # of the seeds that both have
         if method != other and len(change):
             # Returns of sparse tasks are all zero at first: there the SRL error tells equal weights
-            same_starts = int(change[_STARTS].fillna(0).eq(0).all(axis=1).sum())
+            has_one_unit = len({unit_of_errors(experiment, task, each) for each in (method, other)}) == 1
+            starts = change[_STARTS if has_one_unit else _STARTS[:1]]
+            same_starts = int(starts.fillna(0).eq(0).all(axis=1).sum())
             found.append(PairedDifference(method, other, task, change[measure].to_numpy(), same_starts))
     return found

@@ -372,13 +372,16 @@ def rewards_met_table(experiment: Experiment) -> Table:
     def final(task: str, method: str, column: str) -> np.ndarray:
         return np.array(list(statistics.final_values(experiment, task, method, column).values()))
 
+    def text(values: np.ndarray) -> str:
+        return mean_std_text(values, _digits(float(values.sum()) / max(len(values), 1)))
+
     shown = []
     for task, method in experiment.arms:
         met = final(task, method, "rewards_met")
         if len(met) == 0 or (met < 0).any():
             continue
         parts = [final(task, method, f"rewards_met_{part}") for part in ("task", "curious", "late")]
-        numbers = [mean_std_text(met), *(mean_std_text(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
+        numbers = [text(met), *(text(part) or NONE for part in parts), f"{np.log1p(met).mean():.2f}"]
         difference = NONE
         if method != experiment.baseline_of(method):
             difference = value_and_interval(statistics.rewards_met_difference(experiment, task, method))

@@ -148,6 +148,13 @@ def test_flags_override_the_file(set_up: Callable[..., Any]) -> None:
     assert manager.create_envs(1, eval_env=True).observation_space.shape == (6, 44, 44)
 
 
+def test_rate_and_curiosity_may_fall(folder: Path) -> None:
+    """As rl-zoo3 writes schedules, and the saved model has them."""
+    train("--eval-freq", "-1", learning_rate="lin_1e-3", curiosity_prob="lin_0.5")
+    model = CuReSAC.load(f"logs/cure_sac/{RUN}_1/{RUN}.zip", device="cpu")
+    assert (model.lr_schedule(0.5), model.curiosity_prob(0.5)) == (5e-4, 0.25)  # type: ignore[operator]
+
+
 def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
     """1e-3 is a number here as in grids, and the flag -n stands in for the file's ``n_timesteps``."""
     settings = {name: value for name, value in SETTINGS.items() if name != "n_timesteps"}
@@ -296,7 +303,7 @@ def replay(program: str, run: Path, *arguments: str, task: str = TASK) -> int:
 def test_enjoy_plays_the_run(run: Path, played: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     """With the class of its head, in its own environment, or in one that flags change."""
     assert replay("enjoy", run) == 2
-    assert "heads_of_mine" in capsys.readouterr().err
+    assert "add --srl heads_of_mine.Gentle" in capsys.readouterr().err
     assert replay("enjoy", run, "--srl", "heads_of_mine.Gentle") == 0
     assert "2 Episodes" in capsys.readouterr().out  # of 7 steps each
     assert type(played[0].policy.srl) is Gentle

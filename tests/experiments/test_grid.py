@@ -116,6 +116,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         dict(budget=100, coverage=dict(widths=dict(place=1.0), at=[100, 120])),
         "coverage.at has 120, after the end of a training of 100",
     ),
+    "a setting of rl-zoo3's programs": (
+        dict(methods={"a": method(frame_stack=3)}),
+        "method 'a' of .* has frame_stack, which `train` knows and grids do not: env_wrapper stacks",
+    ),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
     "pictures that heads cannot judge alike": (
         dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 from programs_for_tests import find_program
-from results_for_tests import CURE, RAE, curve, write_cell, write_csv, write_grid
+from results_for_tests import CURE, RAE, curve, write_cell, write_csv, write_grid, write_two_arms
 
 from sb3_cure.cli.main import main
 from sb3_cure.experiments import report
@@ -284,12 +284,24 @@ def test_rewards_met_in_training_are_compared(tmp_path: Path) -> None:
     assert report.main([str(tmp_path)]) == 0
     _, baseline, cure, *_ = rows_of(tmp_path / "table.md", "Rewards met in training")
     # Earlier versions did not record who acted
-    assert baseline[2:] == ["2", "4 ± 6", NONE, NONE, NONE, "1.15", NONE]
+    assert baseline[2:] == ["2", "4.50 ± 6.36", NONE, NONE, NONE, "1.15", NONE]
     assert cure[2:4] == ["3", "38 ± 53"] and cure[7] == "2.90"
     assert cure[8] == "2.30 [2.30, 2.30]"  # log(10) in both pairs
     write_cell(tmp_path, TASK, "cure_sac_ae", 2, curve(0, 0), rewards_met=-1)
     assert report.main([str(tmp_path)]) == 0
     assert "38 ±" not in (tmp_path / "table.md").read_text()
+
+
+def test_arm_without_updates_is_named(tmp_path: Path) -> None:
+    """Its budget ends within the warm-up: returns of chance are compared."""
+    write_two_arms(tmp_path)
+    for seed in (0, 1):
+        path = tmp_path / TASK / "cure_sac_ae" / f"seed{seed}" / "eval.csv"
+        table = pd.read_csv(path)
+        table.assign(updates=0).to_csv(path, index=False)
+    assert report.main([str(tmp_path)]) == 0
+    sentence = "No update was made by cure_sac_ae on cartpole-swingup: the budget ends within"
+    assert sentence in (tmp_path / "table.md").read_text().replace("\\_", "_")
 
 
 def test_overview_comes_first(results: Path) -> None:

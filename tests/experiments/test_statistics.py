@@ -80,6 +80,18 @@ def test_equal_starts_are_told_by_the_error(tmp_path: Path) -> None:
     assert (difference.same_starts, difference.pairs) == (2, 3)
 
 
+def test_equal_starts_of_different_heads_are_told_by_returns(tmp_path: Path) -> None:
+    """Their errors have different units."""
+    folder = tmp_path / "curves"
+    write_grid(folder, seeds=2)
+    for seed, start in enumerate((3, 4)):
+        write_cell(folder, TASK, "sac_ae", seed, curve(3, 5))
+        cell = write_cell(folder, TASK, "cure_sac_ae", seed, curve(start, 5), arguments={**CURE, "srl": "curl"})
+        (cell / "eval.csv").write_text((cell / "eval.csv").read_text().replace(",0.001,", ",0.7,"))
+    (difference,) = statistics.paired_differences(read_results(folder)[0])
+    assert (difference.same_starts, difference.pairs) == (1, 2)
+
+
 def test_area_counts_steps_not_evaluations() -> None:
     """Trapezoids: 10 on 0..10, then 5 on average over 90 steps."""
     area = statistics.area_under_curve(np.array([0, 10, 100]), np.array([10.0, 10.0, 0.0]))
