@@ -263,7 +263,14 @@ class SavesModels(OffPolicyAlgorithm):
             given = {*given, "curiosity_ent_coef"}
         fresh = {name for key in given for name in _TEMPERATURES[key]}
         parameters = {key: state for key, state in archive.read("parameters").items() if key not in fresh}
-        parameters |= {key: state for key, state in self.get_parameters().items() if key in fresh}
+        own = self.get_parameters()
+        parameters |= {key: state for key, state in own.items() if key in fresh}
+        others = sorted({key.split(".")[0] for key in parameters["policy"].keys() ^ own["policy"].keys()})
+        if others:
+            raise ValueError(
+                f"{archive.name} was saved with other networks ({', '.join(others)}): load it with the srl=, "
+                "intrinsic= and curiosity= of its training, or begin a new model with its encoder by transfer_from."
+            )
         self.set_parameters(parameters, exact_match=True, device=self.device)
         variables, states = archive.read("variables"), archive.read("parts")
         with refusing(archive.name):

@@ -194,6 +194,17 @@ def test_loading_into_another_algorithm_is_refused(change: dict[str, Any], tmp_p
         CuReSAC.load(tmp_path / "model", **change)
 
 
+@pytest.mark.parametrize(
+    ("change", "networks"),
+    [(dict(curiosity=None), "curious"), (dict(srl="spr"), "intrinsic, srl"), (dict(intrinsic="rnd"), "intrinsic")],
+    ids=str,
+)
+def test_loading_with_other_networks_is_refused(change: dict[str, Any], networks: str, tmp_path: Path) -> None:
+    tiny_model("CnnPolicy", PixelBox()).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=rf"was saved with other networks \({networks}\): load it with"):
+        CuReSAC.load(tmp_path / "model", **change)
+
+
 @pytest.mark.parametrize("key", ["srl", "teacher"])
 def test_own_objects_are_given_to_load(key: str, tmp_path: Path) -> None:
     """An archive holds no class of the user's: it says which one it was."""
