@@ -100,6 +100,9 @@ def test_recipe_gives_the_model_what_the_zoo_file_says(tmp_path: Path) -> None:
     zoo = {"srl": "sb3_cure.srl.VAE", "train_freq": [1, "episode"], "frame_stack": 3, "normalize": True}
     own.write_text(yaml.safe_dump({"default": zoo}))
     assert recipe(own) == {"srl": VAE, "train_freq": (1, "episode")}
+    own.write_text("default: {srl_kwargs: {bits: 8}}")
+    assert recipe(own, srl="rae") == {"srl": "rae", "srl_kwargs": {"bits": 8}}, "the default head, named"
+    assert recipe(own, srl="vae") == {"srl": "vae"}
     own.write_text("default: {learning_rate: lin_1e-3, curiosity_prob: lin_0.5, srl: null}")
     falling = CuReSAC(
         "CnnPolicy", FakeImageEnv(screen_height=32, screen_width=32, discrete=False), **recipe(own, buffer_size=10)

@@ -151,7 +151,7 @@ def check_rewards(task: str, env_kwargs: dict[str, Any]) -> int:
     if len(returns) < MIN_EPISODES:
         raise UsageError(
             f"{len(returns)} episodes of {task} ended within a minute, too few to say: shorten them, as in "
-            "--env-kwargs max_episode_steps:200"
+            "--env-kwargs max_episode_steps:50"
         )
     met, ends = count_rewarded(returns), f"returns {returns.min():.4g} to {returns.max():.4g}"
     if met is None:

@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from functools import partial
@@ -10,12 +11,14 @@ from pathlib import Path
 from pprint import pprint
 from typing import Any
 
+import gymnasium as gym
 import optuna
 import rl_zoo3.train
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -37,6 +40,32 @@ from sb3_cure.envs import make_dmc_env
 
 #: The file of settings where ``--conf-file`` is not given
 DEFAULT_SETTINGS = "cure_sac_ae"
+
+
+class ReportEnds(gym.Wrapper):
+    """Reports episodes that wrappers end, which ``Monitor`` inside of them does not see: evaluations wait for them.
+
+    :param env: Environment with its wrappers
+    :param monitor: Its ``Monitor``
+    """
+
+    def __init__(self, env: gym.Env, monitor: Monitor):
+        super().__init__(env)
+        self.monitor = monitor
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Make a step.
+
+        :param action: The action
+        :return: As the environment's, with ``info["episode"]`` at the end
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if (terminated or truncated) and "episode" not in info:
+            rewards, seconds = self.monitor.rewards, time.time() - self.monitor.t_start
+            info["episode"] = {"r": round(sum(rewards), 6), "l": len(rewards), "t": round(seconds, 6)}
+            if self.monitor.results_writer is not None:
+                self.monitor.results_writer.write_row(info["episode"])
+        return observation, reward, terminated, truncated, info
 
 
 class ExperimentManager(exp_manager.ExperimentManager):
@@ -119,7 +148,11 @@ class ExperimentManager(exp_manager.ExperimentManager):
         hyperparams.update(named_classes(hyperparams))
         for name in ("env_wrapper", "vec_env_wrapper"):
             list(named_wrappers(hyperparams.get(name)))  # or the nearest names
-        processed = super()._preprocess_hyperparams(hyperparams)
+        arguments, env_wrapper, *others = super()._preprocess_hyperparams(hyperparams)
+        if env_wrapper is not None:
+            wrap = env_wrapper  # which gets the environment in its Monitor
+            env_wrapper = lambda env: ReportEnds(wrap(env), env)  # noqa: E731
+        processed = arguments, env_wrapper, *others
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         return processed
@@ -129,6 +162,14 @@ class ExperimentManager(exp_manager.ExperimentManager):
         ours = linear_schedules(hyperparams)  # rl-zoo3's own class is none that archives know
         rest = {name: value for name, value in hyperparams.items() if name not in ours}
         return {**exp_manager.ExperimentManager._preprocess_schedules(rest), **ours}
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        networks = hyperparams.get("policy_kwargs")  # which rl-zoo3 ignores here, and writes into config.yml
+        model = super()._load_pretrained_agent(hyperparams, env)
+        own = {name: value for name, value in model.policy_kwargs.items() if name != "use_sde"}  # which SB3 adds
+        if self.algo in ALGORITHMS and networks is not None and networks != own:
+            raise UsageError(f"{self.trained_agent} has policy_kwargs={own}, which cannot become {networks}.")
+        return model
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         return super()._maybe_normalize(env, eval_env) if self.normalize else env

@@ -1,6 +1,7 @@
 """Algorithms and YAML files of the package by name, such as ``fast/cure_sac_ae``."""
 
 import importlib
+import inspect
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -55,12 +56,37 @@ def packaged_files(folder: Path = ZOO) -> dict[str, Path]:
 
 
 class Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-6 as a number, as YAML 1.2 does; YAML 1.1 reads it as text."""
+    """SafeLoader that reads 1e-6 and 1e6 as numbers, the latter as a whole one, and refuses a key that is there twice.
+
+    YAML 1.1 reads them as text, and PyYAML keeps the last of equal keys.
+    """
+
+    def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
+        """Read a mapping.
+
+        :param anchor: As in PyYAML
+        :return: Its node
+        :raises yaml.YAMLError: If a key is there twice
+        """
+        node = super().compose_mapping_node(anchor)
+        names = [key.value for key, _ in node.value]
+        for name in names:
+            if names.count(name) > 1:
+                raise yaml.YAMLError(f"{name!r} is there twice, in the mapping of line {node.start_mark.line + 1}")
+        return node
+
+    def construct_exponential(self, node: yaml.ScalarNode) -> float:
+        """Read a number with an exponent.
+
+        :param node: Its node
+        :return: An int, such as a buffer's size, if it is whole
+        """
+        number = float(node.value)
+        return int(number) if number.is_integer() else number
 
 
-Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
+Loader.add_implicit_resolver("!exponential", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
+Loader.add_constructor("!exponential", Loader.construct_exponential)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -125,12 +151,13 @@ def recipe(name: str | Path, env_id: str = "default", /, **changes: Any) -> dict
 def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Change settings; another head, reward or augmentation does not inherit the arguments of the former one.
 
-    :param settings: As read from a file; a part that it does not name is compared as None, not as its default
+    :param settings: As read from a file
     :param changes: Settings that take their place
     :return: Both, without the ``..._kwargs`` of parts that changed
     """
     parts = [part for part in ("srl", "intrinsic", "augmentation") if part in changes]
-    stale = {f"{part}_kwargs" for part in parts if changes[part] != settings.get(part)}
+    defaults = inspect.signature(CuReSAC).parameters
+    stale = {f"{part}_kwargs" for part in parts if changes[part] != settings.get(part, defaults[part].default)}
     return {**{key: value for key, value in settings.items() if key not in stale}, **changes}
 
 

@@ -19,6 +19,7 @@ POLICIES: dict[str, type[BasePolicy]] = {
 }
 
 
+# Persistence comes before CuRe, which in a resumed `learn` must see that the step count is not reset.
 class CuReSAC(Pretraining, Persistence, CuRe, SAC):  # type: ignore[misc]
     """SAC from pixels, with state representation learning and a curious policy that seeks badly represented states.
 

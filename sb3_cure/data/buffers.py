@@ -447,5 +447,5 @@ def infer_frame_stack(env: VecEnv | None) -> int:
         return stacked.stacked_obs.n_stack  # it slides these, whatever the environments inside stack
     frame_stack: Any = env.get_attr("frame_stack")[0] if env.has_attr("frame_stack") else 1
     shape = env.observation_space.shape or ()
-    fits = isinstance(frame_stack, int) and frame_stack > 0 and (len(shape) != 3 or shape[0] % frame_stack == 0)
-    return frame_stack if fits else 1
+    is_number = isinstance(frame_stack, int | np.integer) and frame_stack > 0
+    return int(frame_stack) if is_number and (len(shape) != 3 or shape[0] % frame_stack == 0) else 1

@@ -227,8 +227,8 @@ class _Record(BaseCallback):
 
     @property
     def has_reached_return(self) -> bool:
-        """Whether the cell ends early: its last two evaluations have reached ``stop_at_return``."""
-        limit, returns = self.cell.stop_at_return, [row["return_mean"] for row in self.evaluations[-2:]]
+        """Whether the cell ends early: its last two evaluations, after the one at the start, reached the limit."""
+        limit, returns = self.cell.stop_at_return, [row["return_mean"] for row in self.evaluations[1:][-2:]]
         return limit is not None and len(returns) == 2 and all(value != "" and value >= limit for value in returns)
 
     def _on_rollout_start(self) -> None:

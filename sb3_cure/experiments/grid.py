@@ -447,7 +447,9 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
         key: _merged(entry.get(key), value) if key in _MERGED else value for key, value in method.overrides.items()
     }
     entry = changed(entry, overrides)
-    entry.pop("n_timesteps", None)  # rl-zoo's; here the grid's budget says how long
+    if "n_timesteps" in overrides:
+        raise UsageError(f"method {name!r} of {path} overrides n_timesteps: the grid's budget says how long it trains.")
+    entry.pop("n_timesteps", None)
     if foreign := [setting for setting in OF_ZOO_ALONE if setting in entry]:
         raise UsageError(
             f"method {name!r} of {path} has {foreign[0]}, which `train` knows and grids do not: env_wrapper stacks "

@@ -96,6 +96,8 @@ def unit_of_errors(experiment: Experiment, task: str, method: str) -> str:
     :return: The head, or ``"reconstruction"`` if the reward has an autoencoder of its own; and whether it is per pixel
     """
     arguments = next(iter(experiment.finished_cells(task, method).values())).config["arguments"]
+    if arguments.get("curiosity", "separate") not in ("separate", "bonus"):  # then no reward is made
+        return str(arguments.get("srl", "rae"))
     options = arguments.get("intrinsic_kwargs") or {}
     rewards = arguments.get("intrinsic"), options.get("of")  # the latter is what "shuffled" shuffles
     own = "reconstruction" if "reconstruction" in rewards else arguments.get("srl", "rae")

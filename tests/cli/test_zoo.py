@@ -134,6 +134,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ------------------------------------------------------------------ training
 
 
+def test_evaluations_end_where_a_wrapper_ends_the_episode(folder: Path) -> None:
+    """rl-zoo3's Monitor is inside of the wrapper, and does not see this end."""
+    limit = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}}
+    train("--eval-freq", "8", "--eval-episodes", "1", env_wrapper=[limit])
+    folder = Path("logs/cure_sac", f"{RUN}_1")
+    assert set(np.load(folder / "evaluations.npz")["ep_lengths"].flat) == {3}
+    lengths = np.loadtxt(folder / "0.monitor.csv", delimiter=",", skiprows=2)[:, 1]
+    assert lengths.tolist() == [3] * 6
+
+
 def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
     assert (run / f"{RUN}.zip").is_file() and (run / "best_model.zip").is_file()
     assert set(np.load(run / "evaluations.npz")["ep_lengths"].flat) == {7}
@@ -155,15 +165,15 @@ def test_rate_and_curiosity_may_fall(folder: Path) -> None:
     assert (model.lr_schedule(0.5), model.curiosity_prob(0.5)) == (5e-4, 0.25)  # type: ignore[operator]
 
 
-def test_file_says_a_rate_as_people_write_it(folder: Path) -> None:
-    """1e-3 is a number here as in grids, and the flag -n stands in for the file's ``n_timesteps``."""
+def test_file_says_numbers_as_people_write_them(folder: Path) -> None:
+    """1e-3 is a number here as in grids, 5e1 a whole one; the flag -n stands in for the file's ``n_timesteps``."""
     settings = {name: value for name, value in SETTINGS.items() if name != "n_timesteps"}
-    text = yaml.safe_dump({"default": {**settings, "learning_rate": "RATE"}}).replace("RATE", "1e-3")
-    Path("settings.yml").write_text(text)
+    text = yaml.safe_dump({"default": {**settings, "learning_rate": "RATE", "buffer_size": "SIZE"}})
+    Path("settings.yml").write_text(text.replace("RATE", "1e-3").replace("SIZE", "5e1"))
     flags = ["--conf-file", "settings.yml", "--device", "cpu", "--eval-freq", "-1", "-n", "14"]
     assert main(["train", "--env", TASK, *flags]) == 0
     model = CuReSAC.load(f"logs/cure_sac/{RUN}_1/{RUN}.zip", device="cpu")
-    assert (model.lr_schedule(1), model.num_timesteps) == (1e-3, 14)
+    assert (model.lr_schedule(1), model.num_timesteps, model.buffer_size) == (1e-3, 14, 50)
     assert yaml.safe_load("1e-3") == "1e-3", "that of others is as it was"
 
 
@@ -224,6 +234,14 @@ def test_interrupted_training_keeps_its_model(
     assert "Stopped" not in (said := capsys.readouterr().out) and "Nothing was learned" not in said
     train("--eval-freq", "-1", "-i", path, "-n", "2")  # less than the warm-up, which is made again
     assert "Nothing was learned" in capsys.readouterr().out
+
+
+def test_trained_agent_keeps_its_networks(folder: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """rl-zoo3 drops others, and writes them into ``config.yml``."""
+    agent = ["-i", str(run / f"{RUN}.zip"), "--eval-freq", "-1"]
+    train(*agent, status=2, srl="heads_of_mine.Gentle", policy_kwargs={"net_arch": [9]})
+    assert "cannot become {'net_arch': [9]}" in capsys.readouterr().err
+    train(*agent, srl="heads_of_mine.Gentle")
 
 
 # -------------------------------------------------------------------- tuning

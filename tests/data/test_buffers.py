@@ -502,7 +502,7 @@ def test_one_number_of_frames_for_all_images() -> None:
         assert_equal(transitions(twins.ours, rows, envs), transitions(twins.sb3, rows, envs))
 
 
-@pytest.mark.parametrize(("said", "frames"), [(2, 2), (6, 6), (4, 1), (0, 1), (-2, 1), ("two", 1)])
+@pytest.mark.parametrize(("said", "frames"), [(2, 2), (np.int64(6), 6), (4, 1), (0, 1), (-2, 1), ("two", 1)])
 def test_environments_are_believed_where_channels_allow_it(said: Any, frames: int) -> None:
     """Of six channels, a positive number that divides them; around them, SB3's stacks slide."""
     env = DummyVecEnv([PixelBox])

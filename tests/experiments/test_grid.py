@@ -120,6 +120,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         dict(methods={"a": method(frame_stack=3)}),
         "method 'a' of .* has frame_stack, which `train` knows and grids do not: env_wrapper stacks",
     ),
+    "a length of rl-zoo3's": (dict(methods={"a": method(n_timesteps=9)}), "overrides n_timesteps: the grid's budget"),
     "an unknown baseline": (dict(baseline="sac"), "baseline is 'sac', but the methods are cure"),
     "pictures that heads cannot judge alike": (
         dict(kind="visitation", methods={str(n): method(env_kwargs={"frame_stack": n}) for n in (2, 3)}),

@@ -213,6 +213,7 @@ def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: l
     """A panel for each head, and for errors per pixel, but one of returns; constant images have errors of one unit."""
     others = {"cure_sac_ae": {"srl": "curl"}, "per_pixel": {"intrinsic_kwargs": {"per_pixel": True}}}
     others["drawn"] = {"srl": "curl", "intrinsic": "reconstruction"}  # whose own autoencoder measures
+    others["off"] = {"curiosity": None, "intrinsic": "reconstruction"}  # which is not built
     arms: dict[str, dict[str, Any]] = {"sac_ae": {"intrinsic_kwargs": None}, **others}
     write_grid(tmp_path, seeds=1, methods={arm: {} for arm in arms}, baseline="sac_ae")
     for arm, arguments in arms.items():
@@ -220,6 +221,7 @@ def test_errors_of_different_units_do_not_share_an_axis(tmp_path: Path, drawn: l
     figures = describe(tmp_path, drawn)
     panels = [f"{TASK}, {unit}" for unit in ("rae", "curl", "rae, per pixel", "reconstruction")]
     assert list(figures["task_srl_error.png"][0]) == panels
+    assert list(figures["task_srl_error.png"][0][panels[0]]) == ["sac_ae", "off"]
     assert list(figures["learning_curves.png"][0]) == [TASK]
 
     drawn.clear()
