@@ -51,8 +51,10 @@ def one_sentence(error: Exception, *functions: Any) -> str:
     if wrong is None:
         return text
     classes = [base for each in functions for base in (each.mro() if isinstance(each, type) else [each])]
-    known = {name for each in classes for name in inspect.signature(each).parameters}
-    return f"there is no argument {wrong[1]!r}{nearest(wrong[1], known - {'self', 'args', 'kwargs'})}"
+    known = {name: each for each in classes for name in inspect.signature(each).parameters}
+    if wrong[1] in known:
+        return f"there is no argument {wrong[1]!r} here, but in {known[wrong[1]].__name__}."
+    return f"there is no argument {wrong[1]!r}{nearest(wrong[1], known.keys() - {'self', 'args', 'kwargs'})}"
 
 
 @contextlib.contextmanager

@@ -87,9 +87,14 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
     before = read_json(path) if path.exists() else {}
     now = json.loads(json.dumps(settings, default=str))
     if key := first_difference(before, now, now):
+        was, is_now = before[key], now[key]
+        while isinstance(was, dict) and isinstance(is_now, dict):
+            absent = "left out"
+            inner = next(each for each in (*was, *is_now) if was.get(each, absent) != is_now.get(each, absent))
+            key, was, is_now = f"{key}.{inner}", was.get(inner, absent), is_now.get(inner, absent)
         raise UsageError(
-            f"{path.parent} was run with other settings: {key} was {before[key]!r} and is {now[key]!r} now. Choose "
-            "another --out, or remove that folder."
+            f"{path.parent} was run with other settings: {key} was {was!r} and is {is_now!r} now. Choose another "
+            "--out, or remove that folder."
         )
 
 

@@ -114,7 +114,10 @@ def _run_here(run_unit: RunUnit, units: Sequence[Unit]) -> list[Unit]:
         if not run_unit(unit):
             failed.append(unit)
         left = (time.monotonic() - start) * (len(units) / number - 1)
-        print(f"{number} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""), flush=True)
+        print(
+            f"{number - len(failed)} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""),
+            flush=True,
+        )
     return failed
 
 

@@ -37,6 +37,7 @@ TYPOS = {
     f"train {CARTPOLE} --conf-file broken.yml": "line 1, column",
     f"train {CARTPOLE} --conf-file twice.yml": "'tau' is there twice, in the mapping of line 1",
     f"{TRAIN} curiosity_porb:0.5": "did you mean curiosity_prob",
+    f"{TRAIN} net_arch:[8]": "no argument 'net_arch' here, but in CuRePolicy",
     f"{TRAIN} srl:curl": "'curl' is not defined",
     f"{TRAIN} srl:\"'crul'\"": "'curl'",
     f"{TRAIN} srl:\"'my_module.Mien'\"": "did you mean Mine?",
