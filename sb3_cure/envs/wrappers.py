@@ -323,11 +323,11 @@ class StackFrames(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _stacked_space(self, box: spaces.Box, axis: int) -> spaces.Box:
         low, high = (np.concatenate([bound] * self.frame_stack, axis) for bound in (box.low, box.high))
-        channels = low.shape[axis] if low.ndim == 3 else 0
-        if channels > min(low.shape):
+        if low.ndim == 3 and np.argmin(low.shape) != axis:  # so SB3 finds the channels
             raise ValueError(
-                f"frame_stack={self.frame_stack} images of shape {box.shape} have {channels} channels in all, but SB3 "
-                "takes the smallest dimension for the channels: choose larger images (image_size) or fewer frames."
+                f"frame_stack={self.frame_stack} images of shape {box.shape} have {low.shape[axis]} channels in all, "
+                "but SB3 takes the first of the smallest dimensions for the channels: choose larger images "
+                "(image_size) or fewer frames."
             )
         return spaces.Box(low, high, dtype=box.dtype.type)
 

@@ -17,6 +17,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils import env_checker as gym_checker
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.preprocessing import is_image_space_channels_first
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_cure.envs import (
@@ -561,6 +563,19 @@ def test_workers_give_the_same_stream():
 def test_bad_arguments_of_tasks_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_dmc_env(**{"domain": "cartpole", "task": "swingup", **kwargs})
+
+
+@pytest.mark.parametrize(("size", "channel_first"), [(36, True), (37, False)])
+def test_many_frames_are_stacked_if_sb3_finds_the_channels(size, channel_first):
+    """Of equal dimensions SB3 takes the first, so 36 channels that come last need larger images."""
+
+    def stack(size):
+        sides = dict(screen_height=size, screen_width=size, n_channels=3)
+        return StackFrames(FakeImageEnv(**sides, channel_first=channel_first, discrete=False), 12)
+
+    assert is_image_space_channels_first(stack(size).observation_space) == channel_first
+    with pytest.raises(ValueError, match="36 channels in all"):
+        stack(size - 1)
 
 
 class WithAlpha(Painting):
