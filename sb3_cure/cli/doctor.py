@@ -49,12 +49,15 @@ ADVICE = {
         "Some: try it with curiosity (fast/best_cure) and without (fast/best). On one such task curiosity met three "
         "times the rewards in training; returns were still zero."
     ),
-    1.0: "Most: leave curiosity out (curiosity=None). It was not shown to learn faster, and its updates take longer.",
+    1.0: (
+        "Most: begin without curiosity (fast/best), and try it (fast/best_cure) where learning stalls. On one such "
+        "task it added more than a third to the mean return over training, in twice the time."
+    ),
 }
 #: What to do where no two returns are equal
 DENSE = (
     "The reward is dense, or a cost of actions hides a sparse one, which returns cannot tell. If it is dense, leave "
-    "curiosity out (curiosity=None): it was not shown to learn faster, and its updates take longer."
+    "curiosity out (curiosity=None): on one such task it cost a fifth of the mean return, and its updates take longer."
 )
 #: Fewer random episodes say nothing
 MIN_EPISODES = 10
