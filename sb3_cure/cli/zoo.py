@@ -5,7 +5,7 @@ import os
 import sys
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from pprint import pprint
@@ -45,12 +45,12 @@ DEFAULT_SETTINGS = "cure_sac_ae"
 class ReportEnds(gym.Wrapper):
     """Reports episodes that wrappers end, which ``Monitor`` inside of them does not see: evaluations wait for them.
 
-    :param env: Environment with its wrappers
-    :param monitor: Its ``Monitor``
+    :param monitor: The environment in its ``Monitor``
+    :param wrap: Puts the wrappers around it
     """
 
-    def __init__(self, env: gym.Env, monitor: Monitor):
-        super().__init__(env)
+    def __init__(self, monitor: Monitor, wrap: Callable[[gym.Env], gym.Env]):
+        super().__init__(wrap(monitor))
         self.monitor = monitor
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -150,12 +150,10 @@ class ExperimentManager(exp_manager.ExperimentManager):
             list(named_wrappers(hyperparams.get(name)))  # or the nearest names
         arguments, env_wrapper, *others = super()._preprocess_hyperparams(hyperparams)
         if env_wrapper is not None:
-            wrap = env_wrapper  # which gets the environment in its Monitor
-            env_wrapper = lambda env: ReportEnds(wrap(env), env)  # noqa: E731
-        processed = arguments, env_wrapper, *others
+            env_wrapper = partial(ReportEnds, wrap=env_wrapper)
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
-        return processed
+        return arguments, env_wrapper, *others
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
