@@ -2,7 +2,6 @@
 #   docker build -t sb3-cure .
 #   docker run --rm -v "$PWD/logs:/home/cure/logs" sb3-cure train --env dmc_pixels/cartpole-swingup-v0 \
 #       --conf-file fast/cure_sac_ae
-# The image of a Ray cluster is another: zoo_configs/cluster/Dockerfile.
 FROM python:3.11-slim
 
 # hadolint ignore=DL3008

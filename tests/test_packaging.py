@@ -48,12 +48,12 @@ def run(command: list, folder: Path) -> str:
 
 
 def test_wheel_and_source_archive_hold_all_files(archives: tuple[Path, Path]) -> None:
-    """Every module, template and YAML file, but for those of clusters, which need a checkout."""
+    """Every module, template and YAML file."""
     with tarfile.open(archives[0]) as source, zipfile.ZipFile(archives[1]) as wheel:
         in_source = {name.partition("/")[2] for name in source.getnames()}
         in_wheel = {name for name in wheel.namelist() if "dist-info" not in name}
     files = [path for path in (ROOT / "sb3_cure").rglob("*") if path.is_file() and path.suffix != ".pyc"]
-    files += [path for path in ZOO.rglob("*.yml") if "cluster" not in path.parts]
+    files += ZOO.rglob("*.yml")
     assert in_wheel == {path.relative_to(ROOT).as_posix() for path in files}
     assert in_wheel | {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md"} <= in_source
     assert not any(name.startswith("tests") for name in in_source)

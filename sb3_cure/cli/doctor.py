@@ -36,7 +36,6 @@ EXTRAS = {
     "demo": "plots, videos, TensorBoard, progress bars",
     "zoo": "training and tuning from YAML files",
     "experiments": "grids of experiments and their report",
-    "cluster": "the same on several machines",
     "notebooks": "running the notebooks",
 }
 #: What to do, by the largest share of random episodes with a reward to which the advice applies

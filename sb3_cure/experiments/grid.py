@@ -515,7 +515,7 @@ def check_arms(cells: Iterable[Cell]) -> None:
                 if cell.kind == "visitation" and isinstance(env.observation_space, gym.spaces.Dict):
                     raise ValueError("visitation compares errors of one image or vector, but this is a dictionary.")
                 cell.make_model(env, device="cpu", buffer_size=1)
-        except GLUnavailableError:  # with Ray other machines may have OpenGL
+        except GLUnavailableError:  # another machine may have OpenGL
             return
         except Exception as error:
             reason = f"{type(error).__name__}: {one_sentence(error, ALGORITHMS[cell.algo], make_dmc_env)}"

@@ -1,75 +1,65 @@
-"""Run a grid: in this process, or on Ray (this machine or a cluster)."""
+"""Run a grid: in this process, or in several side by side."""
 
 import argparse
-import os
 import re
 import shutil
+import signal
+import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
+from multiprocessing import connection, get_context
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
+
+import torch as th
 
 from sb3_cure.cli.progress import time_text
-from sb3_cure.cli.usage import UsageError, install_command
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import ERROR, Grid, check_arms, load_grid, read_json
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
+from sb3_cure.vec_env.workers import leave_with_parent
 
-ENGINES = ("local", "ray")
 #: Runs a unit, and tells whether it is done
 RunUnit: TypeAlias = Callable[[Unit], bool]
-#: Runs units, and returns those that failed
-RunAll: TypeAlias = Callable[[Sequence[Unit]], list[Unit]]
 
 
 def run_grid(
     grid: Grid,
     results: str | Path,
     *,
-    engine: str = "local",
+    jobs: int = 1,
     checkpoint_minutes: float = 10.0,
     pictures: bool = True,
-    address: str | None = None,
-    cpus_per_cell: float = 1,
-    gpus_per_cell: float = 0,
-    retries: int = 3,
 ) -> list[Unit]:
     """Run the cells that are not done; after an interruption, the same call continues.
 
     In a grid of kind ``"visitation"`` common heads follow when all cells are done.
 
     :param grid: The grid
-    :param results: Folder of all results; with several machines one that they share
-    :param engine: ``"local"``: one after the other in this process; ``"ray"``: side by side in worker processes
+    :param results: Folder of all results
+    :param jobs: Cells at a time. Several run in processes of their own, which share torch's threads and the GPU
     :param checkpoint_minutes: Minutes between two checkpoints, the most that an interruption loses of a cell
     :param pictures: Whether to draw and to film each cell as well
-    :param address: Of a Ray cluster (``"auto"`` from within it); None: a cluster of this machine alone
-    :param cpus_per_cell: Ray: cores per cell or common head, also its threads
-    :param gpus_per_cell: Ray: share of a GPU per cell; 0.25 lets four cells share a card, 0 computes on the CPU
-    :param retries: Ray: how often a cell is started again after its worker died, from its checkpoint
     :return: The cells and common heads that are not done: those that failed, each with its traceback in ``error.txt``,
         and those that another process is running
     :raises UsageError: with one sentence, before anything is written, if the grid cannot be run
     """
-    if engine not in ENGINES:
-        raise UsageError(f"engine must be one of {', '.join(ENGINES)}, not {engine!r}.")
     results = Path(results).resolve()
     check_grid(grid, results)
     run_unit = partial(_run_unit, results=results, checkpoint_minutes=checkpoint_minutes, pictures=pictures)
-    resources = dict(num_cpus=cpus_per_cell, num_gpus=gpus_per_cell, max_retries=retries)
-    here = nullcontext(partial(_run_here, run_unit))
-    with _ray(address, resources, run_unit, results) if engine == "ray" else here as run_all:
-        _write_grid(grid, results / grid.experiment)
-        for cell in grid.cells:
-            if cell.is_done(results):  # and was killed before it removed this
-                shutil.rmtree(results / cell.folder / "checkpoint", ignore_errors=True)
-        failed = run_all([cell for cell in grid.cells if not cell.is_done(results)])
-        heads = common_heads(grid, results)
-        failed += run_all([each for each in heads if not each.is_done(results)])
+    run_all = partial(_run_here, run_unit) if jobs == 1 else partial(_run_side_by_side, run_unit, jobs, results)
+    _write_grid(grid, results / grid.experiment)
+    for cell in grid.cells:
+        if cell.is_done(results):  # and was killed before it removed this
+            shutil.rmtree(results / cell.folder / "checkpoint", ignore_errors=True)
+    failed = run_all([cell for cell in grid.cells if not cell.is_done(results)])
+    heads = common_heads(grid, results)
+    failed += run_all([each for each in heads if not each.is_done(results)])
     lacking = {cell.task for cell in grid.cells if grid.kind == "visitation"} - {each.task for each in heads}
     for task in sorted(lacking):
         print(f"No common heads for {task}: they need two seeds of which all methods are finished, with model.zip.")
@@ -105,20 +95,60 @@ def _write_grid(grid: Grid, folder: Path) -> None:
     write_json(path, description)
 
 
-# ---------------------------------------------------------------- engines
+# ---------------------------------------------------------------- cells
 
 
 def _run_here(run_unit: RunUnit, units: Sequence[Unit]) -> list[Unit]:
-    failed, start = [], time.monotonic()
-    for number, unit in enumerate(units, 1):
+    failed: list[Unit] = []
+    start = time.monotonic()
+    for n_ended, unit in enumerate(units, 1):
         if not run_unit(unit):
             failed.append(unit)
-        left = (time.monotonic() - start) * (len(units) / number - 1)
-        print(
-            f"{number - len(failed)} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""),
-            flush=True,
-        )
+        _print_progress(start, n_ended, len(failed), len(units))
     return failed
+
+
+def _run_side_by_side(run_unit: RunUnit, jobs: int, results: Path, units: Sequence[Unit]) -> list[Unit]:
+    """Run each unit in a process of its own, ``jobs`` of them at a time."""
+    context, threads = get_context("spawn"), max(th.get_num_threads() // jobs, 1)
+    waiting, failed = list(units), []
+    running: dict[SpawnProcess, Unit] = {}
+    start = time.monotonic()
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                unit = waiting.pop(0)
+                process = context.Process(target=_work, args=(run_unit, threads, unit))
+                process.start()
+                running[process] = unit
+            connection.wait([process.sentinel for process in running])
+            for process in [each for each in running if not each.is_alive()]:
+                unit, code = running.pop(process), process.exitcode or 0
+                if code != 0:
+                    failed.append(unit)
+                if code < 0:
+                    _write_error(unit, results, f"its process was killed by {signal.Signals(-code).name}\n")
+                _print_progress(start, len(units) - len(waiting) - len(running), len(failed), len(units))
+    finally:  # Ctrl-C
+        for process in running:
+            process.terminate()
+            process.join()
+    return failed
+
+
+def _work(run_unit: RunUnit, threads: int, unit: Unit) -> None:
+    """Run a unit in a worker process, whose status tells whether it is done."""
+    # Ctrl-C reaches all processes of a terminal, but the parent decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=leave_with_parent, daemon=True).start()
+    th.set_num_threads(threads)
+    raise SystemExit(0 if run_unit(unit) else 1)
+
+
+def _print_progress(start: float, n_ended: int, n_failed: int, n_all: int) -> None:
+    left = (time.monotonic() - start) * (n_all / n_ended - 1)
+    line = f"{n_ended - n_failed} of {n_all} finished"
+    print(f"{line}, about {time_text(left)} left" if left else line, flush=True)
 
 
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
@@ -141,57 +171,11 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
     return True
 
 
-def _run_on_worker(run_unit: RunUnit, has_gpu: bool, unit: Unit) -> bool:
-    """Run a unit in a Ray worker, and hide the GPUs from it if it needs none, which Ray does not do."""
-    if not has_gpu:
-        os.environ["CUDA_VISIBLE_DEVICES"] = ""
-    return run_unit(unit)
-
-
 def _write_error(unit: Unit, results: Path, text: str) -> None:
     print(f"{unit.folder}: failed: {text.strip().splitlines()[-1]}", flush=True)
     with suppress(OSError):  # such as a full disk, which may have been the reason
         (results / unit.folder).mkdir(parents=True, exist_ok=True)
         write_text(results / unit.folder / ERROR, text)
-
-
-@contextmanager
-def _ray(address: str | None, resources: dict[str, Any], run_unit: RunUnit, results: Path) -> Iterator[RunAll]:
-    """Connect to a cluster with the resources that a cell needs."""
-    try:
-        import ray
-    except ImportError:
-        needs = f'engine="ray" needs Ray, which is not installed: {install_command("cluster")}.'
-        raise UsageError(needs) from None
-    own: dict[str, Any] = {"object_store_memory": 10**8, "include_dashboard": False} if address is None else {}
-    ray.init(address=address or "local", **own)
-    try:
-        # One process per unit, so that nothing of a unit burdens the next.
-        remote = ray.remote(max_calls=1, **resources)(_run_on_worker)
-        yield partial(_run_remotely, partial(remote.remote, run_unit, bool(resources["num_gpus"])), results)
-    finally:
-        ray.shutdown()
-
-
-def _run_remotely(start: Callable[[Unit], Any], results: Path, units: Sequence[Unit]) -> list[Unit]:
-    import ray
-
-    failed, pending = [], {start(unit): unit for unit in units}
-    while pending:
-        for reference in ray.wait(list(pending), timeout=5)[0]:
-            unit = pending.pop(reference)
-            try:
-                succeeded = ray.get(reference)
-            except ray.exceptions.RayError as died:  # more often than `retries`
-                succeeded = False
-                _write_error(unit, results, f"{died}\n")
-            if succeeded and not (results / unit.folder).exists():
-                succeeded = False
-                error = f"{results} on the worker's machine is another folder than here: share one (--out)"
-                _write_error(unit, results, error)
-            if not succeeded:
-                failed.append(unit)
-    return failed
 
 
 # ---------------------------------------------------------------- progress
@@ -235,6 +219,12 @@ def _steps(text: str) -> int:
     return round(float(match[1]) * {"": 1, "k": 1_000, "M": 1_000_000}[match[2]])
 
 
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"must be 1 or more, not {text!r}")
+    return int(text)
+
+
 def _seed_choice(text: str) -> int | list[int]:
     return [int(part) for part in text.split(",") if part] if "," in text else int(text)
 
@@ -257,11 +247,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--methods", type=_names, help="some of the grid's methods")
     budget = "environment steps of training, such as 100k; those of pretraining and coverage change in proportion"
     add("--budget", type=_steps, help=budget)
-    add("--engine", choices=ENGINES, default="local", help="in this process, or on Ray")
-    add("--address", help="of a Ray cluster (auto: the one this machine is part of)")
-    add("--cpus-per-cell", type=float, default=1, help="Ray: cores per cell (default: 1)")
-    add("--gpus-per-cell", type=float, default=0, help="Ray: share of a GPU per cell (default: 0, compute on the CPU)")
-    add("--retries", type=int, default=3, help="Ray: new starts of a cell after its worker died")
+    add("--jobs", type=_positive, default=1, help="cells at a time, each in a process of its own (default: 1)")
     add("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     add("--no-pictures", dest="pictures", action="store_false", help="neither draw nor film")
     add("--dry-run", action="store_true", help="list the cells and their states, run nothing")

@@ -31,7 +31,7 @@ CLOSE_SECONDS, KILL_SECONDS = 10.0, 2.0
 _STATE = ("attributes", "seed", "options", "restarts", "faults_in_a_row", "last_obs")
 
 
-def _leave_with_parent() -> None:
+def leave_with_parent() -> None:
     """End this process soon after its parent, as one that hangs in a step does not see the end of its pipe."""
     parent: Any = mp.parent_process()
     started_by = os.getppid()  # siblings that were forked hold the parent's pipes open, but change no process id
@@ -52,7 +52,7 @@ def _work(remote: Connection, parent_remote: Connection, make_env: CloudpickleWr
     # Ctrl-C reaches all processes of a terminal, and SIGTERM all of a job, but the parent decides what they mean.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    threading.Thread(target=leave_with_parent, daemon=True).start()
     if again:
         # Otherwise its Monitor would empty the file with the episodes before the fault.
         Monitor.__init__ = partialmethod(Monitor.__init__, override_existing=False)  # type: ignore[assignment]

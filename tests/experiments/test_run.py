@@ -6,17 +6,19 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import psutil
 import pytest
 from grids_for_tests import method, steps_of, write_grid
 
 from sb3_cure import CuReSAC
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.result_files import read_rows
-from sb3_cure.experiments import cells, heads, run
+from sb3_cure.experiments import cells, run
 from sb3_cure.experiments.grid import load_grid
 
 QUICK: dict[str, Any] = dict(budget=40, evaluation=dict(every=40, episodes=1))
@@ -138,8 +140,7 @@ def test_states_of_cells(tmp_path: Path) -> None:
 
 # ------------------------------------------------------------------- processes
 
-#: Steps take a while, so that there is something to be killed; with CARDS the first ones wait until two processes
-#: have begun, and tell what cards they see.
+#: Steps take a while, so that there is something to be killed; the first ones wait until two processes have begun.
 SLOW_BOX = """
 import os, time
 from pathlib import Path
@@ -151,10 +152,8 @@ from envs_for_tests import PixelBox
 class SlowBox(PixelBox):
     def step(self, action):
         time.sleep(0.005)
-        if folder := os.environ.get("CARDS"):
-            told = Path(folder) / str(os.getpid())
-            if not told.exists():  # once: a process may be killed at any later step
-                told.write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+        if folder := os.environ.get("TOGETHER"):
+            (Path(folder) / str(os.getpid())).touch()
             deadline = time.monotonic() + 120
             while len(list(Path(folder).iterdir())) < 2:
                 assert time.monotonic() < deadline, "no other process has begun"
@@ -164,23 +163,50 @@ class SlowBox(PixelBox):
 
 gym.register("tests/SlowBox-v0", SlowBox)
 """
-#: The command, with common heads that are soon fitted
-COMMAND = "from sb3_cure.experiments import cells, heads, run; heads.COMMON_UPDATES = 5; raise SystemExit(run.main())"
+
+
+class SideBySide:
+    """The command that runs both cells of a grid at the same time.
+
+    :param path: The grid
+    """
+
+    def __init__(self, path: Path):
+        self.grid, self.out, self.begun = load_grid(path), path.parent / "out", path.parent / "begun"
+        self.begun.mkdir()
+        command = [sys.executable, "-m", "sb3_cure.cli.main", "experiment", str(path), "--out", str(self.out)]
+        options = ["--no-pictures", "--checkpoint-minutes", "0", "--jobs", "2"]
+        environment = {**os.environ, "TOGETHER": str(self.begun)}
+        self.process = subprocess.Popen(
+            [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+        )
+
+    def wait_for_training(self) -> None:
+        """Wait until both cells are in the midst of training."""
+        cells = self.grid.cells
+        wait_for(lambda: all(has_evaluated(self.out / cell.folder) for cell in cells))
+        assert not any(cell.is_done(self.out) for cell in cells)
+        self.workers = [int(file.name) for file in self.begun.iterdir()]
+
+    def holder(self, cell: Any) -> int:
+        """The worker that runs a cell."""
+        locked = (self.out / cell.folder / ".lock").resolve()
+        (holder,) = [pid for pid in self.workers if locked in open_files(pid)]
+        return holder
 
 
 @pytest.fixture
-def slow_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Function that writes a grid on a task whose steps take a while, in the working directory."""
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SideBySide]:
+    """A command with two cells of a task whose steps take a while."""
     (tmp_path / "slow_box.py").write_text(SLOW_BOX)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(["", *sys.path]))
-    return lambda **changes: write_grid(tmp_path, tasks=["slow_box:tests/SlowBox-v0"], **changes)
-
-
-def launch(path: Path, out: Path, *options: str) -> subprocess.Popen:
-    command = [sys.executable, "-c", COMMAND, str(path), "--out", str(out), "--no-pictures", *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    evaluation = dict(every=100, episodes=1)
+    running = SideBySide(write_grid(tmp_path, tasks=["slow_box:tests/SlowBox-v0"], seeds=2, evaluation=evaluation))
+    running.wait_for_training()
+    yield running
+    running.process.kill()
 
 
 def wait_for(what: Any, seconds: float = 400) -> Any:
@@ -198,60 +224,6 @@ def has_evaluated(folder: Path) -> bool:
     return path.exists() and len(read_rows(path)) > 1
 
 
-def outcome(folder: Path) -> Any:
-    evaluations = [{**row, "seconds": 0, "cpu_seconds": 0} for row in read_rows(folder / "eval.csv")]
-    return evaluations, (folder / "episodes.csv").read_text()
-
-
-def test_killed_grid_ends_like_one_that_was_not(tmp_path: Path, slow_grid: Any) -> None:
-    """kill -9 in the middle of a cell: the same command finishes it with the same rows as without the kill."""
-    path = slow_grid(evaluation=dict(every=100, episodes=1))
-    (cell,) = load_grid(path).cells
-    process = launch(path, tmp_path / "out", "--checkpoint-minutes", "0")
-    wait_for(lambda: has_evaluated(tmp_path / "out" / cell.folder))
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not cell.is_done(tmp_path / "out")
-    for out in ("out", "whole"):
-        assert run.run_grid(load_grid(path), tmp_path / out, pictures=False) == []
-    killed, whole = (outcome(tmp_path / out / cell.folder) for out in ("out", "whole"))
-    assert killed == whole and steps_of(tmp_path / "out" / cell.folder) == [0, 100, 200, 300, 400]
-    assert json.loads((tmp_path / "out" / cell.folder / "run.json").read_text())["attempts"] == 2
-
-
-def test_killed_ray_worker_costs_nothing(tmp_path: Path, slow_grid: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two cells of half a card each run at the same time, on that card; one is killed half-way and begun again. All
-    rows, also those of the common heads that follow, are those of one process without a kill."""
-    pytest.importorskip("ray")
-    (tmp_path / "seen").mkdir()
-    methods = {"cure": method(device="cpu")}  # where the machine has a card of its own
-    path = slow_grid(kind="visitation", seeds=2, budget=300, evaluation=dict(every=100, episodes=1), methods=methods)
-    grid, out = load_grid(path), tmp_path / "out"
-    with monkeypatch.context() as card:
-        card.delenv("CUDA_VISIBLE_DEVICES")  # of the tests; Ray sets those of its workers
-        card.setenv("CARDS", str(tmp_path / "seen"))
-        card.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1, "CPU": 4}')  # Ray takes any machine's word for its cards
-        ray = ["--engine", "ray", "--gpus-per-cell", "0.5", "--checkpoint-minutes", "0"]
-        process = launch(path, out, *ray)
-        try:
-            victim = wait_for(lambda: next((cell for cell in grid.cells if has_evaluated(out / cell.folder)), None))
-            holders = [int(each.name) for each in (tmp_path / "seen").iterdir()]
-            locked = (out / victim.folder / ".lock").resolve()
-            (holder,) = [pid for pid in holders if locked in open_files(pid)]
-            os.kill(holder, signal.SIGKILL)
-            assert process.wait(timeout=600) == 0
-        finally:
-            process.kill()
-    assert {card.read_text() for card in (tmp_path / "seen").iterdir()} == {"0"}
-    assert json.loads((out / victim.folder / "run.json").read_text())["attempts"] == 2
-    monkeypatch.setattr(heads, "COMMON_UPDATES", 5)
-    assert run.run_grid(grid, tmp_path / "here", pictures=False) == []
-    for cell in grid.cells:
-        assert outcome(out / cell.folder) == outcome(tmp_path / "here" / cell.folder)
-        there, here = (read_rows(folder / cell.folder / "visitation.csv") for folder in (out, tmp_path / "here"))
-        assert there == here and any(row["head"] == "common" for row in here)
-
-
 def open_files(pid: int) -> set[Path]:
     """Of a process that may have ended."""
     try:
@@ -260,22 +232,40 @@ def open_files(pid: int) -> set[Path]:
         return set()
 
 
-def test_unknown_engine_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="engine must be one of local, ray"):
-        run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", engine="rya")
-    assert not (tmp_path / "out").exists()
+def outcome(folder: Path) -> Any:
+    evaluations = [{**row, "seconds": 0, "cpu_seconds": 0} for row in read_rows(folder / "eval.csv")]
+    return evaluations, (folder / "episodes.csv").read_text()
 
 
-def test_workers_without_share_see_no_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ray keeps no account of what nobody asks for: a cell per core would compute on the first card."""
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
-    seen: list[str] = []
-    (cell,) = load_grid(write_grid(tmp_path)).cells
+def test_killed_grid_ends_like_one_that_was_not(command: SideBySide, tmp_path: Path) -> None:
+    """kill -9 in the middle of two cells: their processes leave, and the same command finishes both with the same rows
+    as without the kill."""
+    killed, whole = command.out, tmp_path / "whole"
+    command.process.kill()
+    wait_for(lambda: not any(psutil.pid_exists(pid) for pid in command.workers))
+    for out in (killed, whole):
+        assert run.run_grid(command.grid, out, pictures=False) == []
+    for cell in command.grid.cells:
+        assert outcome(killed / cell.folder) == outcome(whole / cell.folder)
+        assert steps_of(whole / cell.folder) == [0, 100, 200, 300, 400]
+        assert json.loads((killed / cell.folder / "run.json").read_text())["attempts"] == 2
 
-    def run_unit(*_: Any) -> bool:
-        seen.append(os.environ["CUDA_VISIBLE_DEVICES"])
-        return True
 
-    for has_gpu in (True, False):
-        run._run_on_worker(run_unit, has_gpu, cell)
-    assert seen == ["0", ""]
+def test_killed_worker_stops_no_other(command: SideBySide) -> None:
+    """The command finishes the other cell, and says what became of this one."""
+    victim, other = command.grid.cells
+    os.kill(command.holder(victim), signal.SIGKILL)
+    printed, _ = command.process.communicate(timeout=600)
+    assert command.process.returncode == 1 and "1 of 2 finished" in printed
+    assert other.is_done(command.out) and not victim.is_done(command.out)
+    assert "killed by SIGKILL" in (command.out / victim.folder / "error.txt").read_text()
+
+
+def test_interrupted_command_leaves_no_worker(command: SideBySide) -> None:
+    """Ctrl-C ends in one sentence."""
+    for pid in [*command.workers, command.process.pid]:  # as a terminal does
+        os.kill(pid, signal.SIGINT)
+    printed, _ = command.process.communicate(timeout=600)
+    assert command.process.returncode == 130 and printed.splitlines()[-1].startswith("Stopped: ")
+    assert "Traceback" not in printed and not any(cell.is_done(command.out) for cell in command.grid.cells)
+    assert not any(psutil.pid_exists(pid) for pid in command.workers)
