@@ -128,21 +128,6 @@ def arm_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     return chosen | {arm: free[index % len(free)] for index, arm in enumerate(others)}
 
 
-def learning_curve(path: Path, rows: Sequence[Mapping[str, float]], random_return: float, title: str) -> None:
-    """Return on a task of the DeepMind Control suite over environment steps, with a line for the random policy.
-
-    :param path: File to write
-    :param rows: Evaluations with ``environment_steps`` and ``task_return``
-    :param random_return: Mean return of uniformly random actions
-    :param title: Title of the figure
-    """
-    steps = np.array([row["environment_steps"] for row in rows])
-    returns = np.array([[row["task_return"] for row in rows]])
-    curves = {"task policy": (steps, returns), "random policy": (steps, np.full(returns.shape, random_return))}
-    colors = {f"{actor} policy": color for actor, color in COLORS.items()}
-    learning_curves(path, {title: curves}, colors, "return of an episode\n(at most 1000)")
-
-
 @in_style
 def learning_curves(
     path: PathOrFile,

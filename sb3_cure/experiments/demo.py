@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\nMeasuring the random, task and curious policies")
     random, final = (_returns(model, eval_env, actor) for actor in ("random", "task"))
     write_csv(out / "learning_curve.csv", list(progress.rows[0]), progress.rows)
-    plots.learning_curve(out / "learning_curve.png", progress.rows, float(random.mean()), title)
+    _draw_returns(progress.rows, float(random.mean()), title, out)
     errors = _draw_curiosity(model, eval_env, out)
     _film(model, eval_env, out)
     steps = model.num_timesteps
@@ -194,6 +194,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _returns(model: CuReSAC, eval_env: Any, actor: str) -> np.ndarray:
     """Returns of a policy that acts alone."""
     return np.array([episode.total_reward for episode in run_episodes(model, eval_env, EPISODES, actor, seed=20_000)])
+
+
+def _draw_returns(rows: list[dict[str, float]], random_return: float, title: str, out: Path) -> None:
+    """Draw the learning curve, with a line for the random policy."""
+    steps = np.array([row["environment_steps"] for row in rows])
+    returns = np.array([[row["task_return"] for row in rows]])
+    curves = {"task policy": (steps, returns), "random policy": (steps, np.full(returns.shape, random_return))}
+    colors = {f"{actor} policy": color for actor, color in plots.COLORS.items()}
+    label = "return of an episode\n(at most 1000)"
+    plots.learning_curves(out / "learning_curve.png", {title: curves}, colors, label)
 
 
 def _draw_curiosity(model: CuReSAC, eval_env: Any, out: Path) -> dict[str, float]:
