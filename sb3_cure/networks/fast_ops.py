@@ -5,7 +5,8 @@ from typing import Any
 import torch as th
 from torch.nn import functional as F
 
-#: With at most this many channels, a transposed convolution is faster as a convolution of the padded images
+#: With at most this many channels, a transposed convolution is faster as a convolution of the padded images: in bf16
+#: oneDNN needs 1.5 times as long for the former
 FEW_CHANNELS = 16
 #: The bits of minus infinity in bf16, as an integer. All negative numbers are below it, NaNs are not
 MINUS_INFINITY = -128
@@ -49,11 +50,7 @@ def relu_backward(gradient: th.Tensor, result: th.Tensor) -> th.Tensor:
 
 
 class Convolution(th.autograd.Function):
-    """Convolution, or its transpose with stride 1, followed by an optional ReLU.
-
-    The gradient of either with respect to the images is the other, so backward passes use the fast variant too: for
-    few channels in bf16, oneDNN needs 1.5 times as long for a transposed convolution.
-    """
+    """Convolution, or its transpose with stride 1, followed by an optional ReLU."""
 
     @staticmethod
     def forward(
@@ -87,10 +84,8 @@ class Convolution(th.autograd.Function):
         needs_images, needs_weight, needs_bias, *_ = ctx.needs_input_grad
         sizes = [ctx.stride] * 2, [0, 0], [1, 1], ctx.transposed, [0, 0], 1
         images_grad, weight_grad, _ = th.ops.aten.convolution_backward(
-            gradient, images, weight, None, *sizes, [needs_images and ctx.stride > 1, needs_weight, False]
+            gradient, images, weight, None, *sizes, [needs_images, needs_weight, False]
         )
-        if needs_images and ctx.stride == 1:
-            images_grad = _convolve(gradient, weight, None, 1, not ctx.transposed)
         # Inside convolution_backward the bias's gradient would cost as much as that of the weights.
         return images_grad, weight_grad, gradient.sum((0, 2, 3)) if needs_bias else None, None, None, None
 
