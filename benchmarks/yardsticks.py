@@ -23,21 +23,14 @@ from sb3_cure.evaluation.result_files import Row, describe_run, read_rows, write
 from sb3_cure.evaluation.rollouts import run_episodes, srl_errors
 from sb3_cure.experiments.grid import short_name
 from sb3_cure.experiments.heads import fit_head, observation_batch
+from sb3_cure.experiments.published import SRL_ERROR
 from sb3_cure.experiments.tables import NONE, Table
 from sb3_cure.experiments.visitation import constant_errors, mean_target
 
 TASKS = ("cartpole-swingup", "finger-spin", "finger-turn_easy", "ball_in_cup-catch", "reacher-easy", "reacher-hard")
 #: Numbers of updates after which the autoencoder is measured
 UPDATES = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50)
-#: Minimum, mean and maximum that the paper reports for a random and for a curious policy (last table of its appendix)
-PAPER = {
-    "cartpole-swingup": {"random": (0.0002, 0.0002, 0.0003), "cure": (0.0531, 0.054, 0.0548)},
-    "finger-spin": {"random": (0.0002, 0.0003, 0.0004), "cure": (0.0755, 0.0766, 0.0774)},
-    "finger-turn_easy": {"random": (0.0003, 0.0004, 0.0006), "cure": (0.0749, 0.0759, 0.0769)},
-    "ball_in_cup-catch": {"random": (0.0005, 0.0006, 0.0008), "cure": (0.0762, 0.0774, 0.0783)},
-    "reacher-easy": {"random": (0.0001, 0.0002, 0.0003), "cure": (0.039, 0.0399, 0.0424)},
-    "reacher-hard": {"random": (0.0002, 0.0003, 0.0008), "cure": (0.0393, 0.0397, 0.0404)},
-}
+_PAPER = {"random": "random", "cure": "curious"}
 COLUMNS = ("task", "predictor", "updates", "seed", "error_min", "error_mean", "error_max")
 
 
@@ -88,13 +81,13 @@ def table(errors: pd.DataFrame, elsewhere: pd.DataFrame) -> Table:
     :return: These beside the paper's numbers
     """
     tasks = [task for task in TASKS if task in set(errors.task)]
-    rows = {f"paper: {policy}": [_text(*PAPER[task][policy]) for task in tasks] for policy in ("random", "cure")}
-    means_of_cure = {task: PAPER[task]["cure"][1] for task in tasks}
+    papers = {task: SRL_ERROR[task.replace("-", "_")] for task in tasks}
+    rows = {f"paper: {name}": [_text(*papers[task][actor]) for task in tasks] for name, actor in _PAPER.items()}
     for (mujoco, predictor), own in elsewhere.groupby(["mujoco", "predictor"], sort=False):
         means = own.groupby("task").error_mean.mean()
         rows[f"{predictor}, MuJoCo {mujoco}"] = _texts(own, tasks)
         rows[f"paper's cure / {predictor}, MuJoCo {mujoco}"] = [
-            f"{means_of_cure[task] / means[task]:.3g}" if task in means else NONE for task in tasks
+            f"{papers[task]['curious'].mean / means[task]:.3g}" if task in means else NONE for task in tasks
         ]
     autoencoder = errors[errors.predictor == "autoencoder"]
     last = autoencoder.updates.max()
@@ -104,7 +97,7 @@ def table(errors: pd.DataFrame, elsewhere: pd.DataFrame) -> Table:
     rows["updates until its error is below the paper's cure"] = []
     for task in tasks:
         curve = autoencoder[autoencoder.task == task].groupby("updates").error_mean.mean()
-        below = curve.index[curve < means_of_cure[task]]
+        below = curve.index[curve < papers[task]["curious"].mean]
         rows["updates until its error is below the paper's cure"].append(f"{below[0]}" if len(below) else f"> {last}")
     lines = [[name, *texts] for name, texts in rows.items()]
     frame = pd.DataFrame(lines, columns=["mean (min to max)", *(f">{task}" for task in tasks)])
