@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -62,10 +61,9 @@ def processor() -> str:
 def code_commit() -> str | None:
     """Find the commit of the running code.
 
-    :return: ``SB3_CURE_COMMIT`` (set in images without a checkout), else the commit of the package's checkout, marked
-        if it has changes; None if unknown
+    :return: Commit of the package's checkout, marked if it has changes; None if it is none
     """
-    return os.environ.get("SB3_CURE_COMMIT") or checkout_commit(Path(sb3_cure.__file__).parent.parent)
+    return checkout_commit(Path(sb3_cure.__file__).parent.parent)
 
 
 def checkout_commit(folder: Path) -> str | None:

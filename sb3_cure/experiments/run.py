@@ -7,10 +7,10 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
-from multiprocessing import connection, get_context
+from multiprocessing import connection, get_context, resource_tracker
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TypeAlias
@@ -18,12 +18,15 @@ from typing import TypeAlias
 import torch as th
 
 from sb3_cure.cli.progress import time_text
+from sb3_cure.cli.usage import UsageError
 from sb3_cure.evaluation.result_files import read_rows, write_json, write_text
 from sb3_cure.experiments.cells import CellIsRunning, check_cell, check_settings, is_held, run_cell
 from sb3_cure.experiments.grid import ERROR, Grid, check_arms, load_grid, read_json
 from sb3_cure.experiments.heads import CommonHeads, Unit, common_heads, run_heads
 from sb3_cure.vec_env.workers import leave_with_parent
 
+#: Seconds in which worker processes may close their environments after Ctrl-C
+LEAVE_SECONDS = 10.0
 #: Runs a unit, and tells whether it is done
 RunUnit: TypeAlias = Callable[[Unit], bool]
 
@@ -42,13 +45,16 @@ def run_grid(
 
     :param grid: The grid
     :param results: Folder of all results
-    :param jobs: Cells at a time. Several run in processes of their own, which share torch's threads and the GPU
+    :param jobs: Cells at a time. Several run in new processes, which share torch's threads and the GPU, and know only
+        tasks and classes that are named with their module
     :param checkpoint_minutes: Minutes between two checkpoints, the most that an interruption loses of a cell
     :param pictures: Whether to draw and to film each cell as well
     :return: The cells and common heads that are not done: those that failed, each with its traceback in ``error.txt``,
         and those that another process is running
     :raises UsageError: with one sentence, before anything is written, if the grid cannot be run
     """
+    if jobs < 1:
+        raise UsageError(f"jobs must be 1 or more, not {jobs}.")
     results = Path(results).resolve()
     check_grid(grid, results)
     run_unit = partial(_run_unit, results=results, checkpoint_minutes=checkpoint_minutes, pictures=pictures)
@@ -99,12 +105,15 @@ def _write_grid(grid: Grid, folder: Path) -> None:
 
 
 def _run_here(run_unit: RunUnit, units: Sequence[Unit]) -> list[Unit]:
-    failed: list[Unit] = []
-    start = time.monotonic()
-    for n_ended, unit in enumerate(units, 1):
+    failed, start = [], time.monotonic()
+    for number, unit in enumerate(units, 1):
         if not run_unit(unit):
             failed.append(unit)
-        _print_progress(start, n_ended, len(failed), len(units))
+        left = (time.monotonic() - start) * (len(units) / number - 1)
+        print(
+            f"{number - len(failed)} of {len(units)} finished" + (f", about {time_text(left)} left" if left else ""),
+            flush=True,
+        )
     return failed
 
 
@@ -113,42 +122,54 @@ def _run_side_by_side(run_unit: RunUnit, jobs: int, results: Path, units: Sequen
     context, threads = get_context("spawn"), max(th.get_num_threads() // jobs, 1)
     waiting, failed = list(units), []
     running: dict[SpawnProcess, Unit] = {}
-    start = time.monotonic()
+    resource_tracker.ensure_running()  # the first process would start it, which unblocks SIGINT
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
                 unit = waiting.pop(0)
                 process = context.Process(target=_work, args=(run_unit, threads, unit))
-                process.start()
-                running[process] = unit
+                with _interrupts_blocked():
+                    process.start()
+                    running[process] = unit
             connection.wait([process.sentinel for process in running])
             for process in [each for each in running if not each.is_alive()]:
                 unit, code = running.pop(process), process.exitcode or 0
-                if code != 0:
+                if not unit.is_done(results):
                     failed.append(unit)
-                if code < 0:
-                    _write_error(unit, results, f"its process was killed by {signal.Signals(-code).name}\n")
-                _print_progress(start, len(units) - len(waiting) - len(running), len(failed), len(units))
+                    if code != 0:
+                        how = f"was killed by signal {-code}" if code < 0 else f"ended with status {code}"
+                        _write_error(unit, results, f"its process {how}\n")
+                n_finished = len(units) - len(waiting) - len(running) - len(failed)
+                print(f"{n_finished} of {len(units)} finished", flush=True)
     finally:  # Ctrl-C
         for process in running:
             process.terminate()
-            process.join()
+        for process in running:
+            process.join(LEAVE_SECONDS)
+            process.kill()
     return failed
 
 
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold SIGINT back, also in processes that are started meanwhile."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 def _work(run_unit: RunUnit, threads: int, unit: Unit) -> None:
-    """Run a unit in a worker process, whose status tells whether it is done."""
-    # Ctrl-C reaches all processes of a terminal, but the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Run a unit in a worker process."""
+    # Ctrl-C reaches all processes of a terminal, but the parent decides what it means, and sends SIGTERM.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=leave_with_parent, daemon=True).start()
     th.set_num_threads(threads)
-    raise SystemExit(0 if run_unit(unit) else 1)
-
-
-def _print_progress(start: float, n_ended: int, n_failed: int, n_all: int) -> None:
-    left = (time.monotonic() - start) * (n_all / n_ended - 1)
-    line = f"{n_ended - n_failed} of {n_all} finished"
-    print(f"{line}, about {time_text(left)} left" if left else line, flush=True)
+    with suppress(KeyboardInterrupt):  # after environments were closed
+        run_unit(unit)
 
 
 def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bool) -> bool:
@@ -165,7 +186,7 @@ def _run_unit(unit: Unit, results: Path, checkpoint_minutes: float, pictures: bo
     except CellIsRunning as elsewhere:
         print(elsewhere, flush=True)
         return False
-    except Exception:
+    except (Exception, SystemExit):  # the latter from simulators whose window was closed
         _write_error(unit, results, traceback.format_exc())
         return False
     return True

@@ -32,7 +32,7 @@ _STATE = ("attributes", "seed", "options", "restarts", "faults_in_a_row", "last_
 
 
 def leave_with_parent() -> None:
-    """End this process soon after its parent, as one that hangs in a step does not see the end of its pipe."""
+    """End this process soon after its parent, even if it hangs in a step."""
     parent: Any = mp.parent_process()
     started_by = os.getppid()  # siblings that were forked hold the parent's pipes open, but change no process id
     while parent.is_alive() and os.getppid() == started_by:

@@ -204,9 +204,12 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SideByS
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(["", *sys.path]))
     evaluation = dict(every=100, episodes=1)
     running = SideBySide(write_grid(tmp_path, tasks=["slow_box:tests/SlowBox-v0"], seeds=2, evaluation=evaluation))
-    running.wait_for_training()
-    yield running
-    running.process.kill()
+    try:
+        running.wait_for_training()
+        yield running
+    finally:
+        running.process.kill()
+        running.process.communicate()
 
 
 def wait_for(what: Any, seconds: float = 400) -> Any:
@@ -258,7 +261,53 @@ def test_killed_worker_stops_no_other(command: SideBySide) -> None:
     printed, _ = command.process.communicate(timeout=600)
     assert command.process.returncode == 1 and "1 of 2 finished" in printed
     assert other.is_done(command.out) and not victim.is_done(command.out)
-    assert "killed by SIGKILL" in (command.out / victim.folder / "error.txt").read_text()
+    assert "killed by signal 9" in (command.out / victim.folder / "error.txt").read_text()
+
+
+#: A cell of seed 1 ends without a word, one of seed 2 raises, as long as FAILS is set.
+FAILING_BOX = """
+import os
+
+import gymnasium as gym
+from envs_for_tests import PixelBox
+
+
+class FailingBox(PixelBox):
+    def reset(self, *, seed=None, options=None):
+        if "FAILS" in os.environ:
+            if seed == 1:
+                os._exit(3)
+            if seed == 2:
+                raise SystemExit("the window was closed")
+        return super().reset(seed=seed, options=options)
+
+
+gym.register("tests/FailingBox-v0", FailingBox)
+"""
+
+
+def test_workers_fail_and_finish_as_this_process_would(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What failed is known by its sentence, and the same call finishes it, with its share of the threads."""
+    (tmp_path / "failing_box.py").write_text(FAILING_BOX)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 4)
+    monkeypatch.setenv("FAILS", "")
+    path = write_grid(tmp_path, tasks=["failing_box:tests/FailingBox-v0"], seeds=[1, 2], **QUICK)
+    command = [str(path), "--out", str(tmp_path / "out"), "--no-pictures", "--jobs", "2"]
+    assert run.main(command) == 1
+    ended, raised = (tmp_path / "out" / cell.folder for cell in load_grid(path).cells)
+    assert "ended with status 3" in (ended / "error.txt").read_text()
+    assert "the window was closed" in (raised / "error.txt").read_text()
+    monkeypatch.delenv("FAILS")
+    assert run.main(command) == 0
+    for folder in (ended, raised):
+        assert (folder / "DONE").exists() and "2 threads" in (folder / "run.json").read_text()
+
+
+def test_number_of_jobs_is_positive(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="jobs must be 1 or more, not -1"):
+        run.run_grid(load_grid(write_grid(tmp_path)), tmp_path / "out", jobs=-1)
+    assert not (tmp_path / "out").exists()
 
 
 def test_interrupted_command_leaves_no_worker(command: SideBySide) -> None:
