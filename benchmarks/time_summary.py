@@ -21,7 +21,13 @@ from sb3_cure.experiments.tables import NONE, Table, mean_std_text
 #: The arm that the others are compared with
 OURS = "best"
 #: What arms are called in the picture
-NAMES = {"best": "fast/best (ours)", "public_curl": "CURL's code", "drqv2": "DrQ-v2's code"}
+NAMES = {
+    "best": "fast/best (ours)",
+    "public_curl": "CURL's code",
+    "public_curl_own": "CURL's code as it is",
+    "drqv2": "DrQ-v2's code",
+    "drqv2_own": "DrQ-v2's code as it is",
+}
 TRIAL_TASK, TRIAL_SEEDS = "cartpole-swingup", (0,)
 TARGETS = (300, 500, 700)
 #: Minutes after which returns are shown
@@ -269,7 +275,7 @@ def draw(path: Path, runs: Runs) -> None:
         labels = {"xlabel": "CPU minutes of training", "ylabel": "return of ten episodes (higher: better)"}
         axes.set(title=f"{task}, one thread", **labels, xlim=(0, None), ylim=(0, None))
     marks = "thin lines: seeds; thick ones: their means; dashed: the returns of the table"
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 6), title=marks)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(len(handles), 3), title=marks)
     save(figure, path, 120)
 
 
