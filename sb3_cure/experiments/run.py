@@ -240,12 +240,6 @@ def _steps(text: str) -> int:
     return round(float(match[1]) * {"": 1, "k": 1_000, "M": 1_000_000}[match[2]])
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"must be 1 or more, not {text!r}")
-    return int(text)
-
-
 def _seed_choice(text: str) -> int | list[int]:
     return [int(part) for part in text.split(",") if part] if "," in text else int(text)
 
@@ -268,7 +262,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--methods", type=_names, help="some of the grid's methods")
     budget = "environment steps of training, such as 100k; those of pretraining and coverage change in proportion"
     add("--budget", type=_steps, help=budget)
-    add("--jobs", type=_positive, default=1, help="cells at a time, each in a process of its own (default: 1)")
+    add("--jobs", type=int, default=1, help="cells at a time, each in a process of its own (default: 1)")
     add("--checkpoint-minutes", type=float, default=10, help="between two checkpoints of a cell")
     add("--no-pictures", dest="pictures", action="store_false", help="neither draw nor film")
     add("--dry-run", action="store_true", help="list the cells and their states, run nothing")
