@@ -81,13 +81,13 @@ def check_settings(path: Path, settings: dict[str, Any]) -> None:
     """Refuse a file of settings that differ from the given ones.
 
     :param path: A JSON file, which may be missing
-    :param settings: Settings of this run; keys that the file lacks are not compared
+    :param settings: Settings of this run
     :raises UsageError: if they differ
     """
     before = read_json(path) if path.exists() else {}
     now = json.loads(json.dumps(settings, default=str))
-    if key := first_difference(before, now, now):
-        was, is_now = before[key], now[key]
+    if before and (difference := first_difference(before, now, now)):
+        key, was, is_now = difference
         while isinstance(was, dict) and isinstance(is_now, dict):
             absent = "left out"
             inner = next(each for each in (*was, *is_now) if was.get(each, absent) != is_now.get(each, absent))
@@ -224,17 +224,11 @@ class _Record(BaseCallback):
 
     def _on_step(self) -> bool:
         self._tick()
-        return not self.has_reached_return
+        return True
 
     def best_return(self) -> float | None:
         """Best mean return of the task policy in an evaluation; None before the first."""
         return max((row["return_mean"] for row in self.evaluations if row["return_mean"] != ""), default=None)
-
-    @property
-    def has_reached_return(self) -> bool:
-        """Whether the cell ends early: its last two evaluations, after the one at the start, reached the limit."""
-        limit, returns = self.cell.stop_at_return, [row["return_mean"] for row in self.evaluations[1:][-2:]]
-        return limit is not None and len(returns) == 2 and all(value != "" and value >= limit for value in returns)
 
     def _on_rollout_start(self) -> None:
         self._evaluate_if_due(finished=False)
@@ -255,8 +249,7 @@ class _Record(BaseCallback):
 
     def _evaluate_if_due(self, finished: bool) -> None:
         steps = self.num_timesteps * self.action_repeat
-        may_evaluate = self.evaluates and not self.has_reached_return
-        if may_evaluate and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
+        if self.evaluates and is_evaluation_due(self.evaluations, steps, self.cell.eval_every, finished):
             self.evaluate(finished)
         self._tick()
 
@@ -272,8 +265,7 @@ class _Record(BaseCallback):
         self.evaluations.append(row)
         if "task" in actors:
             self._measure("task", row)
-        is_last = finished or self.has_reached_return
-        if "curious" in actors and (is_last or self.cell.eval_curious != "end"):
+        if "curious" in actors and (finished or self.cell.eval_curious != "end"):
             self._measure("curious", row)
         self._tick()
         row.update(seconds=round(self.seconds, 1), cpu_seconds=self.cpu_seconds)

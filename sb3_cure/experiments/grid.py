@@ -5,7 +5,7 @@ import copy
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -146,7 +146,6 @@ class GridFile(_Part):
     :param evaluation: When and how to evaluate
     :param baseline: The arm with which the others are compared, by default the first
     :param coverage: Cells of the true state to count, if any
-    :param stop_at_return: A cell ends early once two evaluations in a row have reached this return
     """
 
     experiment: _Name
@@ -158,7 +157,6 @@ class GridFile(_Part):
     evaluation: Evaluation = Evaluation()
     baseline: str = ""
     coverage: Coverage | None = None
-    stop_at_return: float | None = None
 
     @pydantic.model_validator(mode="after")
     def _check_names(self) -> "GridFile":
@@ -199,7 +197,6 @@ class Cell:
     :param algo: A key of ``ALGORITHMS``
     :param coverage: Cells of the true state to count, if any
     :param eval_curious: ``"end"``: evaluate the curious policy in the last evaluation only
-    :param stop_at_return: End early once two evaluations in a row have reached this return
     """
 
     experiment: str
@@ -218,7 +215,6 @@ class Cell:
     algo: str = "cure_sac"
     coverage: Coverage | None = None
     eval_curious: Literal["end"] | None = None
-    stop_at_return: float | None = None
 
     @property
     def folder(self) -> Path:
@@ -287,15 +283,23 @@ class Cell:
 SETTINGS = tuple(each.name for each in fields(Cell) if each.name not in ("experiment", "method", "seed"))
 
 
-def first_difference(before: Mapping[str, Any], now: Mapping[str, Any], keys: Iterable[str]) -> str | None:
-    """Find a setting that differs; those that an earlier version did not write are not compared.
+#: What a cell did whose version did not have these settings, nor write them
+_DEFAULTS = {each.name: each.default for each in fields(Cell) if each.default is not MISSING}
+
+
+def first_difference(
+    before: Mapping[str, Any], now: Mapping[str, Any], keys: Iterable[str]
+) -> tuple[str, Any, Any] | None:
+    """Find a setting that differs.
 
     :param before: Settings, as in a JSON file
     :param now: Others
-    :param keys: Names of the settings to compare
-    :return: Name of the first that both have and that differs, or None
+    :param keys: Names of the settings to compare; one without a default that either lacks is not compared
+    :return: Name of the first that differs, and both values; None if there is none
     """
-    return next((key for key in keys if key in before and key in now and before[key] != now[key]), None)
+    before, now = {**_DEFAULTS, **before}, {**_DEFAULTS, **now}
+    differ = (key for key in keys if key in before and key in now and before[key] != now[key])
+    return next(((key, before[key], now[key]) for key in differ), None)
 
 
 @dataclass(frozen=True)
@@ -472,7 +476,6 @@ def arm_cell(file: GridFile, path: Path, task: str, name: str) -> Cell:
         algo=method.algo,
         coverage=file.coverage,
         eval_curious=file.evaluation.curious,
-        stop_at_return=file.stop_at_return,
     )
 
 

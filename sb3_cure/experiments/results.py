@@ -14,7 +14,7 @@ from sb3_cure.experiments.grid import DONE, ERROR, SETTINGS, first_difference, r
 
 FINISHED, UNFINISHED, FAILED, NOT_RUN = "done", "unfinished", "failed", "not run"
 #: Settings that all cells of a task share, with the budget of those that train
-_SHARED = ("eval_every", "eval_episodes", "coverage", "stop_at_return")
+_SHARED = ("eval_every", "eval_episodes", "coverage")
 _FIX = "remove the cell's folder and run the grid again"
 
 
@@ -53,8 +53,6 @@ class CellResult:
     def curve(self, column: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values, where there are any.
 
-        A cell that stopped early, at ``stop_at_return``, holds its last returns and SRL errors until the budget.
-
         :param column: A column of ``eval.csv``, or ``"cells"`` of ``coverage.csv``
         :return: Steps and values, [n] each
         """
@@ -62,11 +60,7 @@ class CellResult:
         if column not in table:
             return np.zeros(0), np.zeros(0)
         known = table.dropna(subset=[column])
-        steps, values = known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
-        stopped = self.config.get("stop_at_return") is not None and len(steps) and steps[-1] < self.config["budget"]
-        if stopped and column.endswith(("return_mean", "srl_error")):
-            steps, values = np.append(steps, self.config["budget"]), np.append(values, values[-1])
-        return steps, values
+        return known["environment_steps"].to_numpy(float), known[column].to_numpy(float)
 
     def states(self) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
         """True physics states that were visited (``visits.npz``).
@@ -206,9 +200,10 @@ def _read_experiment(path: Path, name: str | None = None) -> Experiment:
 
 def _check_settings(first: CellResult, other: CellResult, keys: Iterable[str]) -> None:
     """Refuse to average over cells that were run with different settings."""
-    if key := first_difference(first.config, other.config, keys):
+    if difference := first_difference(first.config, other.config, keys):
+        key, one, another = difference
         raise UsageError(
-            f"{other.folder} was run with {key} {other.config[key]!r}, but {first.folder} with {first.config[key]!r}: "
+            f"{other.folder} was run with {key} {another!r}, but {first.folder} with {one!r}: "
             "put one of them into another folder."
         )
 
@@ -238,8 +233,7 @@ def _check_curve(cell: CellResult) -> None:
     """Refuse a curve that does not go from 0 to the budget, or lacks returns: its area would be wrong."""
     path, budget = cell.folder / "eval.csv", cell.config["budget"]
     steps, _ = cell.curve("environment_steps")
-    is_whole = len(steps) > 0 and (steps[-1] >= budget or cell.config.get("stop_at_return") is not None)
-    if not is_whole or steps[0] > 0 or not (np.diff(steps) > 0).all():
+    if len(steps) == 0 or steps[0] > 0 or steps[-1] < budget or not (np.diff(steps) > 0).all():
         raise UsageError(f"{path} does not go step by step from 0 to {budget} environment steps: {_FIX}.")
     if cell.config["arguments"].get("task", True) and cell.evaluations["return_mean"].isna().any():
         raise UsageError(f"{path} has a row without return_mean: {_FIX}.")

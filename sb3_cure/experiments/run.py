@@ -81,7 +81,7 @@ def check_grid(grid: Grid, results: Path) -> None:
     :param results: Folder of all results, whether it exists or not
     :raises UsageError: with one sentence
     """
-    shared = {key: grid.description.get(key) for key in ("kind", "budget", "evaluation", "coverage", "stop_at_return")}
+    shared = {key: grid.description.get(key) for key in ("kind", "budget", "evaluation", "coverage")}
     check_settings(results / grid.experiment / "grid.json", shared)
     for cell in grid.with_seeds_in(results):
         check_cell(results / cell.folder, cell)

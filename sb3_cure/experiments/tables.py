@@ -238,11 +238,11 @@ def reached_table(experiment: Experiment, thresholds: Sequence[float]) -> Table:
 
     :param experiment: An experiment
     :param thresholds: Returns
-    :return: The table; without rows for a return that no arm reaches on a task, or above that which ends a cell
+    :return: The table; without rows for a return that no arm reaches on a task
     """
-    rows, end = [], experiment.grid.get("stop_at_return", math.inf)
+    rows = []
     lasts = {arm: statistics.summarise_arm(experiment, *arm)["last"] for arm in experiment.arms}
-    for task, limit in itertools.product(experiment.tasks, [each for each in thresholds if each <= end]):
+    for task, limit in itertools.product(experiment.tasks, thresholds):
         arms = {arm: statistics.steps_to_return(experiment, task, arm, limit) for arm in experiment.methods}
         if not any(np.isfinite(steps).any() for steps in arms.values()):
             continue

@@ -2,7 +2,7 @@
 
 import json
 import random
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -238,16 +238,16 @@ def test_project_pretraining_trains_in_miniature() -> None:
 
 
 def test_folders_of_earlier_versions_are_continued(tmp_path: Path) -> None:
-    """Their config.json lacks newer keys, which is no other setting; another stop is one."""
+    """Their config.json lacks newer keys: those cells had the defaults, and nothing else."""
     grid = load_grid(write_grid(tmp_path))
     (cell,) = grid.cells
     folder = tmp_path / cell.folder
     folder.mkdir(parents=True)
     (tmp_path / "tiny" / "grid.json").write_text(json.dumps(grid.description))
-    earlier = {key: value for key, value in asdict(cell).items() if key not in ("eval_curious", "stop_at_return")}
+    earlier = {key: value for key, value in asdict(cell).items() if key not in ("algo", "eval_curious", "coverage")}
     (folder / "config.json").write_text(json.dumps(earlier))
     (folder / "DONE").touch()
     run.check_grid(grid, tmp_path)
-    (folder / "config.json").write_text(json.dumps(asdict(cell)))
-    with pytest.raises(UsageError, match="stop_at_return was None and is 500"):
-        run.check_grid(load_grid(write_grid(tmp_path, stop_at_return=500)), tmp_path)
+    for changed, key in ((replace(cell, algo="cure_tqc"), "algo"), (replace(cell, eval_curious="end"), "eval_curious")):
+        with pytest.raises(UsageError, match=f"run with other settings: {key} was"):
+            run.check_grid(replace(grid, cells=(changed,), arms=(changed,)), tmp_path)

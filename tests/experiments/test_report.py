@@ -125,20 +125,6 @@ def test_tables_of_curves(results: Path) -> None:
     assert "2 pairs of seeds on cartpole-swingup: inconclusive." in headlines
 
 
-@pytest.mark.parametrize("end", [500, 0])
-def test_nothing_is_said_of_returns_above_that_which_ends_a_cell(end: int, tmp_path: Path) -> None:
-    """An arm that stopped at 520 did not fail to reach 750."""
-    write_grid(tmp_path, seeds=1, methods={"stopped": {}, "lucky": {}}, baseline="stopped", stop_at_return=end)
-    for arm, steps in {"stopped": (-500, 10, 20), "lucky": (-500, 240, 260)}.items():
-        curve = {25_000 * number: end + value for number, value in enumerate(steps)}
-        write_cell(tmp_path, TASK, arm, 0, curve, stop_at_return=end)
-    limits = [end - 250, end, end + 250]
-    assert report.main([str(tmp_path), f"--thresholds={','.join(map(str, limits))}"]) == 0
-    rows = rows_of(tmp_path / "table.md", "Returns reached")[1:]
-    shown = {str(limit).replace("-", "\N{MINUS SIGN}") for limit in limits[:2]}
-    assert {row[1] for row in rows} == shown and all(row[3] == "1 of 1" for row in rows)
-
-
 def test_cells_reached_in_training_are_compared(tmp_path: Path) -> None:
     """Also of arms without a task, which have no returns; a seed that only one arm has done does not count."""
     write_grid(tmp_path, seeds=[0, 1, 2])

@@ -89,11 +89,11 @@ def test_cells_of_other_settings_are_refused(results: Path, method: str, seed: i
 
 
 def test_cells_of_earlier_versions_enter_with_those_of_today(results: Path) -> None:
-    """Keys that an earlier version did not write are no other setting; those that two later ones have are."""
+    """A cell whose version did not write a key had its default."""
     write_cell(results, TASK, "sac_ae", 2, curve(0, 1), algo="cure_sac", pretrain=None)
     assert list(read_results(results)[0].finished_cells(TASK, "sac_ae")) == [0, 1, 2]
     write_cell(results, TASK, "sac_ae", 3, curve(0, 1), algo="cure_tqc", pretrain=None)
-    with pytest.raises(UsageError, match=r"seed3 was run with algo 'cure_tqc', but .*seed2 with 'cure_sac'"):
+    with pytest.raises(UsageError, match=r"seed3 was run with algo 'cure_tqc', but .*seed0 with 'cure_sac'"):
         read_results(results)
 
 

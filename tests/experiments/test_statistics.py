@@ -42,31 +42,6 @@ def test_return_before_training_is_none_of_the_agents(tmp_path: Path) -> None:
         np.testing.assert_array_equal(statistics.steps_to_return(experiment, TASK, "sac_ae", limit), [steps])
 
 
-def test_cell_that_stopped_holds_its_last_return(tmp_path: Path) -> None:
-    """It ends at 50 000 of 100 000 steps: the area is that of 0 to 400 in 50 000 steps, and 400 from there on."""
-    folder = tmp_path / "curves"
-    write_grid(folder, seeds=1, stop_at_return=300)
-    for method in ("sac_ae", "cure_sac_ae"):
-        write_cell(folder, TASK, method, 0, {0: 0, 25_000: 200, 50_000: 400}, stop_at_return=300)
-    (experiment,) = read_results(folder)
-    arm = statistics.summarise_arm(experiment, TASK, "sac_ae")
-    np.testing.assert_allclose(arm.area, [(200 + 400) / 2])
-    np.testing.assert_array_equal(statistics.steps_to_return(experiment, TASK, "sac_ae", 300), [50_000])
-    np.testing.assert_allclose(arm["last"], [(200 + 400 + 400) / 3])
-
-
-def test_measures_of_seeds_that_stop_at_different_times_have_common_steps(tmp_path: Path) -> None:
-    """Curious policies are evaluated at the end alone: at 20 000 and at 30 000 steps."""
-    write_grid(tmp_path, seeds=2, stop_at_return=1)
-    for seed, end in enumerate((20_000, 30_000)):
-        path = write_cell(tmp_path, TASK, "sac_ae", seed, {0: 0, end: 1}, curious=True, stop_at_return=1) / "eval.csv"
-        first, _, *rows = path.read_text().splitlines()
-        path.write_text("\n".join([first, "0,0,0,0,0,0,,,,", *rows]))
-    curves = statistics.stack_curves(read_results(tmp_path)[0], "curious_srl_error")
-    np.testing.assert_array_equal(curves[TASK]["sac_ae"][0], [30_000, 100_000])
-    np.testing.assert_allclose(curves[TASK]["sac_ae"][1], 0.002)
-
-
 def test_equal_starts_are_told_by_the_error(tmp_path: Path) -> None:
     """Returns of a sparse task are zero at first whatever the weights; an arm without errors is told by returns."""
     folder = tmp_path / "curves"
@@ -179,10 +154,10 @@ def test_order_of_seeds_changes_nothing(differences: list[float], random: object
 
 
 def test_rewards_met_are_compared_at_the_last_common_step(tmp_path: Path) -> None:
-    """The second arm has stopped early: there it had met ten times as many."""
+    """The first arm went on beyond the budget: at the budget the second had met ten times as many."""
     write_grid(tmp_path, seeds=[0])
-    write_cell(tmp_path, TASK, "sac_ae", 0, curve(0, 0, 0), rewards_met=[0, 9, 999], stop_at_return=0)
-    write_cell(tmp_path, TASK, "cure_sac_ae", 0, {0: 0, 50_000: 0}, rewards_met=[0, 99], stop_at_return=0)
+    write_cell(tmp_path, TASK, "sac_ae", 0, {0: 0, 100_000: 0, 200_000: 0}, rewards_met=[0, 9, 999])
+    write_cell(tmp_path, TASK, "cure_sac_ae", 0, {0: 0, 100_000: 0}, rewards_met=[0, 99])
     found = statistics.rewards_met_difference(read_results(tmp_path)[0], TASK, "cure_sac_ae")
     assert found.value == pytest.approx(np.log(10))
 
