@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import yaml
 from rl_zoo3 import create_test_env
-from rl_zoo3.utils import EnvironmentName, StoreDict, get_model_path
+from rl_zoo3.utils import EnvironmentName, StoreDict, get_model_path, get_wrapper_class
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecVideoRecorder
 
+from sb3_cure.cli.report_ends import ReportEnds
 from sb3_cure.cli.usage import UsageError, nearest, one_sentence, parse, refusals_in_one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
@@ -149,6 +150,8 @@ def _load(args: argparse.Namespace, render_mode: str | None) -> tuple[OffPolicyA
         env_kwargs["render_mode"] = render_mode
     settings.setdefault("normalize", False)
     settings["normalize_kwargs"] = settings["normalize"]
+    if wrap := get_wrapper_class(settings):
+        settings["env_wrapper"] = {ReportEnds: {"wrap": wrap}}
     objects: dict[str, Any] = {name: find_class(vars(args)[name]) for name in CLASS_ARGUMENTS if vars(args)[name]}
     objects |= {"replay_buffer_class": _NoReplayBuffer, "n_steps": 1, "optimize_memory_usage": False}
     load: Any = ALGORITHMS[args.algo].load

@@ -3,26 +3,24 @@
 import argparse
 import os
 import sys
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from pprint import pprint
 from typing import Any
 
-import gymnasium as gym
 import optuna
 import rl_zoo3.train
 from rl_zoo3 import ALGOS, exp_manager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import StoreDict
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cli.progress import TimeLeft
+from sb3_cure.cli.report_ends import ReportEnds
 from sb3_cure.cli.usage import UsageError, missing_file, nearest, parse, refusals_in_one_sentence
 from sb3_cure.cli.zoo_files import (
     ALGORITHMS,
@@ -40,32 +38,6 @@ from sb3_cure.envs import make_dmc_env
 
 #: The file of settings where ``--conf-file`` is not given
 DEFAULT_SETTINGS = "cure_sac_ae"
-
-
-class ReportEnds(gym.Wrapper):
-    """Reports episodes that wrappers end, which ``Monitor`` inside of them does not see: evaluations wait for them.
-
-    :param monitor: The environment in its ``Monitor``
-    :param wrap: Puts the wrappers around it
-    """
-
-    def __init__(self, monitor: Monitor, wrap: Callable[[gym.Env], gym.Env]):
-        super().__init__(wrap(monitor))
-        self.monitor = monitor
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Make a step.
-
-        :param action: The action
-        :return: As the environment's, with ``info["episode"]`` at the end
-        """
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        if (terminated or truncated) and "episode" not in info:
-            rewards, seconds = self.monitor.rewards, time.time() - self.monitor.t_start
-            info["episode"] = {"r": round(sum(rewards), 6), "l": len(rewards), "t": round(seconds, 6)}
-            if self.monitor.results_writer is not None:
-                self.monitor.results_writer.write_row(info["episode"])
-        return observation, reward, terminated, truncated, info
 
 
 class ExperimentManager(exp_manager.ExperimentManager):

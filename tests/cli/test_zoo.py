@@ -134,7 +134,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ------------------------------------------------------------------ training
 
 
-def test_evaluations_end_where_a_wrapper_ends_the_episode(folder: Path) -> None:
+def test_episodes_end_where_a_wrapper_ends_them(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """rl-zoo3's Monitor is inside of the wrapper, and does not see this end."""
     limit = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}}
     train("--eval-freq", "8", "--eval-episodes", "1", env_wrapper=[limit])
@@ -142,6 +142,9 @@ def test_evaluations_end_where_a_wrapper_ends_the_episode(folder: Path) -> None:
     assert set(np.load(folder / "evaluations.npz")["ep_lengths"].flat) == {3}
     lengths = np.loadtxt(folder / "0.monitor.csv", delimiter=",", skiprows=2)[:, 1]
     assert lengths.tolist() == [3] * 6
+    capsys.readouterr()
+    assert replay("enjoy", folder, "--trusted") == 0
+    assert "4 Episodes" in capsys.readouterr().out  # of 14 steps
 
 
 def test_env_kwargs_of_the_file_hold_for_the_evaluation(run: Path) -> None:
