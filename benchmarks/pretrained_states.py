@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sb3_cure.envs import physics_state_names, physics_state_units
+from sb3_cure.evaluation import Episode, run_episodes, state_probe
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.evaluation.rollouts import Episode, run_episodes, state_probe
 from sb3_cure.experiments.cells import EVAL_SEED
 from sb3_cure.experiments.grid import Cell, load_grid
 

@@ -185,7 +185,7 @@ def summarise(runs: Runs) -> list[Row]:
                 values = (
                     *(task, arm, target, len(data), len(data) - data.num_censored()),
                     "not reached" if median is None else round(median, 2),
-                    round(compare(times_to(arms[OURS], target), data), 4) if compares else "",
+                    float(f"{compare(times_to(arms[OURS], target), data):.2g}") if compares else "",
                     "; ".join(f"seed {seed}: {run.time_text(target)}" for seed, run in seeds.items()),
                 )
                 rows.append(dict(zip(SUMMARY_COLUMNS, values, strict=True)))

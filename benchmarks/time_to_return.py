@@ -52,7 +52,6 @@ from benchmarks.public_sac_ae import checkout_folder
 from benchmarks.time_summary import COLUMNS, OURS, best_trial, read_runs, write_summary
 from sb3_cure.cli.usage import UsageError
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import (
     Row,
     checkout_commit,
@@ -60,6 +59,7 @@ from sb3_cure.evaluation.result_files import (
     write_csv,
     write_json,
 )
+from sb3_cure.evaluation.rollouts import untouched_randomness
 from sb3_cure.experiments.cells import EVAL_SEED, check_settings, is_evaluation_due
 from sb3_cure.experiments.grid import Cell, GridFile, Method, arm_cell, load_grid, short_name
 from sb3_cure.networks.allocator import tune_allocator

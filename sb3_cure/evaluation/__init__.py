@@ -1,5 +1,6 @@
 """Evaluation: rollouts and their errors, callbacks, diagnostics, plots, videos and deployment."""
 
+from sb3_cure.evaluation.probe import state_probe
 from sb3_cure.evaluation.rollouts import (
     Episode,
     HighestErrors,
@@ -8,7 +9,6 @@ from sb3_cure.evaluation.rollouts import (
     highest_errors,
     run_episodes,
     srl_errors,
-    state_probe,
     trained_actors,
 )
 

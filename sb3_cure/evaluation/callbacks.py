@@ -4,8 +4,6 @@ All work with any SB3 algorithm (``DiagnosticsCallback``, ``ReconstructionCallba
 are those of the head or of a reward that reconstructs; without either there are none.
 """
 
-import contextlib
-import random
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +16,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor, set_random_seed
+from stable_baselines3.common.utils import check_for_correct_spaces, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_cure.cure.reconstructions import newest_frames
@@ -29,15 +27,17 @@ from sb3_cure.envs.physics import map_coordinates
 from sb3_cure.envs.wrappers import action_repeat_of
 from sb3_cure.evaluation import decoding, diagnostics
 from sb3_cure.evaluation.encoders import encoder_of
+from sb3_cure.evaluation.probe import state_probe
 from sb3_cure.evaluation.rollouts import (
     Episode,
     as_arrays,
     as_trained,
     balanced_negatives,
+    returns_and_errors,
     run_episodes,
-    state_probe,
     states_and_errors,
     trained_actors,
+    untouched_randomness,
 )
 
 __all__ = [
@@ -49,7 +49,6 @@ __all__ = [
     "ReconstructionCallback",
     "RolloutCallback",
     "StateProbeCallback",
-    "untouched_randomness",
 ]
 
 #: Longest name that SB3 prints in full; it refuses to print two names that are equal when truncated
@@ -94,24 +93,6 @@ class PeriodicCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"{type(self).__name__}: {folder / name}")
         return folder / name
-
-
-@contextlib.contextmanager
-def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator[None]:
-    """Restore the random number generators of Python, NumPy and PyTorch afterwards.
-
-    :param device: Device whose generator is restored besides the CPU's
-    :param seed: Seed of all of them meanwhile; None: they continue from their state
-    """
-    python_state, numpy_state = random.getstate(), np.random.get_state()
-    with th.random.fork_rng([device] if device.type == "cuda" else []):
-        try:
-            if seed is not None:
-                set_random_seed(seed)
-            yield
-        finally:
-            random.setstate(python_state)
-            np.random.set_state(numpy_state)
 
 
 class RolloutCallback(PeriodicCallback):
@@ -214,9 +195,8 @@ class EvalBothCallback(RolloutCallback):
         """
         row: dict[str, float] = {}
         for actor in self.actors:
-            results = [(episode.total_reward, episode.srl_errors) for episode in self.run(actor)]
-            row[f"eval/{actor}_reward"] = float(np.mean([reward for reward, _ in results]))
-            errors = np.concatenate([errors for _, errors in results])
+            returns, errors = returns_and_errors(self.run(actor))
+            row[f"eval/{actor}_reward"] = float(returns.mean())
             if len(errors) > 0:
                 row[f"eval/{actor}_srl_error"] = float(errors.mean())
         self._log(row)

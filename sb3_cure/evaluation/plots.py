@@ -95,7 +95,7 @@ def save(figure: Figure, path: PathOrFile, dpi: int = 150, tight: bool = False) 
     file = io.BytesIO()
     figure.savefig(file, dpi=dpi, bbox_inches="tight" if tight else None)
     with Image.open(file) as image:
-        few = image.convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         few.save(path, "PNG", optimize=True)
 
 
@@ -296,8 +296,8 @@ def _panels(count: int, height: float, ylabel: str) -> tuple[Figure, list[Axes]]
 
 
 def _use_logarithms(axes: Axes) -> None:
-    """Make an axis logarithmic, with plain numbers at its ticks; zeros have no place on it."""
-    axes.set_yscale("log", nonpositive="mask")
+    """Make an axis logarithmic, with plain numbers at its ticks; zeros lie below its bottom."""
+    axes.set_yscale("log", nonpositive="clip")
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())

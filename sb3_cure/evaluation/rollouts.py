@@ -2,7 +2,8 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import random
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,13 +14,12 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import maybe_transpose
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.utils import obs_as_tensor, set_random_seed
 
 from sb3_cure.data.buffers import stored_places, transitions
 from sb3_cure.data.observations import by_key, images_of, rows_of, stacked
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state
-from sb3_cure.evaluation.encoders import encoder_of
 from sb3_cure.srl import CURL, heads_by_key
 
 ACTORS = ("task", "curious", "random")
@@ -61,6 +61,16 @@ def states_and_errors(episodes: Iterable[Episode]) -> tuple[np.ndarray, np.ndarr
     return np.concatenate(states), np.concatenate(errors)
 
 
+def returns_and_errors(episodes: Iterable[Episode]) -> tuple[np.ndarray, np.ndarray]:
+    """Keep of episodes what evaluations report, so that no two of them are in memory at a time.
+
+    :param episodes: At least one, as ``run_episodes`` yields them
+    :return: Their returns, [n], and the SRL errors of all steps, [steps]; empty if the model measures none
+    """
+    kept = [(episode.total_reward, episode.srl_errors) for episode in episodes]
+    return np.array([total for total, _ in kept]), np.concatenate([errors for _, errors in kept])
+
+
 def chunks(n: int) -> list[slice]:
     """Split observations into parts of ``CHUNK``, which are encoded one at a time.
 
@@ -87,6 +97,24 @@ def srl_errors(model: BaseAlgorithm, batch: ReplayBufferSamples | Samples) -> np
             part: Any = (None if each is None else rows_of(each, chunk) for each in batch[:5])
             errors.append(policy.error(policy.samples(Samples(*part), random=False)).float().cpu().numpy())
     return np.concatenate(errors)
+
+
+@contextlib.contextmanager
+def untouched_randomness(device: th.device, seed: int | None = None) -> Iterator[None]:
+    """Restore the random number generators of Python, NumPy and PyTorch afterwards.
+
+    :param device: Device whose generator is restored besides the CPU's
+    :param seed: Seed of all of them meanwhile; None: they continue from their state
+    """
+    python_state, numpy_state = random.getstate(), np.random.get_state()
+    with th.random.fork_rng([device] if device.type == "cuda" else []):
+        try:
+            if seed is not None:
+                set_random_seed(seed)
+            yield
+        finally:
+            random.setstate(python_state)
+            np.random.set_state(numpy_state)
 
 
 def trained_actors(model: BaseAlgorithm) -> list[str]:
@@ -300,69 +328,3 @@ def binned_errors(
         return visits, np.full_like(visits, np.nan)
     sums = np.histogram2d(x, y, bins=edges, weights=errors)[0]  # type: ignore[call-overload]
     return visits, np.divide(sums, visits, out=np.full_like(sums, np.nan), where=visits > 0)
-
-
-def state_probe(
-    model: BaseAlgorithm,
-    episodes: Iterable[Episode],
-    names: Sequence[str],
-    units: Sequence[str] | None = None,
-    ridge: float = 1e-3,
-) -> dict[str, float]:
-    """R² of each coordinate of the true state, predicted from the latents by ridge regression.
-
-    Each episode is predicted by the regression on all other episodes: neighbouring steps would give the answer away. An
-    angle is predicted as sine and cosine with one R² for both: as a number it would jump by a turn. R² is 1 for perfect
-    predictions, 0 for the mean of all states, and below 0 for worse.
-
-    :param model: A model of any SB3 algorithm with an encoder (``encoders.encoder_of``); compare models on the same
-        episodes, such as those of random actions with a seed
-    :param episodes: Two or more, of ``run_episodes(..., states=True)``
-    :param names: Names of the state's coordinates, [d], as for ``sb3_cure.envs.physics_state_names``
-    :param units: Their units, [d], as for ``physics_state_units``: ``"rad"`` marks angles. None: no angles
-    :param ridge: Penalty of the squared weights for latents of variance 1, as a share of the number of observations
-    :return: R² by name; NaN for coordinates that never change
-    :raises ValueError: if the model has no encoder, episodes have no states, or there are fewer than two
-    """
-    policy: Any = model.policy
-    encode = encoder_of(policy)
-    if encode is None:
-        raise ValueError(f"state_probe needs a policy with an encoder, which {type(policy).__name__} does not have.")
-    policy.set_training_mode(False)
-    latents, states = [], []
-    for episode in episodes:
-        if len(episode.states) != len(episode.rewards):
-            raise ValueError("the episodes have no true states: make them by run_episodes(..., states=True).")
-        seen = obs_as_tensor(as_trained(model, episode.observations), model.device)
-        parts = [rows_of(seen, chunk) for chunk in chunks(len(episode.states))]
-        with th.no_grad():
-            latents.append(np.concatenate([encode(part).double().cpu().numpy() for part in parts]))
-        states.append(episode.states)
-    if len(states) < 2:
-        raise ValueError("state_probe needs two episodes at least: it predicts each from the others.")
-
-    targets = [
-        np.stack([np.sin(column), np.cos(column)], axis=1) if unit == "rad" else column[:, None]
-        for column, unit in zip(np.concatenate(states).T, units or [""] * len(names), strict=True)
-    ]
-    inputs, outputs = np.concatenate(latents), np.concatenate(targets, axis=1)
-    owners = np.repeat(np.arange(len(states)), [len(each) for each in states])
-    predicted = np.empty_like(outputs)
-    for own in (owners == owner for owner in range(len(states))):
-        predicted[own] = _ridge(inputs[~own], outputs[~own], inputs[own], ridge)
-    ends = np.cumsum([target.shape[1] for target in targets])[:-1]
-    result = {}
-    for name, target, guess in zip(names, targets, np.split(predicted, ends, axis=1), strict=True):
-        spread = np.square(target - target.mean(axis=0)).sum()
-        varies = spread > 1e-9 * len(target)
-        result[name] = float(1 - np.square(guess - target).sum() / spread) if varies else float("nan")
-    return result
-
-
-def _ridge(inputs: np.ndarray, targets: np.ndarray, new_inputs: np.ndarray, penalty: float) -> np.ndarray:
-    """Predict targets of new inputs by ridge regression on standardised inputs."""
-    mean, deviation, middle = inputs.mean(axis=0), inputs.std(axis=0) + 1e-12, targets.mean(axis=0)
-    design = (inputs - mean) / deviation
-    gram = design.T @ design + penalty * len(design) * np.eye(design.shape[1])
-    weights = np.linalg.solve(gram, design.T @ (targets - middle))
-    return (new_inputs - mean) / deviation @ weights + middle

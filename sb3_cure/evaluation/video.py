@@ -47,16 +47,15 @@ def write_video(path: Path, episodes: Mapping[str, Episode], fps: int, action_re
             writer.append_data(np.concatenate(padded, axis=1))  # type: ignore[attr-defined]
 
 
-def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3, size: int = 128) -> None:
+def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3) -> None:
     """Write an episode as a GIF: the camera's pictures beside the newest frame of what the agent sees.
 
     :param path: File to write, ``*.gif``
     :param episode: An episode of images with ``frames`` (rendered with ``render=True``)
     :param fps: Pictures per second, one per agent step
     :param channels: Of a frame that the agent sees: 3, or 1 if it is grey
-    :param size: Height of the GIF in pixels
     """
-    pictures = []
+    pictures, size = [], 128
     for frame, observation in zip(episode.frames[:-1], episode.observations, strict=True):
         seen = observation[-channels:].transpose(1, 2, 0).repeat(3 // channels, axis=2)
         rendered = Image.fromarray(frame).resize((size, size), Image.Resampling.LANCZOS)
@@ -65,7 +64,8 @@ def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3, size: i
         picture.paste(Image.fromarray(seen).resize((size, size), Image.Resampling.NEAREST), (size + 4, 0))
         pictures.append(picture)
     # Few colours, the same in all pictures: else the file is larger, and grounds flicker.
-    palette = pictures[len(pictures) // 2].quantize(40, dither=Image.Dither.NONE)
+    some = np.concatenate([np.asarray(picture) for picture in pictures[:: max(len(pictures) // 8, 1)]])
+    palette = Image.fromarray(some).quantize(40, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     first.save(path, save_all=True, append_images=rest, duration=1000 // fps, loop=0)
 

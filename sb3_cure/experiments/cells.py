@@ -21,9 +21,8 @@ from sb3_cure.cli.usage import UsageError
 from sb3_cure.cli.zoo_files import ALGORITHMS
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs.wrappers import action_repeat_of
-from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, describe_run, write_csv, write_json, write_text
-from sb3_cure.evaluation.rollouts import run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import returns_and_errors, run_episodes, trained_actors, untouched_randomness
 from sb3_cure.experiments import rewards_met
 from sb3_cure.experiments.coverage import CoverageRecorder
 from sb3_cure.experiments.grid import DONE, ERROR, SETTINGS, Cell, first_difference, read_json
@@ -277,19 +276,18 @@ class _Record(BaseCallback):
         model = self.model
         # Environments may draw from the global generators of Python or NumPy, as training does.
         with untouched_randomness(model.device, EVAL_SEED):
-            episodes = list(run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED))
-        returns = [float(episode.total_reward) for episode in episodes]
+            episodes = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
+            returns, errors = returns_and_errors(episodes)
         if not np.isfinite(returns).all():
             raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: correct its rewards.")
-        for number, value in enumerate(returns):
+        for number, value in enumerate(returns.tolist()):
             values = (row["environment_steps"], actor, number, value)
             self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
         if actor == "task":
-            row.update(return_mean=float(np.mean(returns)), return_std=float(np.std(returns)))
+            row.update(return_mean=float(returns.mean()), return_std=float(returns.std()))
         else:
-            row["curious_return_mean"] = float(np.mean(returns))
-        if getattr(model.policy, "measures_errors", False):
-            errors = np.concatenate([episode.srl_errors for episode in episodes])
+            row["curious_return_mean"] = float(returns.mean())
+        if len(errors) > 0:
             row[f"{actor}_srl_error"] = float(errors.mean())
 
     def write_tables(self) -> None:

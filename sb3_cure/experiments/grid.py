@@ -33,7 +33,7 @@ from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import make_dmc_env
 from sb3_cure.envs.counting import CellInfo, SumRewards, TaskReward
 from sb3_cure.envs.rendering import GLUnavailableError
-from sb3_cure.evaluation.callbacks import untouched_randomness
+from sb3_cure.evaluation.rollouts import untouched_randomness
 
 #: Empty file of a finished cell
 DONE = "DONE"

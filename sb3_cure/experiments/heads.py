@@ -36,14 +36,10 @@ class CommonHeads:
 
     :param grid: The grid, whichever of its seeds and arms are chosen
     :param task: Gymnasium id
-    :param updates: Updates of each head
-    :param share: Observations of each policy of a seed in the mix
     """
 
     grid: Grid
     task: str
-    updates: int
-    share: int
 
     @property
     def folder(self) -> Path:
@@ -73,7 +69,7 @@ class CommonHeads:
             for cells in self.seeds(results).values()
             for cell in cells
         }
-        return {"cells": finished, "updates": self.updates, "share": self.share}
+        return {"cells": finished, "updates": COMMON_UPDATES, "share": COMMON_SHARE}
 
     def is_done(self, results: Path) -> bool:
         """Whether they were fitted to all seeds that are finished now.
@@ -95,7 +91,7 @@ def common_heads(grid: Grid, results: Path) -> list[CommonHeads]:
     :return: One for each such task; none in grids of another kind than ``"visitation"``
     """
     tasks = dict.fromkeys(cell.task for cell in grid.cells if grid.kind == "visitation")
-    every = [CommonHeads(grid, task, COMMON_UPDATES, COMMON_SHARE) for task in tasks]
+    every = [CommonHeads(grid, task) for task in tasks]
     return [heads for heads in every if len(heads.seeds(results)) > 1]
 
 
@@ -115,12 +111,12 @@ def run_heads(heads: CommonHeads, results: Path) -> None:
             return
         (folder / ERROR).unlink(missing_ok=True)
         fingerprint, seeds = heads.fingerprint(results), heads.seeds(results)
-        mixes = {seed: _mix(cells, heads.share, results) for seed, cells in seeds.items()}
+        mixes = {seed: _mix(cells, results) for seed, cells in seeds.items()}
         tables: dict[Path, list[Row]] = {}
         for seed, cells in seeds.items():
             judge = _judge(cells[0])
             others = np.concatenate([mixes[other] for other in mixes if other != seed])
-            for _ in fit_head(judge, others, heads.updates):
+            for _ in fit_head(judge, others, COMMON_UPDATES):
                 pass
             print(f"{heads.folder}: the head of seed {seed} is fitted", flush=True)
             for cell in cells:
@@ -141,7 +137,7 @@ def _episodes(cell: Cell, results: Path, known: Container[str] = ()) -> Iterator
                 yield actor, roll_out(model, cell, env, actor)
 
 
-def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
+def _mix(cells: Sequence[Cell], results: Path) -> np.ndarray:
     """Equally many observations of each policy of a seed, those of the first arm that has it.
 
     Further arms of the same kind, such as variants, would outweigh the others.
@@ -150,7 +146,7 @@ def _mix(cells: Sequence[Cell], share: int, results: Path) -> np.ndarray:
     for cell in cells:
         for actor, episodes in _episodes(cell, results, seen):
             observations = np.concatenate([episode.observations for episode in episodes])
-            seen[actor] = observations[np.linspace(0, len(observations) - 1, share).astype(int)]
+            seen[actor] = observations[np.linspace(0, len(observations) - 1, COMMON_SHARE).astype(int)]
     return np.concatenate(list(seen.values()))
 
 

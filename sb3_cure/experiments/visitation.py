@@ -15,9 +15,15 @@ from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_cure.cure.algorithms import CuReSAC
 from sb3_cure.envs import physics_state_names, physics_state_units
-from sb3_cure.evaluation.callbacks import untouched_randomness
 from sb3_cure.evaluation.result_files import Row, write_csv
-from sb3_cure.evaluation.rollouts import Episode, balanced_negatives, chunks, run_episodes, trained_actors
+from sb3_cure.evaluation.rollouts import (
+    Episode,
+    balanced_negatives,
+    chunks,
+    run_episodes,
+    trained_actors,
+    untouched_randomness,
+)
 from sb3_cure.experiments.grid import Cell
 from sb3_cure.networks.layers import flatten_vectors
 from sb3_cure.srl import RAE

@@ -43,7 +43,8 @@ from sb3_cure.evaluation.callbacks import (
     ReconstructionCallback,
     StateProbeCallback,
 )
-from sb3_cure.evaluation.rollouts import Episode, binned_errors, run_episodes, state_probe
+from sb3_cure.evaluation.probe import state_probe
+from sb3_cure.evaluation.rollouts import Episode, binned_errors, run_episodes
 from sb3_cure.evaluation.video import annotated_frames
 
 

@@ -25,13 +25,13 @@ from sb3_cure.data.samples import Samples
 from sb3_cure.evaluation import plots, rollouts
 from sb3_cure.evaluation.callbacks import EvalBothCallback
 from sb3_cure.evaluation.decoding import draw_latents, fit_decoder
+from sb3_cure.evaluation.probe import state_probe
 from sb3_cure.evaluation.rollouts import (
     Episode,
     balanced_negatives,
     highest_errors,
     run_episodes,
     srl_errors,
-    state_probe,
 )
 
 

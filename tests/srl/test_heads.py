@@ -16,7 +16,8 @@ from updates_for_tests import filled_model, standardised, train_once
 from sb3_cure import CuReSAC, make_dmc_env
 from sb3_cure.data.samples import Samples
 from sb3_cure.envs import physics_state_names, physics_state_units
-from sb3_cure.evaluation.rollouts import Episode, run_episodes, srl_errors, state_probe
+from sb3_cure.evaluation.probe import state_probe
+from sb3_cure.evaluation.rollouts import Episode, run_episodes, srl_errors
 from sb3_cure.srl import SRL_HEADS
 
 HEADS = pytest.mark.parametrize("srl", SRL_HEADS)
