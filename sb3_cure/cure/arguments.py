@@ -88,8 +88,10 @@ def choose_intrinsic(model: Any) -> type[IntrinsicReward]:
 
 def _depends_on_observation_alone(model: Any) -> bool:
     """Whether the intrinsic reward of a transition (s, a, s') depends on s alone."""
-    is_error = issubclass(choose_intrinsic(model), SRLError) and model.srl is not None
-    return is_error and model.curiosity_target == "observation" and not get_srl_class(model.srl).models_transitions
+    if model.srl is None or not issubclass(choose_intrinsic(model), SRLError):
+        return False
+    head = get_srl_class(model.srl)
+    return model.curiosity_target == "observation" and not (head.models_transitions or head.needs_next_latents)
 
 
 def _conflicts(model: Any) -> Iterator[str]:

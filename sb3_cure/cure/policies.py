@@ -185,10 +185,14 @@ class CuRePolicy(BasePolicy):
         with _forked_rng(self._head_seed):
             self.srl = self._build_head(srl_class, srl_kwargs)
         self.srl.bind(self.encoder_target, self.augmentation)
-        # A head may have registered the encoder as a submodule, but the encoder has its own optimiser.
-        shared = set(map(id, [*self.encoder.parameters(), *self.encoder_target.parameters()]))
-        parameters = [parameter for parameter in self.srl.parameters() if id(parameter) not in shared]
+        parameters = self._own_parameters(self.srl)
         self.srl.optimizer = self._make_optimizer(parameters, **self.srl.optimizer_kwargs) if parameters else None
+
+    def _own_parameters(self, module: nn.Module) -> list[nn.Parameter]:
+        """Parameters of a head or reward without those of encoder and head, which it may have registered."""
+        others = [each for each in (self.encoder, self.encoder_target, self.srl) if each not in (None, module)]
+        shared = {id(parameter) for other in others for parameter in other.parameters()}
+        return [parameter for parameter in module.parameters() if id(parameter) not in shared]
 
     def _build_head(self, srl_class: type[SRLHead], srl_kwargs: dict[str, Any]) -> SRLHead:
         """Dynamics heads use the joint latents; other heads get one instance per image of a dictionary."""
@@ -209,7 +213,7 @@ class CuRePolicy(BasePolicy):
                 settings={**(self._arguments["reward_settings"] or {}), "srl": self.srl},
                 kwargs=intrinsic_kwargs,
             )
-        parameters = [parameter for parameter in self.intrinsic.parameters() if parameter.requires_grad]
+        parameters = [each for each in self._own_parameters(self.intrinsic) if each.requires_grad]
         self.intrinsic.optimizer = self._make_optimizer(parameters) if parameters else None
 
     def _make_actor_critic(self) -> ActorCritic:

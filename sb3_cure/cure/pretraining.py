@@ -233,6 +233,9 @@ class Pretraining(CuRe):
                 f"curiosity was set to {self.curiosity!r} after the model was made, with networks of another kind: "
                 "make a new model. (With curiosity_prob=0 a separate curious policy learns, but does not act.)"
             )
+        for name in ("task", "update", "curiosity_encoder_grad"):
+            if getattr(self, name) != (made_with := self.policy._arguments[name]):
+                raise ValueError(f"{name} was set after the model was made with {made_with!r}: make a new model.")
         if self._restarts_random_streams:
             self._restart_random_streams()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

@@ -192,6 +192,8 @@ def _transitions(source: Iterator[Any], buffer: ReplayBuffer, scale_action: Call
                 "an episode of T steps has T actions, rewards, terminations and truncations, and T + 1 observations, "
                 f"but in one T is {', '.join(f'{length} ({name})' for name, length in lengths.items())}."
             )
+        if np.logical_or(episode.terminations, episode.truncations)[:-1].any():
+            raise ValueError("an episode ends before its last step: split the recording, or values cross the boundary.")
         actions = scale_action(np.asarray(episode.actions))
         if actions.shape[1:] != buffer.action_space.shape or not (np.abs(actions) <= 1 + 1e-6).all():
             raise ValueError(

@@ -310,6 +310,13 @@ def make_encoder(
     :param observation_space: Space of the views
     :param kwargs: Passed on to the class
     :return: The encoder
+    :raises ValueError: if an ``Encoder`` has a ``forward`` of its own, which not all of its users would call
     """
     extractor = extractor_class(observation_space, **kwargs)  # type: ignore[arg-type]
-    return extractor if isinstance(extractor, Encoder) else ExtractorEncoder(extractor)
+    if not isinstance(extractor, Encoder):
+        return ExtractorEncoder(extractor)
+    if type(extractor).forward is not Encoder.forward:
+        raise ValueError(
+            f"{extractor_class.__name__} overrides forward, but agents call trunk and projection, too: override these."
+        )
+    return extractor

@@ -50,7 +50,7 @@ class SRLHead(nn.Module):
     def __init__(self, encoder: Encoder, observation_space: spaces.Space):
         super().__init__()
         self.observation_space = observation_space
-        self.optimizer_kwargs = {}
+        self.optimizer_kwargs = dict(getattr(self, "optimizer_kwargs", {}))  # a subclass may have set them
         # In tuples, so that the encoders are not registered as submodules: the head does not train or save them.
         self._encoder = self._target_encoder = (encoder,)
         #: Draws another view of stored observations: ``self.augment(batch.observations)``
@@ -89,7 +89,11 @@ class SRLHead(nn.Module):
 
         :param target_encoder: The moving average of the encoder
         :param augmentation: The policy's augmentation
+        :raises ValueError: if the head has a network of its own by the name of a shared one, which nothing would read
         """
+        for name, shared in {"encoder": self.encoder, "target_encoder": target_encoder}.items():
+            if self._modules.get(name, shared) is not shared:
+                raise ValueError(f"{type(self).__name__} has a network {name!r}, the shared one's name: rename it.")
         self._target_encoder = (target_encoder,)
         self.augment = augmentation
 

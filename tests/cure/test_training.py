@@ -504,6 +504,15 @@ def test_curiosity_that_is_set_later_needs_the_same_networks(before: str | None,
         model.learn(12)
 
 
+@pytest.mark.parametrize("change", [dict(task=False), dict(update="sequential"), dict(curiosity_encoder_grad=False)])
+def test_what_decides_who_trains_the_encoder_cannot_be_set_later(change: dict[str, Any]) -> None:
+    """The task's actor would act on, untrained; and the archive could not be loaded."""
+    model = tiny_model("MlpPolicy", VectorBox())
+    vars(model).update(change)
+    with pytest.raises(ValueError, match=f"{next(iter(change))} was set after the model was made"):
+        model.learn(12)
+
+
 def test_pretraining_of_a_bonus() -> None:
     """Each run has its burst; the bonus is scaled anew, by its size and not by the spread of another reward."""
     model = tiny_model("MlpPolicy", VectorBox(), curiosity="bonus", ent_coef=0.1, warmup_updates=5).pretrain(14)

@@ -438,6 +438,25 @@ def test_pickled_buffer_is_as_large_as_its_contents(tmp_path: Path) -> None:
     assert loaded.counts == {"": 3}
 
 
+class Prioritised(FrameStackReplayBuffer):
+    """A buffer of the user's own, with an argument and a state."""
+
+    def __init__(self, *args: Any, alpha: float = 0.6, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.alpha, self.priorities = alpha, np.ones(self.buffer_size)
+
+
+def test_copies_keep_what_a_subclass_adds() -> None:
+    buffer = Prioritised(9, image_space(3, 3, 8, 8), ACTIONS, "cpu", frame_stack=3, alpha=0.9)
+    obs = np.ones((1, 9, 8, 8), np.uint8)
+    buffer.add(*row_of(obs, obs))
+    buffer.priorities[0] = 5
+    copied = copy.deepcopy(buffer)
+    assert type(copied) is Prioritised and copied.size() == 1
+    assert copied.alpha == 0.9 and copied.priorities[0] == 5
+    assert copied.priorities is not buffer.priorities
+
+
 def test_frames_on_disk_are_the_same_frames(tmp_path: Path) -> None:
     """Also after a copy; nothing is left in the folder."""
     twins = Twins(20)

@@ -132,6 +132,16 @@ def test_lengths_of_an_episode_must_agree() -> None:
     assert model.replay_buffer.size() == 0
 
 
+def test_several_episodes_in_one_are_refused() -> None:
+    """At the boundary a value would bootstrap from the first observation of the next episode."""
+    model, n = tiny_model("MlpPolicy", VectorBox()), 6
+    ends = np.zeros(n, bool)
+    ends[2] = True
+    joined = RecordedEpisode(np.zeros((n + 1, 2), np.float32), np.zeros((n, 2)), np.zeros(n), ~ends & ends, ends)
+    with pytest.raises(ValueError, match="ends before its last step"):
+        model.load_transitions([joined])
+
+
 @pytest.mark.parametrize("part", ["observations", "actions", "rewards"])
 @pytest.mark.parametrize("number", [np.nan, 1e39])
 def test_numbers_that_are_not_finite_are_refused(part: str, number: float) -> None:

@@ -56,6 +56,19 @@ class SlowLatents(LatentStep):
     trains_encoder = True
 
 
+def test_reward_that_holds_the_head_does_not_train_it() -> None:
+    class Holder(Forward):
+        needs_srl = True
+
+        def __init__(self, *args: Any, srl: Any):
+            super().__init__(*args)
+            self.srl = srl
+
+    policy = tiny_model("MlpPolicy", VectorBox(), srl="rae", intrinsic=Holder).policy
+    (group,) = policy.intrinsic.optimizer.param_groups
+    assert set(map(id, group["params"])) == set(map(id, policy.intrinsic.model.parameters()))
+
+
 @UPDATES
 @pytest.mark.parametrize("curiosity", ["separate", "bonus"])
 def test_reward_with_parameters_learns_them(curiosity: str, update: str) -> None:

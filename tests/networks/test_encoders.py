@@ -250,6 +250,17 @@ def test_make_encoder_leaves_ours_as_they_are() -> None:
     assert th.equal(wrapped(x), wrapped.trunk(x))
 
 
+def test_encoder_with_a_forward_of_its_own_is_refused() -> None:
+    """Critics would read latents of trunk and projection, and their targets those of forward."""
+
+    class Unit(PixelEncoder):
+        def forward(self, views: Any) -> th.Tensor:
+            return F.normalize(super().forward(views))
+
+    with pytest.raises(ValueError, match="Unit overrides forward"):
+        make_encoder(Unit, image_space(3, 36))
+
+
 @pytest.mark.parametrize("update", ["joint", "sequential"])
 def test_pretrained_extractor_may_be_frozen(update: str) -> None:
     """Its parameters stay, everything that reads its features learns."""

@@ -1,13 +1,13 @@
 """What a head is given, and what is done with what it returns."""
 
 import copy
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch as th
 from dictionaries_for_tests import sensor_model
-from envs_for_tests import PixelBox, tiny_model
+from envs_for_tests import PixelBox, VectorBox, tiny_model
 from torch import nn
 from updates_for_tests import BATCH, equal, filled_model, groups, moved, train_once
 
@@ -247,6 +247,27 @@ def test_head_does_not_own_the_encoder(srl: str) -> None:
     assert not any("encoder" in key for key in policy.srl.state_dict())
     assert policy.srl.encoder is policy.encoder
     assert policy.srl.target_encoder is policy.encoder_target
+
+
+@pytest.mark.parametrize("name", ["encoder", "target_encoder"])
+def test_network_by_the_name_of_a_shared_one_is_refused(name: str) -> None:
+    """A momentum encoder of the head's own, say: reading the name would give the shared one."""
+
+    class Momentum(Positions):
+        def __init__(self, encoder: Encoder, observation_space: Any):
+            super().__init__(encoder, observation_space)
+            setattr(self, name, copy.deepcopy(encoder))
+
+    with pytest.raises(ValueError, match=f"Momentum has a network '{name}'.*rename it"):
+        tiny_model("MlpPolicy", VectorBox(), srl=Momentum)
+
+
+def test_optimizer_arguments_may_be_the_heads_class() -> None:
+    class Decaying(Positions):
+        optimizer_kwargs: ClassVar[dict[str, Any]] = {"weight_decay": 0.5}
+
+    model = tiny_model("MlpPolicy", VectorBox(), srl=Decaying)
+    assert model.policy.srl.optimizer.param_groups[0]["weight_decay"] == 0.5
 
 
 @UPDATES
