@@ -13,7 +13,7 @@ from scipy import stats
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from benchmarks.harness import make_model
-from benchmarks.update import METHODS
+from benchmarks.phases import METHODS
 
 COLUMNS = {"train/q_target": "mean Q", "train/srl_loss": "SRL loss"}
 #: Small, so that there is time for many seeds: how far runs part says more than one run of the paper's size

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from benchmarks import checkpoints, collection, growth, heads, numerics, rendering, replay, rewards, settings, update
+from benchmarks import checkpoints, collection, growth, heads, numerics, phases, rendering, replay, rewards, settings
 from benchmarks.harness import PRECISIONS
 from sb3_cure.networks.allocator import tune_allocator
 
@@ -18,11 +18,10 @@ def parts(repeats: int, disk: str | None) -> dict[str, Callable[[], dict[str, An
     :return: What can be measured, by name, in the order of the report
     """
     return {
-        "update": partial(update.measure, repeats),
         "update_by_setting": partial(settings.measure, repeats),
         "update_by_head": partial(heads.costs, repeats),
         "update_by_reward": partial(rewards.costs, repeats),
-        "update_by_phase": update.breakdowns,
+        "update_by_phase": phases.breakdowns,
         "replay": replay.measure,
         "rendering": rendering.measure,
         "end_to_end": collection.measure,

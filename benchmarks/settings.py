@@ -88,6 +88,7 @@ def _measure(setting: Setting, repeats: int) -> dict[str, Any]:
     arms: dict[str, dict[str, Any]] = {
         "CuRe-RAE": {},
         "CuRe-RAE, fp32": dict(precision="fp32"),
+        "CuRe-RAE, sequential": dict(update="sequential"),
         "CuRe-RAE, no curiosity": dict(curiosity=None),
         "CuRe-CURL": dict(intrinsic="srl_error", **curl),  # the paper's
         "CuRe-CURL, reconstruction": dict(intrinsic="reconstruction", **curl),

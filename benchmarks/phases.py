@@ -1,71 +1,17 @@
-"""Time of one update: ours by mode, precision and head, beside plain SAC-AE and SB3's SAC on the same batches."""
+"""Time of an update, phase by phase."""
 
 import contextlib
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import torch as th
-from stable_baselines3 import SAC
 
-from benchmarks.harness import BATCH_SIZE, PRECISIONS, interleaved, make_model, median_ratio, summary
-from benchmarks.sac_ae import PlainSacAe
+from benchmarks.harness import BATCH_SIZE, make_model
 
 #: Of the paper, which rewards the curious agent for the head's own error
 METHODS: dict[str, dict[str, Any]] = {head: dict(srl=head, intrinsic="srl_error") for head in ("rae", "curl")}
-YARDSTICK, SB3_SAC = "plain SAC-AE, fp32", "SB3 SAC (NatureCNN, 1024)"
-
-
-def _train_call(model: Any) -> Callable[[], object]:
-    return lambda: model.train(gradient_steps=1, batch_size=BATCH_SIZE)
-
-
-def _yardstick_call() -> Callable[[], object]:
-    buffer = make_model().replay_buffer
-    agent = PlainSacAe(actions=1, device=buffer.device)
-    return lambda: agent.update(buffer.sample(BATCH_SIZE))
-
-
-def measure(repeats: int = 7, precisions: tuple[str, ...] = PRECISIONS) -> dict[str, Any]:
-    """Time updates by mode, precision and head.
-
-    :param repeats: Rounds
-    :param precisions: Number formats to measure
-    :return: Times by variant, and the ratios that matter
-    """
-    variants = {
-        YARDSTICK: _yardstick_call(),
-        SB3_SAC: _train_call(make_model(SAC, policy_kwargs=dict(net_arch=[1024, 1024]))),
-    }
-    default = "joint"
-    arms: list[tuple[str, str, str, str | None]] = [
-        (head, mode, precision, "separate")
-        for head in METHODS
-        for mode in ("joint", "sequential")
-        for precision in precisions
-    ]
-    arms += [("rae", default, precision, None) for precision in precisions]
-    for head, mode, precision, curiosity in arms:
-        model = make_model(**METHODS[head], update=mode, precision=precision, curiosity=curiosity, warmup_updates=0)
-        variants[_name(head, mode, precision, curiosity)] = _train_call(model)
-    times = interleaved(variants, repeats)
-    ratios = {}
-    for precision in precisions:
-        ours = _name("rae", default, precision, "separate")
-        ratios[f"plain SAC-AE fp32 / CuRe-RAE {precision}"] = median_ratio(times, YARDSTICK, ours)
-        ratios[f"SB3 SAC / CuRe-RAE {precision}"] = median_ratio(times, SB3_SAC, ours)
-        without = _name("rae", default, precision, None)
-        ratios[f"curiosity on / off, {precision}"] = median_ratio(times, ours, without)
-    return {
-        "default_mode": default,
-        "times": {name: summary(values) for name, values in times.items()},
-        "ratios": {name: round(value, 2) for name, value in ratios.items()},
-    }
-
-
-def _name(head: str, mode: str, precision: str, curiosity: str | None) -> str:
-    return f"CuRe-{head.upper()}, {mode}, {precision}" + ("" if curiosity else ", no curiosity")
 
 
 class PhaseTimer:
