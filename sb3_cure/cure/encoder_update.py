@@ -110,8 +110,8 @@ class EncoderUpdate:
 
         :param source: Name of the loss; latents of a loss that does not train the encoder carry no gradient
         :param name: Name of the views
-        :param graph: Whether any loss of this update needs the graph of these latents, which is then built even under
-            ``no_grad``
+        :param graph: Whether to build the graph, even under ``no_grad``, as later losses of this update share these
+            latents; False where none differentiates through them (centred views, read by a reward that learns nothing)
         :return: fp32, [B, features_dim]
         """
         if name not in self._latents:

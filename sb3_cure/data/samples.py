@@ -36,8 +36,8 @@ class Samples(NamedTuple):
     :param discounts: Discounts of a custom buffer, float32 [B, 1]; None: the discount factor of the agent
     :param views: ``observations`` as the encoder saw them (shifted or cropped), in 0-255, [B, *view shape]
     :param n_step: Returns of n steps, for the task's critic alone; None unless ``n_steps > 1``
-    :param restarts: ``next_observations``, but where the episode terminated the first observation of the next one, for
-        the curious critic alone; None if they are the same
+    :param restarts: What the curious critic bootstraps from: ``next_observations``, with each terminal observation
+        replaced by the first one of the next episode; None if nothing was replaced
     """
 
     observations: th.Tensor

@@ -37,7 +37,8 @@ class Persistence(SavesModels, SavesReplayBuffers):
     def __deepcopy__(self: Self, memo: dict[int, Any]) -> Self:
         """Copy the model with its environments and replay buffer, for population-based training.
 
-        The logger is shared until the copy's next ``learn``: its open files cannot be copied.
+        The logger is shared, as its open files cannot be copied: until the copy's next ``learn`` makes a new one or, if
+        it was set by ``set_logger``, until the copy is given another.
         """
         if "_logger" in vars(self):
             memo[id(self._logger)] = self._logger
