@@ -278,9 +278,10 @@ class _Record(BaseCallback):
         with untouched_randomness(model.device, EVAL_SEED):
             episodes = run_episodes(model, self.eval_env, self.cell.eval_episodes, actor, seed=EVAL_SEED)
             returns, errors = returns_and_errors(episodes)
-        if not np.isfinite(returns).all():
-            raise ValueError(f"{self.cell.task} gave an evaluation the returns {returns}: correct its rewards.")
-        for number, value in enumerate(returns.tolist()):
+        totals = returns.tolist()
+        if not np.isfinite(totals).all():
+            raise ValueError(f"{self.cell.task} gave an evaluation the returns {totals}: correct its rewards.")
+        for number, value in enumerate(totals):
             values = (row["environment_steps"], actor, number, value)
             self.episodes.append(dict(zip(_EPISODE_COLUMNS, values, strict=True)))
         if actor == "task":

@@ -147,6 +147,7 @@ def _run_side_by_side(run_unit: RunUnit, jobs: int, results: Path, units: Sequen
         for process in running:
             process.join(LEAVE_SECONDS)
             process.kill()
+            process.join()
     return failed
 
 

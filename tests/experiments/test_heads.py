@@ -105,7 +105,7 @@ def test_heads_see_the_other_seeds_alone(visits: Path, monkeypatch: pytest.Monke
     """The policies of a seed are judged by a head that has seen nothing of them, but all of the others."""
     seen: dict[int, set[int]] = {}
 
-    def mix(of_seed: list[Any], share: int, results: Path) -> np.ndarray:
+    def mix(of_seed: list[Any], results: Path) -> np.ndarray:
         return np.full((4, 3, 24, 24), of_seed[0].seed, dtype=np.uint8)
 
     def fit(model: CuReSAC, observations: np.ndarray, updates: int) -> Iterator[int]:
