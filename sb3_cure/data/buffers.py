@@ -108,7 +108,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         self.observations, self.next_observations = (  # type: ignore[assignment]
             self.rows.get(f"{name}/") for name in ("observations", "next_observations")
         )
-        self._names = {"_names", *vars(self)}  # all others are a subclass's
+        self._own_attributes = {"_own_attributes", *vars(self)}  # all others are a subclass's
         if frames_dir is None and psutil is not None and self.nbytes > (free := psutil.virtual_memory().available):
             warnings.warn(
                 f"The full replay buffer needs {self.nbytes / 1e9:.2f} GB of memory, but {free / 1e9:.2f} GB are "
@@ -346,7 +346,7 @@ class FrameStackReplayBuffer(ReplayBuffer):
         names = ("observation_space", "action_space", "device", "n_envs", "handle_timeout_termination")
         settings = {name: getattr(self, name) for name in (*names, "frame_stack", "info_shapes", "frames_dir")}
         settings["buffer_size"] = self.buffer_size * self.n_envs
-        of_subclass = {name: value for name, value in vars(self).items() if name not in self._names}
+        of_subclass = {name: value for name, value in vars(self).items() if name not in self._own_attributes}
         return {"settings": settings, "state": self.state_dict(), "of_subclass": of_subclass}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

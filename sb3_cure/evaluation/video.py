@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from sb3_cure.evaluation.rollouts import Episode
 
 MIN_WIDTH = 256
+GIF_HEIGHT = 128
 #: Characters of a line of the title; text grows with the picture, so that it holds as many at any width
 LINE = 36
 RED, GREY = "#d62728", "#bbbbbb"
@@ -55,7 +56,8 @@ def write_gif(path: Path, episode: Episode, fps: int, channels: int = 3) -> None
     :param fps: Pictures per second, one per agent step
     :param channels: Of a frame that the agent sees: 3, or 1 if it is grey
     """
-    pictures, size = [], 128
+    pictures = []
+    size = GIF_HEIGHT
     for frame, observation in zip(episode.frames[:-1], episode.observations, strict=True):
         seen = observation[-channels:].transpose(1, 2, 0).repeat(3 // channels, axis=2)
         rendered = Image.fromarray(frame).resize((size, size), Image.Resampling.LANCZOS)

@@ -84,8 +84,7 @@ class IntrinsicReward(nn.Module):
     Rewards are computed anew for each sampled batch, so they are never stale. Keep targets, statistics and memories in
     buffers, which are saved, and draw random numbers from an ``OwnGenerator``, so that runs with the same
     seed and different rewards draw the same numbers elsewhere. A constructor that names ``frame_stack`` (frames per
-    image), ``curiosity_target`` or ``srl`` (the head, which its own optimizer trains) gets that
-    setting of the agent.
+    image), ``curiosity_target`` or ``srl`` (the head, which its own optimizer trains) gets that setting of the agent.
 
     :param observation_space: Space of the stored observations
     :param action_space: Action space
