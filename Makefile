@@ -34,6 +34,8 @@ MUTATION_ARGS ?=
 define apt_install
 	if [ "$$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then exit 1; fi
 	echo "Installing $(1)"
+	exec 8<>Makefile  # only to lock it: of two at a time, apt refuses the second
+	flock 8
 	export DEBIAN_FRONTEND=noninteractive
 	apt-get update -qq || true
 	apt-get install -y -qq --no-install-recommends -o DPkg::Lock::Timeout=300 $(1) >/dev/null

@@ -15,7 +15,9 @@ import pytest
 import torch as th
 
 # What workers of vectorised environments need is imported once by the server that forks them, not by each of them.
-multiprocessing.get_context("forkserver").set_forkserver_preload(["sb3_cure", "stable_baselines3.common.vec_env"])
+multiprocessing.get_context("forkserver").set_forkserver_preload(
+    ["sb3_cure", "stable_baselines3.common.vec_env", "torch._dynamo", "shimmy"]
+)
 
 # The networks of the tests are so small that more threads only cost time; and some sums depend on their number.
 th.set_num_threads(1)

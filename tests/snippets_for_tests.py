@@ -5,6 +5,7 @@ short episodes with tiny networks and images, and callbacks come due in them. Pa
 fork.
 """
 
+import importlib
 import os
 import sys
 import traceback
@@ -95,6 +96,12 @@ def shrink_models(small: Callable[..., gym.Env] = short_episodes) -> None:
     sb3_cure.make_dmc_env = envs.make_dmc_env = dmc.make_dmc_env
 
 
+def shrink_for_notebooks() -> None:
+    shrink_models()
+    shrink(rollouts, "run_episodes", two_episodes)
+    evaluation.run_episodes = callbacks.run_episodes = rollouts.run_episodes
+
+
 def shrink_everything() -> None:
     shrink_models(small_env)
     for name in ("learn", "pretrain", "fit_representation"):
@@ -109,6 +116,9 @@ def shrink_everything() -> None:
 
 
 if __name__ == "__main__":
+    # What the pages would import one after the other, which takes longer than all that they do
+    for package in ("torch._dynamo", "matplotlib.pyplot", "tensorboard", "imageio", "mujoco", "shimmy"):
+        importlib.import_module(package)
     shrink_everything()
     failed = [folder for folder in sys.argv[1:] if not run_page(folder)]
     sys.exit(f"failed: {failed}" if failed else 0)

@@ -38,8 +38,8 @@ RUNS: dict[str, tuple[Any, str, int, int, dict[str, Any]]] = {
     "box-rae-1-bf16": (BOX, "dummy", 1, 24, dict(precision="bf16")),
     "box-off-4": (BOX, "dummy", 4, 48, dict(srl=None, curiosity=None)),
     "box-curl-4-subproc": (BOX, "subproc", 4, 48, dict(srl="curl")),
-    "dmc-rae-4": (cartpole, "dummy", 4, 48, {}),
-    "dmc-curl-4-overlap": (cartpole, "subproc", 4, 48, dict(srl="curl", overlap=True)),
+    "dmc-rae-2": (cartpole, "dummy", 2, 30, {}),
+    "dmc-curl-2-overlap": (cartpole, "subproc", 2, 30, dict(srl="curl", overlap=True)),
 }
 
 

@@ -56,7 +56,7 @@ def test_task_return_rises_well_above_random(srl: str, update: str) -> None:
         update=update,
         gamma=0.9,
         **QUICK,
-    ).learn(1200)
+    ).learn(800)
     env = PixelBox(frame_stack=1, size=SIZE)
     random = mean_return(model, env, "random")
     assert random < 9
@@ -72,7 +72,7 @@ def test_curious_policy_visits_persistently_high_error_more_than_random() -> Non
         task=False,
         curiosity_gamma=0.9,
         **QUICK,
-    ).learn(1200)
+    ).learn(800)
     visits, errors = {}, {}
     for actor in ("curious", "random"):
         env = StaticScreen()

@@ -16,16 +16,18 @@ import sys
 import gymnasium as gym, numpy as np
 import sb3_cure
 
-env = gym.make("dmc_pixels/cartpole-swingup-v0", image_size=36, renderer="fast", render_mode=sys.argv[1])
-env.action_space.seed(0)
-found = {"observations": [env.reset(seed=0)[0]], "frames": [], "shown": []}
-for _ in range(4):
-    found["observations"].append(env.step(env.action_space.sample())[0])
-    if sys.argv[1] == "human":
-        found["frames"].append(env.env.render())
-        found["shown"].append(np.frombuffer(open(sys.argv[3], "rb").read(), np.uint8))
-np.savez(sys.argv[2], **{name: np.stack(values) for name, values in found.items() if values})
-env.close()
+found = {"rgb_array": [], "human": [], "frames": [], "shown": []}
+for mode in ("rgb_array", "human"):
+    env = gym.make("dmc_pixels/cartpole-swingup-v0", image_size=36, renderer="fast", render_mode=mode)
+    env.action_space.seed(0)
+    found[mode].append(env.reset(seed=0)[0])
+    for _ in range(4):
+        found[mode].append(env.step(env.action_space.sample())[0])
+        if mode == "human":
+            found["frames"].append(env.env.render())
+            found["shown"].append(np.frombuffer(open(sys.argv[2], "rb").read(), np.uint8))
+    env.close()
+np.savez(sys.argv[1], **{name: np.stack(values) for name, values in found.items()})
 """
 SIZE = 320
 
@@ -57,17 +59,15 @@ def test_window_shows_frames_and_leaves_observations_alone(
     name, screen = display
     environment = {**os.environ, "DISPLAY": name, "MUJOCO_GL": backend, "SDL_VIDEO_WINDOW_POS": "0,0"}
     environment.pop("SDL_VIDEODRIVER", None)
-    found = {}
-    for mode in ("human", "rgb_array"):
-        command = [sys.executable, "-c", PROGRAM, mode, str(tmp_path / f"{mode}.npz"), str(screen)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr[-2000:]
-        with np.load(tmp_path / f"{mode}.npz") as file:
-            found[mode] = dict(file)
-    np.testing.assert_array_equal(found["human"]["observations"], found["rgb_array"]["observations"])
-    frames = found["human"]["frames"]
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "found.npz"), str(screen)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    with np.load(tmp_path / "found.npz") as file:
+        found = dict(file)
+    np.testing.assert_array_equal(found["human"], found["rgb_array"])
+    frames = found["frames"]
     assert all((frames[i] != frames[i + 1]).any() for i in range(len(frames) - 1))
     # The display's memory: a header, then rows of blue, green, red and a byte that says nothing.
-    shown = found["human"]["shown"][:, -SIZE * SIZE * 4 :].reshape(-1, SIZE, SIZE, 4)
+    shown = found["shown"][:, -SIZE * SIZE * 4 :].reshape(-1, SIZE, SIZE, 4)
     height, width = frames.shape[1:3]
     np.testing.assert_array_equal(shown[:, :height, :width, 2::-1], frames)

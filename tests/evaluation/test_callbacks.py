@@ -111,16 +111,16 @@ def test_watching_does_not_change_the_training(tmp_path: Path) -> None:
             env = Careless(watching)
             callbacks = [
                 *(EvalBothCallback(env, 5, 1, actors=["task", "curious", "random"], seed=seed) for seed in (1, None)),
-                PolicyVideoCallback(env, tmp_path, 15, deterministic=False),
-                ReconstructionCallback(tmp_path, 15, decoder_updates=2),
-                CuriosityMapCallback(env, tmp_path, 15, n_episodes=1, deterministic=False, **MAP),
-                StateProbeCallback(env, 15, n_episodes=2, **MAP),
+                PolicyVideoCallback(env, tmp_path, 11, deterministic=False),
+                ReconstructionCallback(tmp_path, 11, decoder_updates=2),
+                CuriosityMapCallback(env, tmp_path, 11, n_episodes=1, deterministic=False, **MAP),
+                StateProbeCallback(env, 11, n_episodes=2, **MAP),
             ]
         model = tiny_model("CnnPolicy", training, srl="curl", srl_kwargs=dict(bank_size=12))
-        models.append(model.learn(40, callback=callbacks))
+        models.append(model.learn(24, callback=callbacks))
     assert names(tmp_path) == sorted(
-        [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (15, 30)]
-        + [f"curiosity_map_{steps}_steps.png" for steps in (15, 30)]
+        [f"{actor}_policy_{steps}_steps.mp4" for actor in ("task", "curious") for steps in (11, 22)]
+        + [f"curiosity_map_{steps}_steps.png" for steps in (11, 22)]
         + ["reconstructions.png"]
     )
     assert differences(models[0].get_parameters(), models[1].get_parameters()) == []
@@ -383,13 +383,13 @@ def test_pictures_need_images(tmp_path: Path) -> None:
 @pytest.mark.parametrize("srl", ["rae", "curl"])
 def test_each_image_has_a_picture_of_reconstructions(srl: str, tmp_path: Path) -> None:
     """Drawn by its head, or by a decoder that is fitted afterwards; of the same observations at all times."""
-    callback = ReconstructionCallback(tmp_path, every=30, columns=3, decoder_updates=40)
-    model = sensor_model(srl=srl).learn(30, callback=callback)
+    callback = ReconstructionCallback(tmp_path, every=14, columns=3, decoder_updates=15)
+    model = sensor_model(srl=srl).learn(14, callback=callback)
     callback.draw(model)
     files = sorted(path.name for path in tmp_path.iterdir())
     assert files == [f"reconstructions_{key}.png" for key in ("front", "wrist")]
     steps, (*_, drawn) = zip(*callback.rows, strict=True)
-    assert steps == (30, 30) and {key: image.shape[2] for key, image in drawn.items()} == {"front": 36, "wrist": 28}
+    assert steps == (14, 14) and {key: image.shape[2] for key, image in drawn.items()} == {"front": 36, "wrist": 28}
     seen: Any = callback.observations
     if srl == "rae":
         expected = model.policy.reconstruct({key: th.as_tensor(part) for key, part in seen.items()})[1]  # type: ignore[index]

@@ -329,7 +329,7 @@ def test_cell_trains_on_real_pixels(arm: str, tmp_path: Path) -> None:
     """In a process of its own, with one thread."""
     limits: dict[str, Any] = {"budget": 48, "eval_every": 4, "eval_episodes": 1}
     cell = replace(ttr.make_cell(arm, "cartpole-swingup", 0, tmp_path), **limits)
-    process = multiprocessing.get_context("spawn").Process(target=ttr.run_cell, args=(tmp_path, cell, 5.0, None))
+    process = multiprocessing.get_context("forkserver").Process(target=ttr.run_cell, args=(tmp_path, cell, 5.0, None))
     process.start()
     process.join()
     path = ttr.cell_path(tmp_path, cell)

@@ -71,7 +71,7 @@ class Breakable(gym.Wrapper):
 
 
 def breakable_dmc() -> gym.Env:
-    return Breakable(Monitor(make_dmc_env("ball_in_cup", "catch", image_size=24, renderer="fast")))
+    return Breakable(Monitor(make_dmc_env("cartpole", "swingup", image_size=24, renderer="fast")))
 
 
 def breakable_box(**kwargs: Any) -> gym.Env:
@@ -110,7 +110,7 @@ def kill(env: Any, index: int = 1) -> None:
 @pytest.fixture(scope="module")
 def fresh() -> Iterator[ProcessPoolExecutor]:
     """A process that has rendered nothing, so that it may fork workers which do."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=import_dmc) as process:
+    with ProcessPoolExecutor(1, mp_context=get_context("forkserver"), initializer=import_dmc) as process:
         yield process
 
 
