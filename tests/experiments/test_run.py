@@ -178,7 +178,12 @@ class SideBySide:
         options = ["--no-pictures", "--checkpoint-minutes", "0.01", "--jobs", "2"]
         environment = {**os.environ, "TOGETHER": str(self.begun)}
         self.process = subprocess.Popen(
-            [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
+            [*command, *options],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # which a shell's background job ignores
         )
 
     def wait_for_training(self) -> None:
