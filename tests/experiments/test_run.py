@@ -272,8 +272,8 @@ gym.register("tests/FailingBox-v0", FailingBox)
 def test_workers_fail_and_finish_as_this_process_would(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What failed is known by its sentence and stops no other, and the same call finishes it; each worker has its
-    share of the threads."""
+    """What failed is known by its sentence and stops no other, and another call finishes it, in a worker or here;
+    each worker has its share of the threads."""
     (tmp_path / "failing_box.py").write_text(FAILING_BOX)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr("torch.get_num_threads", lambda: 4)
@@ -288,7 +288,8 @@ def test_workers_fail_and_finish_as_this_process_would(
     assert "killed by signal 9" in (killed / "error.txt").read_text()
     assert (other / "DONE").exists() and "2 threads" in (other / "run.json").read_text()
     monkeypatch.delenv("FAILS")
-    assert run.main(command) == 0
+    assert run.main([*command, "--jobs", "2", "--seeds", "3,"]) == 0
+    assert (killed / "DONE").exists() and run.main(command) == 0
     assert all((folder / "DONE").exists() for folder in (ended, raised, killed))
 
 
