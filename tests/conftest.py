@@ -14,7 +14,7 @@ import multiprocessing
 import pytest
 import torch as th
 
-# What workers of environments, trainings and scripts need is imported once by the server that forks them, not by each.
+# What workers of environments and trainings need is imported once by the server that forks them, not by each of them.
 multiprocessing.get_context("forkserver").set_forkserver_preload(
     ["sb3_cure", "stable_baselines3.common.vec_env", "torch._dynamo", "shimmy"]
 )

@@ -2,9 +2,6 @@
 
 import os
 import shutil
-import sys
-from multiprocessing import get_context
-from multiprocessing.process import BaseProcess
 
 import pytest
 
@@ -22,15 +19,3 @@ def find_program(*names: str, package: str) -> str:
             pytest.fail(reason)
         pytest.skip(reason)
     return found
-
-
-def _run(code: str, arguments: list[str]) -> None:
-    sys.argv = ["-c", *arguments]
-    exec(compile(code, "script", "exec"), {"__name__": "__main__"})
-
-
-def start_script(code: str, *arguments: str) -> BaseProcess:
-    """Run a script in a process of its own, forked from one that has imported the packages."""
-    process = get_context("forkserver").Process(target=_run, args=(code, list(arguments)))
-    process.start()
-    return process

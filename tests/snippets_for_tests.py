@@ -90,14 +90,10 @@ def run_page(folder: str) -> bool:
 
 
 def shrink_models(small: Callable[..., gym.Env] = short_episodes) -> None:
-    """And environments, but not what notebooks have as parameters, such as steps."""
+    """And environments and evaluations, but not what notebooks have as parameters, such as steps."""
     shrink(CuReBase, "__init__", tiny_model)
     shrink(dmc, "make_dmc_env", small)
     sb3_cure.make_dmc_env = envs.make_dmc_env = dmc.make_dmc_env
-
-
-def shrink_for_notebooks() -> None:
-    shrink_models()
     shrink(rollouts, "run_episodes", two_episodes)
     evaluation.run_episodes = callbacks.run_episodes = rollouts.run_episodes
 
@@ -109,8 +105,6 @@ def shrink_everything() -> None:
     shrink(envs, "make_pixel_env", small_env)
     sb3_cure.make_pixel_env = envs.make_pixel_env
     shrink(env_util, "make_vec_env", one_worker)
-    shrink(rollouts, "run_episodes", two_episodes)
-    evaluation.run_episodes = callbacks.run_episodes = rollouts.run_episodes
     shrink(callbacks.PeriodicCallback, "__init__", soon)
     shrink(ExactCheckpoint, "__init__", checkpoint_soon)
 

@@ -15,7 +15,7 @@ SHRINK = f"""
 import os, sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 if "snippets_for_tests" not in sys.modules:
-    import snippets_for_tests; snippets_for_tests.shrink_for_notebooks()
+    import snippets_for_tests; snippets_for_tests.shrink_models()
 """
 #: What replaces the parameter cell of each notebook: it names all parameters, with small values
 SETTINGS = "LEARNING_STARTS, WARMUP_UPDATES, BATCH_SIZE, NETWORKS = 10, 5, 8, {}"

@@ -289,12 +289,12 @@ def power(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(
-    ("minutes", "keeps"),
-    [(0, False), (0, True), (10, False)],
+    ("minutes", "keeps", "moments"),
+    [(0, False, (10, 26, 31, 60, 76)), (0, True, (31, 76)), (10, False, (31, 76))],
     ids=["each step is kept", "and what pretraining collected", "only starts are kept"],
 )
 def test_killed_cell_ends_like_one_that_was_not(
-    minutes: float, keeps: bool, tmp_path: Path, power: SimpleNamespace
+    minutes: float, keeps: bool, moments: tuple[int, ...], tmp_path: Path, power: SimpleNamespace
 ) -> None:
     """Random numbers start anew with training, not before and not when it is resumed."""
     *_, cell = pretrained_grid(tmp_path, TASK, warm_up=20, budget=120).cells
@@ -309,7 +309,7 @@ def test_killed_cell_ends_like_one_that_was_not(
     assert CuReSAC.load(tmp_path / "whole" / cell.folder / "model.zip")._keeps_replay_buffer == keeps
     assert CuReSAC.load(tmp_path / "whole" / cell.folder / "pretrained.zip").num_timesteps == 0
     # In pretraining's warm-up, among its updates, at its end; in the first evaluation, in training's updates
-    for power.fails_at in (10, 26, 31, 60, 76) if minutes == 0 and not keeps else (31, 76):
+    for power.fails_at in moments:
         power.n_steps, folder = 0, tmp_path / f"killed-{power.fails_at}"
         with pytest.raises(RuntimeError, match="the power went"):
             run_cell(cell, folder, minutes, pictures=False)

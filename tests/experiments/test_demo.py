@@ -10,7 +10,6 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 from envs_for_tests import PixelBox, tiny_model
-from gymnasium.wrappers import TimeLimit
 from PIL import Image
 
 from sb3_cure import CuReSAC
@@ -26,8 +25,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         few.setattr(demo, "SETTINGS", {**demo.SETTINGS, **small})
         for name, value in (("EVALUATIONS", 1), ("ROWS", 2), ("EPISODES", 2)):
             few.setattr(demo, name, value)
-        make = demo.make_dmc_env
-        few.setattr(demo, "make_dmc_env", lambda *args, **kwargs: TimeLimit(make(*args, **kwargs), 30))
         assert demo.main(["--out", str(folder), "--steps", "170", "--minutes", "5"]) == 0
     return folder
 
@@ -37,7 +34,7 @@ def test_demo_reports_returns_and_errors(written: Path) -> None:
     summary = json.loads((written / "summary.json").read_text())
     assert summary["agent_steps"] == 170 and summary["environment_steps"] == 1360
     assert summary["updates"] == 5 + 20 // 2
-    assert summary["ratio"] == pytest.approx(summary["final_return_mean"] / summary["random_return_mean"], rel=0.02)
+    assert summary["ratio"] == pytest.approx(summary["final_return_mean"] / summary["random_return_mean"], abs=0.01)
     rows = list(csv.DictReader((written / "learning_curve.csv").open()))
     assert [int(row["agent_steps"]) for row in rows] == [170]
     errors = list(csv.DictReader((written / "errors.csv").open()))
@@ -53,7 +50,7 @@ def test_demo_draws_pictures_and_a_video(written: Path) -> None:
         picture = np.asarray(Image.open(written / f"{name}.png").convert("L"))
         assert picture.std() > 5, f"{name}.png is blank"
     frames = imageio.mimread(written / "policies.mp4", memtest=False)
-    assert len(frames) == 31
+    assert len(frames) == 126
     # Two policies side by side; below each the curve of its error grows from the first to the last frame.
     width = frames[0].shape[1] // 2
     for left in (0, width):
@@ -65,12 +62,12 @@ def test_demo_draws_pictures_and_a_video(written: Path) -> None:
 def test_demo_draws_the_agent_beside_what_it_sees(written: Path) -> None:
     """A step of 8 environment steps lasts .08 s; the camera's picture is in colour, the agent's of 36 grey pixels."""
     with Image.open(written / "agent.gif") as gif:
-        assert (gif.n_frames, gif.info["duration"]) == (30, 80)  # type: ignore[attr-defined]
+        assert (gif.n_frames, gif.info["duration"]) == (125, 80)  # type: ignore[attr-defined]
         picture = np.asarray(gif.convert("RGB"))
     camera, seen = picture[:, :128], picture[:, -128:]
     colourful = [np.ptp(half.astype(int), axis=2).mean() for half in (camera, seen)]
     assert colourful[0] > 20 and colourful[1] < 10
-    assert len(np.unique(seen, axis=0)) <= 36 and seen.std() > 5 and (written / "agent.gif").stat().st_size < 2.4e5
+    assert len(np.unique(seen, axis=0)) <= 36 and seen.std() > 5 and (written / "agent.gif").stat().st_size < 1e6
 
 
 def test_time_limit_in_the_first_evaluation_leaves_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
